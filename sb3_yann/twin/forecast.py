@@ -225,7 +225,7 @@ def forecast(
     some = -(-RUNS // count)
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
     begins = [np.stack([each.thetas[:1] for each in episodes]), drawn.reshape(count, some, -1)]
-    found: list[tuple[float, float, str]] = []
+    found: list[tuple[float, float, float, str]] = []
     plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
     for judge in judges:
         law = law_of(judge.dynamics.problem)
@@ -239,13 +239,9 @@ def forecast(
             for first in begins:
                 mpc, policy = (replays.costs(each, first) for each in (law, act))
                 found.append((*_changed(mpc, policy, independent), says))
-    middle = np.array([each[0] for each in found])
-    room = np.array([each[1] for each in found])
-    high, low = middle + room, middle - room
-    return Forecast(
-        float(middle[:2].mean()), float(low.min()), float(high.max()),
-        _cure(found, int(np.argmax(high)), independent, loosest),
-    )  # fmt: skip
+    low, high = [each[1] for each in found], [each[2] for each in found]
+    change, worst = (found[0][0] + found[1][0]) / 2, found[int(np.argmax(high))]
+    return Forecast(change, min(low), max(high), _cure(*worst, independent, loosest))
 
 
 def surely_worse(behind: Array) -> NDArray[np.bool_]:
@@ -259,29 +255,34 @@ def surely_worse(behind: Array) -> NDArray[np.bool_]:
     return np.asarray((known.mean(axis=-1) > REFUTED * error) | each)
 
 
-def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float]:
-    """Return a change relative to the MPC, and the half-width of its interval."""
+def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float, float]:
+    """Return a change relative to the MPC, and the ends of its interval."""
     with np.errstate(all="ignore"):
-        unit = np.abs(mpc).mean(axis=1, keepdims=True)
-        ratios = (policy - mpc).mean(axis=1) / unit[:, 0]  # (members,)
+        changes, size = policy - mpc, np.abs(mpc)
+        ratios = changes.mean(axis=1) / size.mean(axis=1)  # (members,)
     if not np.isfinite(ratios).all() or independent < 2:
-        return 0.0, np.inf
+        return 0.0, -np.inf, np.inf
     # Of a ratio of means only what is not in proportion varies (Cochran, *Sampling*, chapter 6).
-    apart = (policy - mpc - ratios[:, None] * np.abs(mpc)) / unit
+    apart = (changes - ratios[:, None] * size) / size.mean(axis=1, keepdims=True)
     of_episodes = np.sqrt(apart.mean(axis=0).var(ddof=1) / independent)
     of_fits = np.sqrt((len(ratios) - 1) * ratios.var())
     likely = [stats.t.ppf(SURE, max(k - 1, 1)) for k in (independent, len(ratios))]
-    return float(ratios.mean()), float(np.hypot(likely[0] * of_episodes, likely[1] * of_fits))
+    mean = float(ratios.mean())
+    # A mean lies between the least and the largest of what it is taken over.
+    each = changes.mean(axis=0) / np.maximum(size.mean(axis=0), 1e-300)
+    room = likely[0] * of_episodes
+    up, down = (float(np.clip(most, 0, room)) for most in (each.max() - mean, mean - each.min()))
+    fits = float(likely[1] * of_fits)
+    return mean, mean - float(np.hypot(down, fits)), mean + float(np.hypot(up, fits))
 
 
-def _cure(found: list[tuple[float, float, str]], worst: int, independent: int, loosest: str) -> str:
+def _cure(middle: float, low: float, high: float, says: str, independent: int, loosest: str) -> str:
     """Return what would settle a change whose interval contains zero."""
-    middle, room, says = found[worst]
     if middle >= 0 or says == "hidden dynamics":
         kind = " for longer than the actuator takes" if says == "hidden dynamics" else ""
         which = f"; {says} says otherwise" if says else ""
         return f"log held steps of {loosest}{kind}{which}"
-    if not np.isfinite(room):
+    if not np.isfinite(high - low):
         return "log more episodes"
-    needed = independent * min((room / middle) ** 2, 100.0)
+    needed = independent * min(((high - middle) / middle) ** 2, 100.0)
     return f"log about {int(np.ceil(needed)) - independent + 1} episodes more"
