@@ -112,7 +112,7 @@ class TwinPlant:
             found[:, parts.disturbance] = theta[:, parts.disturbance]
         return found
 
-    def _slopes(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+    def slopes(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives of rows at theta (T, k, size) and u (T, k, m)."""
         acting, (steps, k) = self._acting(rows), theta.shape[:2]
         if self.members is not None:
@@ -127,7 +127,7 @@ class TwinPlant:
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
         row, parts = self.dynamics.row, self.dynamics.problem.layout
-        A, B = self._slopes(row.begin(theta), u, rows)
+        A, B = self.slopes(row.begin(theta), u, rows)
         if row.observer is None:
             return A, B
         number, n = np.arange(parts.size), parts.size

@@ -14,6 +14,7 @@ from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe
 from sb3_yann.control import LinearMPC
 from sb3_yann.improvement.model import Imagined, Scenarios, task_of
+from sb3_yann.improvement.refinement import descend
 from sb3_yann.improvement.simulator import of_law
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.yann import LawLayer
@@ -26,6 +27,10 @@ RATE = 1e-2  # of Adam at first; it falls to zero
 NEARBY = 3  # states beside each of a plan that its feedback answers
 SPREAD = 0.1  # how far they are, in standard deviations of the states in the episodes
 FITS = 6  # fits to plans in a model, at most: after each the policy's own states are planned from
+FAR = 0.5  # share below which, after half of the fits, a policy descends on its own costs instead
+STEPS = 150  # of that descent
+LOSS = 10.0  # how much more in it what a start loses against the MPC counts than what others gain
+FINE_RATE = 1e-3  # of Adam in it, at first
 HARDEST = 20  # scenarios that are planned anew after a fit
 NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
 
@@ -171,7 +176,8 @@ def imitate(
     Then the policy plays these episodes in the model, and learns more where it does worse than
     plans: from their starts, and from where it had got to (S. Ross, G. Gordon and D. Bagnell, *A
     reduction of imitation learning and structured prediction to no-regret online learning*, AISTATS
-    2011). The layer ends with the fit that cost the least. Return what it saves in the model: see
+    2011). The layer ends with the fit that cost the least. Where that saves less than half of what
+    plans do, it descends on its own costs. Return what it saves in the model: see
     :meth:`Teacher.saved`.
     """
     most, best = -np.inf, copy.deepcopy(layer.state_dict())
@@ -183,11 +189,40 @@ def imitate(
         say(f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model")
         if saved > most:
             most, best = saved, copy.deepcopy(layer.state_dict())
-        if most >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
+        lost = fit >= FITS // 2 and most < FAR * teacher.gain
+        if most >= (1 - NEAR) * teacher.gain or lost or fit == FITS - 1:
             break
         teacher.show(act, played)
     layer.load_state_dict(best)
+    if lost:
+        most = refine(layer, teacher)
+        say(f"descent: {100 * most:.3g} % of plans' {100 * teacher.gain:.3g} % in the model")
     return most
+
+
+def refine(layer: LawLayer, teacher: Teacher) -> float:
+    """Descend on what the policy's own episodes cost in the model, and keep the best weights.
+
+    Return what they save: see :meth:`Teacher.saved`.
+    """
+    scenarios = teacher.scenarios.wider(teacher.rng)
+    mpc = scenarios.play(of_law(teacher.problem)).costs
+    most, saved, best = -np.inf, 0.0, copy.deepcopy(layer.state_dict())
+    optimizer = th.optim.Adam(layer.network.weights(), lr=FINE_RATE)
+    for k in range(STEPS + 1):
+        played = scenarios.play(controller_of(policy_of(layer, teacher.problem)))
+        if (worth := worth_of(played.costs, mpc)) > most:
+            most, saved = worth, teacher.saved(played.costs[: len(teacher.best)])
+            best = copy.deepcopy(layer.state_dict())
+        if k < STEPS:
+            optimizer.param_groups[0]["lr"] = FINE_RATE * (1 - k / STEPS)
+            optimizer.zero_grad()
+            weights = np.where(played.costs > mpc, 1 + LOSS, 1.0) / units_of(mpc)
+            descend(layer, scenarios, teacher.task, played, weights)
+            optimizer.step()
+    optimizer.zero_grad()
+    layer.load_state_dict(best)
+    return saved
 
 
 def units_of(mpc: Array) -> Array:
@@ -202,6 +237,11 @@ def gain_of(costs: Array, mpc: Array) -> float:
     finite = np.isfinite(mpc)
     saved = (mpc[finite] - costs[finite]) / units_of(mpc)[finite]
     return float(np.mean(saved)) if finite.any() else 0.0
+
+
+def worth_of(costs: Array, mpc: Array) -> float:
+    """Return the gain, less ``LOSS`` times what scenarios cost more than with the MPC."""
+    return gain_of(costs, mpc) + LOSS * gain_of(np.maximum(costs, mpc), mpc)
 
 
 def fit_layer(

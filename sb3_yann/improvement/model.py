@@ -185,6 +185,7 @@ class Imagined:
 
     Attributes
     ----------
+    rows : ndarray, shape (T + 1, k, size)
     thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
     costs : ndarray, shape (k,)
         Stage costs, and what soft bounds cost.
@@ -192,6 +193,7 @@ class Imagined:
         As :func:`~sb3_yann.compare.unsafe_columns` returns it.
     """
 
+    rows: Array
     thetas: Array
     inputs: Array
     costs: Array
@@ -239,6 +241,22 @@ class Scenarios:
         given = [e.thetas[np.minimum(np.arange(steps), len(e)), row.given] for e in episodes]
         return cls(model, None, row.begin(thetas), np.stack(given, axis=1))
 
+    def wider(self, rng: np.random.Generator) -> Scenarios:
+        """Return these, and as many that begin anywhere, with the same references."""
+        row, starts, n = (
+            self.model.dynamics.row,
+            self.model.starts,
+            self.model.problem.model.n_states,
+        )
+        thetas = row.shown(self.starts).copy()
+        thetas[:, :n] = rng.uniform(starts.low, starts.high, thetas[:, :n].shape)
+        return Scenarios(
+            self.model,
+            None if self.members is None else np.tile(self.members, 2),
+            np.concatenate([self.starts, row.begin(thetas)]),
+            np.tile(self.given, (1, 2, 1)),
+        )
+
     @cached_property
     def plant(self) -> TwinPlant:
         """What acts in them."""
@@ -267,4 +285,4 @@ class Scenarios:
             costs = problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
         lost = ~(np.isfinite(costs) & np.isfinite(thetas).all(axis=(0, 2)))
         costs = np.where(lost, np.inf, costs)
-        return Imagined(thetas, inputs, costs, unsafe_columns(0, 0, lost, excess))
+        return Imagined(rows, thetas, inputs, costs, unsafe_columns(0, 0, lost, excess))
