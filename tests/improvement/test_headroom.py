@@ -226,7 +226,6 @@ def test_the_best_of_a_random_plant_is_one_controller() -> None:
     assert found.total < found.offset + 0.05
 
 
-@pytest.mark.xfail(reason="an angle that jumps by a turn is not in the model")
 def test_another_way_to_swing_is_found() -> None:
     """From the MPC's own swing the search ends 1 % below it; a push first leads to 4 %."""
     seed = 2008
@@ -237,7 +236,6 @@ def test_another_way_to_swing_is_found() -> None:
     assert found.total > 0.75 * (1 - best.mean() / found.mpc_costs.mean())
 
 
-@pytest.mark.xfail(reason="an angle that jumps by a turn is not in the model")
 def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
     mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=Terminal())
     found = headroom(mpc, "ClippedPendulum-v0", n_starts=2, seed=2021)
