@@ -6,6 +6,7 @@ much on average (their conditional value at risk), is the mean cost higher?
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -128,7 +129,7 @@ AcceptanceRule.__init__ = former_names(**AcceptanceRule.former)(AcceptanceRule._
 
 
 class Verdict(NamedTuple):
-    """Whether a policy is no worse.
+    """Whether a policy is no worse, and whether more starts would change that.
 
     Attributes
     ----------
@@ -138,11 +139,17 @@ class Verdict(NamedTuple):
         Whether it breaks a limit that the policy before does not: then there is no patience.
     above_mpc : bool
         Whether its mean cost is above the MPC's.
+    is_sure : bool
+        Whether its mean cost is surely lower, at the level that was asked for.
+    is_hopeless : bool
+        Whether more starts would hardly show a gain that counts.
     """
 
     reason: str = ""
     breaks_limit: bool = False
     above_mpc: bool = False
+    is_sure: bool = False
+    is_hopeless: bool = False
 
     @property
     def accepted(self) -> bool:
@@ -180,13 +187,6 @@ class Scores(NamedTuple):
         """Return the episodes of both."""
         return Scores._make(map(np.concatenate, zip(self, other, strict=True)))
 
-    def replaced(self, index: Any, other: Scores) -> Scores:
-        """Return a copy with other episodes in some places."""
-        copy = Scores._make(each.copy() for each in self)
-        for ours, theirs in zip(copy, other, strict=True):
-            ours[index] = theirs
-        return copy
-
 
 @dataclass(frozen=True)
 class Tolerance:
@@ -199,10 +199,11 @@ class Tolerance:
         average.
     cvar_alpha : float, share of all starts that the average is over; 0 is the worst single start
         With a CVaR, a start that costs the MPC more than ``typical`` may cost more in proportion,
-        and no start may cost more than `WORST_START` times as much as the average may.
+        and no start may cost more than ``worst_start`` times as much as the average may.
     typical : float, the MPC's median cost
     excess_room : float, half-widths by which an excess over bounds may be larger
     bounds : BoundNames, which reasons name
+    worst_start : float, how many times as much as on average a single start may cost more
     """
 
     margin: float
@@ -210,6 +211,7 @@ class Tolerance:
     typical: float = np.inf
     excess_room: float = EXCESS_ROOM
     bounds: BoundNames = field(default_factory=BoundNames)
+    worst_start: float = WORST_START
 
     def exceeded(self, policy: Scores, episode: int, mpc: Scores | None = None) -> str:
         """Return which bound an episode exceeds most, and by how much; empty where none is.
@@ -241,30 +243,105 @@ class Tolerance:
         more = np.where(costs <= mpc_costs, np.fmin(more, 0.0), more)  # also without any margin
         return np.asarray(np.nan_to_num(more, nan=np.inf, posinf=np.inf, neginf=-np.inf))
 
-    def objection(
-        self, excess: Array, n_starts: int | None = None, standard_errors: float = 0.0
-    ) -> str:
+    def is_tail_lost(self, excess: Array) -> bool:
+        """Return whether more starts would hardly show that the worst ones may pass.
+
+        If the share that counts as the worst ones exceeds 1, so does their average: as many as
+        here would be, in one of ten cases at most, among starts of which fewer do.
+        """
+        count = np.count_nonzero(excess > 1.0)
+        if not self.cvar_alpha or count == 0:
+            return not self.cvar_alpha
+        return bool(special.bdtrc(count - 1, len(excess), self.cvar_alpha) <= 0.1)
+
+    def objection(self, excess: Array, standard_errors: float = 0.0) -> str:
         """Return what speaks against such an excess over the MPC, empty where nothing does.
 
         Parameters
         ----------
         excess : ndarray, shape (starts,)
             As :meth:`excess` returns it.
-        n_starts : int, optional
-            Number of starts of which these are the worst ones. The default is all of them.
         standard_errors : float, default 0
             How many standard errors of the tail's average count as well.
         """
         worst = int(np.argmax(excess))
         if not excess[worst] > 1.0:
             return ""
-        if not self.cvar_alpha or excess[worst] > WORST_START:
+        if not self.cvar_alpha or excess[worst] > self.worst_start:
             return f"start {worst}"
-        average, error = tail_average(excess, self.cvar_alpha, n_starts or len(excess))
+        average, error = tail_average(excess, self.cvar_alpha)
         if average + standard_errors * error <= 1.0:
             return ""
         share = 100 * self.cvar_alpha
         return f"the worst {share:g} % of the starts cost too much, start {worst}"
+
+
+class Difference(NamedTuple):
+    """The mean difference of pairs of episodes.
+
+    Attributes
+    ----------
+    mean : float
+    error : float
+        Its standard error.
+    pairs : int
+    chance : float, default 0
+        Of few pairs in turns: how often the order that was drawn for each alone brings a mean as
+        low, which is exact under any drift. Of more than `FEW_PAIRS` the error counts a drift.
+    """
+
+    mean: float
+    error: float
+    pairs: int
+    chance: float = 0.0
+
+    @classmethod
+    def of(cls, differences: Array, in_turns: bool = False) -> Difference:
+        """Return that of differences.
+
+        Pairs that were played ``in_turns`` on a plant, in an order that was drawn for each, may be
+        correlated: they are in the order in which they were played, and the error is widened.
+        """
+        n = len(differences)
+        mean = float(differences.mean()) if n else np.nan
+        if n < 2:
+            return cls(mean, np.inf, n, 0.5 if in_turns else 0.0)
+        with np.errstate(invalid="ignore"):  # a cost may be infinite
+            error = float(differences.std(ddof=1) / np.sqrt(n))
+            left = differences - mean
+        if not in_turns:
+            return cls(mean, error, n)
+        chance, size = 0.0, float(left @ left)
+        if n <= FEW_PAIRS:
+            orders = 1 - 2 * (np.arange(2**n)[:, None] >> np.arange(n) & 1)
+            as_low = differences.sum() + COST_ROUNDING * np.abs(differences).sum()
+            chance = float(np.mean(orders @ differences <= as_low))
+        lag = float(np.clip(left[1:] @ left[:-1] / size, 0.0, 0.95)) if size > 0 else 0.0
+        widened = np.sqrt((1 + lag) / (1 - lag))  # an autoregression's variance of the mean
+        return cls(mean, float(widened * error), n, chance)
+
+    def room(self, level: float) -> float:
+        """Return how far from 0 the mean may be by chance, one-sided; inf for a single pair."""
+        if self.pairs < 2:
+            return np.inf
+        return float(special.stdtrit(self.pairs - 1, 1 - level) * self.error)
+
+    def is_below_zero(self, level: float) -> bool:
+        """Return whether the mean is negative by chance with a probability of ``level`` at most."""
+        return self.chance <= level and self.mean + self.room(level) < 0
+
+
+def level_of_look(significance: float, look: int) -> float:
+    """Return the level of the look of a number from 1: all looks together err no more often."""
+    return significance / (look * (look + 1))
+
+
+def looks(first: int, most: int) -> list[int]:
+    """Return after how many pairs it is decided whether more are played: twice as many each."""
+    counts = [min(first, most)]
+    while counts[-1] < most:
+        counts.append(min(2 * counts[-1], most))
+    return counts
 
 
 def no_worse(
@@ -272,7 +349,12 @@ def no_worse(
     accepted: Scores,
     mpc: Scores,
     tolerance: Tolerance,
-    n_starts: int | None = None,
+    *,
+    names: Sequence[int] | None = None,
+    n_hard: int = 0,
+    level: float = 0.05,
+    least_gain: float = 0.0,
+    tail_errors: float = 0.0,
 ) -> Verdict:
     """Compare a policy with the accepted one and the MPC, from the same starts.
 
@@ -284,38 +366,58 @@ def no_worse(
         Of the three.
     tolerance : Tolerance
         What starts may cost more than with the MPC.
-    n_starts : int, optional
-        The number of starts that these are the worst ones of. The default is all of them.
+    names : sequence of int, optional
+        What the starts are called in a reason: their seeds.
+    n_hard : int, default 0
+        So many of the first starts were chosen since a policy lost them: they count in no mean.
+    level : float, default 0.05
+        One-sided, of what is sure.
+    least_gain : float, default 0
+        As a fraction of the MPC's mean cost: what gains surely less is hopeless.
+    tail_errors : float, default 0
+        How many standard errors of the worst starts' average count as well.
     """
+    names = range(len(mpc.costs)) if names is None else names
     breaks = policy.breaks_more_than(accepted, tolerance.excess_room)
-    above_mpc = is_above(policy.costs, mpc.costs)
     # Neither is exceeded: a tolerance over the accepted policy alone would add up.
     allowed = np.minimum(accepted.unsafe, mpc.unsafe)
     less = less_safe(policy.unsafe, allowed, tolerance.excess_room)
     excess = tolerance.excess(mpc.costs, policy.costs)
+    costs, of_mpc = policy.costs[n_hard:], mpc.costs[n_hard:]
+    before = of_mpc if accepted is mpc else accepted.costs[n_hard:]
+    above_mpc = is_above(costs, of_mpc)
+    typical = np.maximum(np.abs(of_mpc), np.median(np.abs(of_mpc)))  # each relative to its own cost
+    gain = Difference.of((costs - before) / np.where(typical > 0, typical, 1.0))
+    best = float((costs - before).mean() / max(np.abs(of_mpc).mean(), 1e-300))
+    is_sure = gain.is_below_zero(level)
+    hopeless = gain.mean - gain.error > -least_gain / 2 and best > -least_gain
     reason = ""
     if less.any():
         column = int(np.argmax(less.any(axis=0)))
         which = np.flatnonzero(less[:, column])
-        reason = f"{len(which)} starts with {UNSAFE[column]}, the first is number {which[0]}"
         words = tolerance.exceeded(policy, int(which[0]))
+        reason = f"{len(which)} of {len(less)} starts with {UNSAFE[column]}, the first is "
+        reason += f"start {names[which[0]]}"
         if column == ENDED:
             reason = f"{reason}; {SUCCESS_HINT}"
         elif column != INPUT_STEP and words:
             reason = f"{reason}: {words}"
-    elif costly := tolerance.objection(excess, n_starts):
-        worst = np.argmax(excess)
+        hopeless = True
+    elif costly := tolerance.objection(excess, tail_errors):
+        worst = int(np.argmax(excess))
         more = policy.costs[worst] - mpc.costs[worst]
         reason = f"{costly} costs {more:.4g} more than with the MPC"
-        if words := tolerance.exceeded(policy, int(worst), mpc):
+        reason = reason.replace(f"start {worst} ", f"start {names[worst]} ")
+        if words := tolerance.exceeded(policy, worst, mpc):
             reason = f"{reason}: {words}"
-    elif is_above(policy.costs, accepted.costs):
-        mean, other = format_distinct(policy.costs.mean(), accepted.costs.mean())
+        hopeless |= not np.isfinite(excess[worst]) or tolerance.is_tail_lost(excess[n_hard:])
+    elif is_above(costs, before) and before is not of_mpc:
+        mean, other = format_distinct(costs.mean(), before.mean())
         reason = f"mean cost {mean}, accepted {other}"
-    elif above_mpc:  # by as much as rounding in many acceptances adds up to
-        mean, other = format_distinct(policy.costs.mean(), mpc.costs.mean())
+    elif above_mpc:  # or by as much as rounding in many acceptances adds up to
+        mean, other = format_distinct(costs.mean(), of_mpc.mean())
         reason = f"mean cost {mean}, MPC {other}"
-    return Verdict(reason, breaks, above_mpc)
+    return Verdict(reason, breaks, above_mpc, is_sure, hopeless)
 
 
 @dataclass(frozen=True)
@@ -326,184 +428,57 @@ class Starts:
     ----------
     seeds, mpc : tuple of int and Scores
     tolerance : Tolerance, what they may cost more than with the MPC
-    n_starts : int, of so many they are those that count
-    standard_errors : float, by how many the mean cost, and the tail's, must be clear of the MPC's
-    least_gain : float, what the mean must gain, as a fraction of the MPC's
+    n_hard : int
+        So many of the first ones are starts that a policy has lost.
     """
 
     seeds: tuple[int, ...]
     mpc: Scores
     tolerance: Tolerance
-    n_starts: int
-    standard_errors: float = 0.0
-    least_gain: float = 0.0
+    n_hard: int = 0
 
-    def at(self, index: Any) -> Starts:
-        """Return some of them, which stand for as many."""
-        seeds = tuple(np.array(self.seeds)[index].tolist())
-        return replace(self, seeds=seeds, mpc=self.mpc.at(index))
-
-    def joined_with(self, other: Starts) -> Starts:
-        """Return the starts of both."""
-        count = self.n_starts + other.n_starts
-        mpc = self.mpc.extended_by(other.mpc)
-        return Starts((*self.seeds, *other.seeds), mpc, self.tolerance, count)
-
-    def excess(self, policy: Scores) -> Array:
-        """Return what each costs more than with the MPC, in what it may; inf for nan."""
-        return self.tolerance.excess(self.mpc.costs, policy.costs)
-
-    def less_safe(self, policy: Scores) -> NDArray[np.bool_]:
-        """Return in which a policy is less safe than the MPC."""
-        less = less_safe(policy.unsafe, self.mpc.unsafe, self.tolerance.excess_room)
-        return np.asarray(less.any(axis=1))
+    def with_hard(self, others: Starts, hard: NDArray[np.int64]) -> Starts:
+        """Return these starts, with some of others before them."""
+        seeds = (*(others.seeds[i] for i in hard), *self.seeds)
+        mpc = others.mpc.at(hard).extended_by(self.mpc)
+        return replace(self, seeds=seeds, mpc=mpc, n_hard=self.n_hard + len(hard))
 
     def lost(self, policy: Scores) -> NDArray[np.bool_]:
-        """Return which a policy loses against the MPC."""
-        return (self.excess(policy) > 1.0) | self.less_safe(policy)
+        """Return which of the first starts a policy loses against the MPC."""
+        mpc = self.mpc.at(slice(len(policy.costs)))
+        less = less_safe(policy.unsafe, mpc.unsafe, self.tolerance.excess_room).any(axis=1)
+        return np.asarray((self.tolerance.excess(mpc.costs, policy.costs) > 1.0) | less)
 
-    def is_lost(self, policy: Scores) -> bool:
-        """Return whether a policy loses too many or too much of them, or is less safe."""
-        excess = self.excess(policy)
-        costly = self.tolerance.objection(excess, self.n_starts, self.standard_errors)
-        return bool(costly) or bool(self.less_safe(policy).any())
-
-    def gains_too_little(self, policy: Scores) -> bool:
-        """Return whether the mean cost is not below the MPC's by the least gain."""
-        gained = self.mpc.costs.mean() - policy.costs.mean()
-        needed = self.least_gain * np.abs(self.mpc.costs).mean()
-        return bool(self.least_gain and not gained >= needed)
-
-    def mean_is_above(self, policy: Scores) -> bool:
-        """Return whether the mean cost is above the MPC's, by more than rounding.
-
-        Where it must be clear of it, its upper confidence limit must be below, and it itself by
-        the least gain.
-        """
-        more = policy.costs - self.mpc.costs
-        error = 0.0
-        if self.standard_errors:
-            error = self.standard_errors * more.std() / np.sqrt(len(more))
-        above = is_above(policy.costs, self.mpc.costs, error)
-        return above or self.gains_too_little(policy)
-
-    def verdict(self, policy: Scores) -> Verdict:
-        """Return whether a policy is no worse than the MPC on these starts, which are new to it."""
-        above_mpc = is_above(policy.costs, self.mpc.costs)
-        if self.is_lost(policy):
-            first = self.hardest(policy)[0]
-            breaks = False
-            words = self.tolerance.exceeded(policy, int(first), self.mpc)
-            also = f": {words}" if words else ""
-            if self.less_safe(policy).any():
-                breaks = policy.breaks_more_than(self.mpc, self.tolerance.excess_room)
-                words = self.tolerance.exceeded(policy, int(first))
-                limit = f"violates a limit: {words}" if words else "violates a limit"
-                also = f" and {limit if breaks else 'moves an input too far'}"
-            more = (policy.costs - self.mpc.costs)[first]
-            reason = (
-                f"{self.lost(policy).sum()} of {len(self.seeds)} new starts lose against the MPC, "
-                f"seed {self.seeds[first]} costs {more:.4g} more{also}"
-            )
-            return Verdict(reason, breaks, above_mpc)
-        if not self.mean_is_above(policy):
-            return Verdict()
-        mean, mpc = format_distinct(policy.costs.mean(), self.mpc.costs.mean())
-        reason = f"mean cost {mean} on {len(self.seeds)} new starts, MPC {mpc}"
-        if not above_mpc:
-            little = self.gains_too_little(policy)
-            reason += ": too little a gain" if little else ": not surely below"
-        return Verdict(reason, False, above_mpc)
-
-    def hardest(self, policy: Scores | None) -> NDArray[np.int64]:
-        """Return the hardest that cost more than with the MPC; the first without scores."""
-        if policy is None:
-            return np.zeros(1, dtype=np.int64)
-        excess, less = self.excess(policy), self.less_safe(policy)
+    def hardest(self, policy: Scores) -> NDArray[np.int64]:
+        """Return the hardest of the first starts that a policy loses, else that cost it more."""
+        mpc = self.mpc.at(slice(len(policy.costs)))
+        excess = self.tolerance.excess(mpc.costs, policy.costs)
+        less = less_safe(policy.unsafe, mpc.unsafe, self.tolerance.excess_room).any(axis=1)
         order = np.argsort(np.where(less, -np.inf, -excess), kind="stable")
         count = self.lost(policy).sum() or np.count_nonzero(excess > 0)
         return order[: min(HARDEST, count)]
 
 
-class PairedMean(NamedTuple):
-    """The mean difference of pairs that were played in turns on a plant.
-
-    Attributes
-    ----------
-    mean : float
-    error : float
-        Its standard error, widened where pairs that follow each other are correlated.
-    pairs : int
-    chance : float, default 0
-        How often the order that was drawn for each pair alone brings a mean as low: exact under
-        any drift. It is not computed for more than `FEW_PAIRS`, where the error counts a drift.
-    """
-
-    mean: float
-    error: float
-    pairs: int
-    chance: float = 0.0
-
-    @classmethod
-    def of(cls, differences: Array) -> PairedMean:
-        """Return that of differences in the order in which they were played."""
-        n = len(differences)
-        chance = 0.0
-        if n <= FEW_PAIRS:
-            orders = 1 - 2 * (np.arange(2**n)[:, None] >> np.arange(n) & 1)
-            as_low = differences.sum() + COST_ROUNDING * np.abs(differences).sum()
-            chance = float(np.mean(orders @ differences <= as_low))
-        if n < 2:
-            return cls(float(differences.mean()), 0.0, n, chance)
-        left = differences - differences.mean()
-        size = float(left @ left)
-        lag = float(np.clip(left[1:] @ left[:-1] / size, 0.0, 0.95)) if size > 0 else 0.0
-        widened = np.sqrt((1 + lag) / (1 - lag))  # an autoregression's variance of the mean
-        error = float(widened * differences.std(ddof=1) / np.sqrt(n))
-        return cls(float(differences.mean()), error, n, chance)
-
-    def is_below_zero(self) -> bool:
-        """Return whether the mean is surely negative: by chance in one of twenty cases at most."""
-        return self.pairs >= 2 and self.chance <= 0.05 and self.mean + self.room() < 0
-
-    def room(self, level: float = 0.95) -> float:
-        """Return how far from 0 the mean may be by chance, one-sided; inf for a single pair."""
-        if self.pairs < 2:
-            return np.inf
-        return float(special.stdtrit(self.pairs - 1, level) * self.error)
-
-
-def tail_average(values: Array, alpha: float, n_starts: int) -> tuple[float, float]:
+def tail_average(values: Array, alpha: float) -> tuple[float, float]:
     """Return the average of the worst share of values, and its standard error.
 
     The conditional value at risk q + E(x - q)+ / alpha at the quantile q, with the deviation of the
     second part (Rockafellar and Uryasev, *Optimization of conditional value-at-risk*, Journal of
     Risk 2, 2000). At least one value counts.
-
-    Parameters
-    ----------
-    values : ndarray, shape (values,)
-        The worst ones of ``n_starts``.
-    alpha : float
-        The share.
-    n_starts : int
-        So many values there are.
     """
-    count = min(max(1.0, alpha * n_starts), float(len(values)))
+    count = min(max(1.0, alpha * len(values)), float(len(values)))
     ranked = np.sort(values)[::-1]
     level = ranked[int(np.ceil(count)) - 1]
     beyond = np.maximum(ranked - level, 0.0)
-    mean = beyond.sum() / count
-    deviation = np.sqrt(max(0.0, np.sum(beyond**2) / n_starts - (beyond.sum() / n_starts) ** 2))
-    return float(level + mean), float(deviation * np.sqrt(n_starts) / count)
+    return float(level + beyond.sum() / count), float(beyond.std() * np.sqrt(len(values)) / count)
 
 
-def is_above(costs: Array, others: Array, error: float = 0.0) -> bool:
-    """Return whether the mean of costs, and an error, is above that of others beyond rounding.
+def is_above(costs: Array, others: Array) -> bool:
+    """Return whether the mean of costs is above that of others beyond rounding.
 
     A mean that is not a number is.
     """
-    return not costs.mean() + error - others.mean() <= COST_ROUNDING * np.abs(others).mean()
+    return not costs.mean() - others.mean() <= COST_ROUNDING * np.abs(others).mean()
 
 
 def format_distinct(one: float, other: float) -> tuple[str, str]:

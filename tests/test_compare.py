@@ -10,11 +10,13 @@ from scipy import stats
 
 from sb3_yann.compare import (
     AcceptanceRule,
-    PairedMean,
+    Difference,
     Scores,
     Starts,
     Tolerance,
     less_safe,
+    level_of_look,
+    looks,
     no_worse,
     tail_average,
     unsafe_columns,
@@ -35,9 +37,8 @@ def scores(costs: Any, unsafe: Any = (), visits: Any = None) -> Scores:
     return Scores(np.array(costs, float), rows, np.array(visits, bool))
 
 
-def starts(costs: Any, tolerance: Tolerance = STRICT, unsafe: Any = (), **bar: float) -> Starts:
-    seeds = tuple(range(100, 100 + len(costs)))
-    return Starts(seeds, scores(costs, unsafe), tolerance, len(costs), **bar)
+def starts(costs: Any, tolerance: Tolerance = STRICT, unsafe: Any = ()) -> Starts:
+    return Starts((*range(100, 100 + len(costs)),), scores(costs, unsafe), tolerance)
 
 
 def columns(*episodes: list[float], violations: object = 0) -> np.ndarray:
@@ -140,13 +141,13 @@ def test_rounding_adds_up_to_no_loss_however_many_policies_are_accepted_in_turn(
 @pytest.mark.parametrize(
     ("now", "before", "why"),
     [
-        ([[0, 0], [0, 0], [1, 0]], [[0, 0]] * 3, "1 starts with violations, the first is number 2"),
+        ([[0, 0], [0, 0], [1, 0]], [[0, 0]] * 3, "1 of 3 starts with violations, the"),
         ([[0, 0], [2, 0], [0, 0]], [[0, 0], [2, 0], [0, 0]], ""),
         ([[1, 0], [0, 0], [0, 0]], [[0, 0], [2, 0], [0, 0]], "violations"),
         ([[0, 0], [3, 0], [0, 0]], [[0, 0], [2, 0], [0, 0]], "violations"),
         ([[1, 1], [0, 1], [0, 0]], [[2, 0], [0, 1], [0, 0]], "the env ends"),
         ([[0, 0, 0, 0], [0, 0, 0, 2], [0, 0, 0, 2]], [[0, 0]] * 3,
-         "2 starts with an input that moves too far in one step, the first is number 1"),
+         "2 of 3 starts with an input that moves too far in one step, the first is start 1"),
     ],
 )  # fmt: skip
 def test_whoever_is_less_safe_is_refused_whatever_it_costs(now, before, why) -> None:
@@ -191,144 +192,95 @@ def test_a_single_start_ten_times_beyond_what_is_allowed_is_too_much_alone() -> 
     assert rule.objection(np.append(rest, 10.1)) == "start 99"
 
 
-def test_the_worst_of_many_starts_stand_for_all_of_them() -> None:
-    excess = np.array([3.0, 2.0, 1.0, 0.0])
-    assert tail_average(excess, 0.05, 40)[0] == pytest.approx(2.5)  # two of forty
-    assert tail_average(excess, 0.05, 4)[0] == 3.0  # one at least
+def test_the_average_of_a_tail_and_its_error_are_those_of_what_lies_beyond_a_quantile() -> None:
     draws = np.random.default_rng(0).standard_normal((400, 1000))
-    found, errors = np.transpose([tail_average(each, 0.05, 1000) for each in draws])
+    found, errors = np.transpose([tail_average(each, 0.05) for each in draws])
     assert found.mean() == pytest.approx(stats.norm.pdf(stats.norm.isf(0.05)) / 0.05, abs=0.02)
     assert errors.mean() == pytest.approx(found.std(), rel=0.15)
-    assert tail_average(10 * draws[0], 0.05, 1000)[1] == pytest.approx(10 * errors[0])
-
-
-def test_the_error_of_a_tail_s_average_is_that_of_what_lies_beyond_its_quantile() -> None:
     excess = np.random.default_rng(0).exponential(size=200)
-    average, error = tail_average(excess, 0.1, 200)
+    average, error = tail_average(excess, 0.1)
     ranked = np.sort(excess)[::-1]
     assert average == pytest.approx(ranked[:20].mean())
     assert error == pytest.approx(np.maximum(excess - ranked[19], 0).std() / np.sqrt(200) / 0.1)
-    # The worst of many stand for all: those left out are nowhere beyond.
-    assert tail_average(ranked[:40], 0.1, 200) == pytest.approx((average, error))
     # A share that is no whole number counts the last one in part.
     part = (ranked[:20].sum() + 0.5 * ranked[20]) / 20.5
-    assert tail_average(excess, 0.1025, 200)[0] == pytest.approx(part)
-    assert tail_average(excess, 1e-6, 200) == (pytest.approx(ranked[0]), 0.0)
+    assert tail_average(excess, 0.1025)[0] == pytest.approx(part)
+    assert tail_average(excess, 1e-6) == (pytest.approx(ranked[0]), 0.0)
 
 
 def test_standard_errors_of_the_tail_count_where_it_must_be_sure() -> None:
     excess = np.concatenate([[2.0, 0.5, 0.3], np.full(57, -1.0)])
-    average, error = tail_average(excess, 0.05, 60)
+    average, error = tail_average(excess, 0.05)
     enough = (1 - average) / error
     rule = Tolerance(1.0, 0.05)
-    assert rule.objection(excess) == rule.objection(excess, 60, 0.99 * enough) == ""
-    assert rule.objection(excess, 60, 1.01 * enough).endswith("cost too much, start 0")
+    assert rule.objection(excess) == rule.objection(excess, 0.99 * enough) == ""
+    assert rule.objection(excess, 1.01 * enough).endswith("cost too much, start 0")
 
 
-def test_episodes_are_picked_joined_and_replaced() -> None:
-    one = scores([1, 2, 3], visits=[[1, 0], [0, 1], [1, 1]])
-    assert one.at([2, 0]).costs.tolist() == [3, 1]
-    assert one.at([2, 0]).visits.tolist() == [[True, True], [True, False]]
-    longer = one.extended_by(scores([7]))
-    assert longer.costs.tolist() == [1, 2, 3, 7] and len(longer.unsafe) == len(longer.visits) == 4
-    other = one.replaced([1], scores([9], [[1, 2, 3, 4]], [[0, 0]]))
-    assert other.costs.tolist() == [1, 9, 3] and other.unsafe[1, :4].tolist() == [1, 2, 3, 4]
-    assert other.visits[1].tolist() == [False, False]
-    assert one.costs.tolist() == [1, 2, 3]  # as it was
-
-
-def test_some_starts_stand_for_all_and_starts_join() -> None:
-    some = starts([1, 2, 3], standard_errors=2.0).at([2, 0])
-    assert some.seeds == (102, 100) and some.mpc.costs.tolist() == [3, 1]
-    assert (some.n_starts, some.standard_errors) == (3, 2.0)
-    both = some.joined_with(starts([5.0]))
-    assert both.seeds == (102, 100, 100) and both.n_starts == 4 and both.standard_errors == 0.0
-    assert both.mpc.costs.tolist() == [3, 1, 5]
-
-
-def test_starts_lose_by_cost_or_by_what_is_unsafe() -> None:
+def test_starts_lose_by_cost_or_by_what_is_unsafe_and_the_hardest_come_first() -> None:
     given = starts([10, 10])
     assert given.lost(scores([11, 11.1])).tolist() == [False, True]
-    assert given.excess(scores([11, NAN])).tolist() == [1.0, INF]
-    assert given.is_lost(scores([11.1, 0])) and not given.is_lost(scores([11, 10]))
-    assert given.is_lost(scores([0, 0], [[0, 0, 0, 1], [0, 0, 0, 0]]))
-    # With a CVaR, of more starts than these: the worst tenth of twenty is two.
-    many = Starts((1, 2), scores([10, 10]), Tolerance(1.0, 0.1, 10.0), 20)
-    assert not many.is_lost(scores([11.5, 10])) and many.is_lost(scores([11.5, 10.6]))
-
-
-def test_the_mean_must_not_be_above_the_mpc_s_by_more_than_rounding() -> None:
-    given = starts([10, -30])
-    for more, above in ((0.9e-6, False), (1.1e-6, True)):
-        assert given.mean_is_above(scores([10, -30 + 2 * 20 * more])) == above
-    assert given.mean_is_above(scores([10, NAN]))
-    change = np.array([-3.0, 1.0, -1.0, -1.0])
-    edge = 1.0 / (change.std() / 2)  # standard errors that the mean is below
-    for errors, above in ((0.99 * edge, False), (1.01 * edge, True)):
-        surely = starts([10.0] * 4, Tolerance(9.0), standard_errors=errors)
-        assert surely.mean_is_above(scores(10 + change)) == above
-
-
-@pytest.mark.parametrize(
-    ("costs", "unsafe", "reason"),
-    [
-        ([12, 9, 13.5], (), "2 of 3 new starts lose against the MPC, seed 102 costs 3.5 more"),
-        ([9, 9, 12], [[0], [1], [0]],
-         "2 of 3 new starts lose against the MPC, seed 101 costs -1 more and violates a limit"),
-        ([9, 9, 9], [[0] * 4, [0, 0, 0, 1], [0] * 4],
-         "1 of 3 new starts lose against the MPC, seed 101 costs -1 more and moves an input too "
-         "far"),
-        ([10.5, 10, 10], (), "mean cost 10.1667 on 3 new starts, MPC 10"),
-        ([10, 10, 10.00006], (), "mean cost 10.00002 on 3 new starts, MPC 10"),
-        ([10, 10, 10], (), ""),
-    ],
-)  # fmt: skip
-def test_the_reason_names_the_hardest_start_and_how_many_are_lost(costs, unsafe, reason) -> None:
-    verdict = starts([10, 10, 10]).verdict(scores(costs, unsafe))
-    assert verdict.reason == reason
-    assert verdict.breaks_limit == ("violates" in reason)
-
-
-def test_at_the_end_a_gain_must_be_sure_and_large_enough() -> None:
-    rule = AcceptanceRule()
-    sure, least = rule.standard_errors, rule.least_gain
-    assert sure == pytest.approx(1.645, abs=1e-3)
-    assert AcceptanceRule(cvar_alpha=0).standard_errors == 0
-    change = np.random.default_rng(0).standard_normal(200)
-    change += -0.5 * change.std() / np.sqrt(200) - change.mean()
-    for errors, reason in ((0.0, ""), (sure, "not surely below")):
-        given = starts(np.full(200, 20.0), Tolerance(2.0, 0.05, 20.0), standard_errors=errors)
-        said = given.verdict(scores(20 + change)).reason
-        assert reason in said and bool(said) == bool(reason)
-    given = starts(np.full(50, -20.0), Tolerance(2.0, 0.05, 20.0), least_gain=least)
-    for gain, passes in ((0.0009, False), (0.0011, True)):
-        said = given.verdict(scores(np.full(50, -20 - 20 * gain))).reason
-        assert said.endswith("" if passes else ": too little a gain") and passes is not bool(said)
-
-
-def test_the_ten_hardest_starts_come_first_and_those_less_safe_before() -> None:
-    given = starts([10.0] * 15)
-    assert given.hardest(scores(12.0 + np.arange(15))).tolist() == [*range(14, 4, -1)]
-    assert len(given.hardest(scores([10.0] * 15))) == 0
+    assert given.lost(scores([0, 0], [[0, 0, 0, 1], [0, 0, 0, 0]])).tolist() == [True, False]
+    assert given.lost(scores([NAN])).tolist() == [True]  # of the first
+    many = starts([10.0] * 15)
+    assert many.hardest(scores(12.0 + np.arange(15))).tolist() == [*range(14, 4, -1)]
+    assert len(many.hardest(scores([10.0] * 15))) == 0
     given = starts(np.full(6, 20.0), Tolerance(2.0, 0.5, 20.0))
     costs = [21.9, 22.1, 23.9, 15, 20, 50]
     assert given.hardest(scores(costs)).tolist() == [5, 2, 1]
-    unsafe = np.zeros((6, 1))
-    unsafe[4] = 1
-    assert given.hardest(scores(costs, unsafe)).tolist() == [4, 5, 2, 1]
+    assert given.hardest(scores(costs, [[0]] * 4 + [[1], [0]])).tolist() == [4, 5, 2, 1]
     near = scores([21, 19, 21.5, 20, 18, 20.5])
     assert not given.lost(near).any()
     assert given.hardest(near).tolist() == [2, 0, 5]  # those that cost more than with the MPC
-    assert given.hardest(None).tolist() == [0]
+
+
+def test_hard_starts_come_first_and_count_in_no_mean() -> None:
+    both = starts([1, 2, 3]).with_hard(starts([5, 6]), np.array([1]))
+    assert both.seeds == (101, 100, 101, 102) and both.n_hard == 1
+    assert both.mpc.costs.tolist() == [6, 1, 2, 3]
+    dear = scores([6.5, 0.5, 1.5, 2.5])
+    assert no_worse(dear, both.mpc, both.mpc, STRICT, n_hard=1).accepted
+    verdict = no_worse(scores([7.5, 0, 0, 0]), both.mpc, both.mpc, STRICT, names=both.seeds)
+    assert verdict.reason == "start 101 costs 1.5 more than with the MPC"
+
+
+def test_a_gain_is_sure_or_hopeless_by_the_pairs() -> None:
+    mpc = scores(np.full(20, 10.0))
+    noise = np.tile([-1.0, 1.0], 10)
+
+    def found(change: float, **options: float) -> Any:
+        policy = scores(10 * (1 + change) + noise)
+        return no_worse(policy, mpc, mpc, Tolerance(9.0), **options)
+
+    edge = stats.t.ppf(0.95, 19) * noise.std(ddof=1) / np.sqrt(20) / 10
+    assert found(-1.01 * edge).is_sure and not found(-0.99 * edge).is_sure
+    assert not found(-1.01 * edge, level=0.01).is_sure
+    one = noise.std(ddof=1) / np.sqrt(20) / 10
+    assert found(1.01 * one).is_hopeless and not found(0.99 * one).is_hopeless
+    least = {"least_gain": 0.05}
+    assert found(1.01 * one - 0.025, **least).is_hopeless
+    assert not found(0.99 * one - 0.025, **least).is_hopeless
+    # What is lost for good is hopeless; a tail may fall below its bound with more starts.
+    unsafe = scores(np.full(20, 1.0), [[1]] + [[0]] * 19)
+    assert no_worse(unsafe, mpc, mpc, Tolerance(9.0)).is_hopeless
+    tail = scores([11.5] + [1.0] * 19)
+    assert not no_worse(tail, mpc, mpc, Tolerance(1.0, 0.05, 10.0)).is_hopeless
+    assert no_worse(tail, mpc, mpc, Tolerance(1.0)).is_hopeless
+
+
+def test_looks_double_and_share_the_level() -> None:
+    assert looks(5, 100) == [5, 10, 20, 40, 80, 100] and looks(5, 3) == [3]
+    assert sum(level_of_look(0.05, j) for j in range(1, 1000)) == pytest.approx(0.05, rel=0.01)
 
 
 def test_pairs_that_follow_each_other_alike_are_fewer_than_they_seem() -> None:
-    apart = PairedMean.of(np.tile([-1.0, 1.0], 20) + 3)
-    drifting = PairedMean.of(np.repeat([-1.0, 1.0], 20) + 3)
+    apart = Difference.of(np.tile([-1.0, 1.0], 20) + 3, in_turns=True)
+    drifting = Difference.of(np.repeat([-1.0, 1.0], 20) + 3, in_turns=True)
     assert apart.mean == drifting.mean == pytest.approx(3.0)
     assert apart.error == pytest.approx(1.0 / np.sqrt(39)) and drifting.error > 4 * apart.error
-    assert apart.room() == pytest.approx(stats.t.ppf(0.95, 39) * apart.error)
-    assert PairedMean.of(np.array([1.0])).room() == np.inf
+    assert apart.room(0.05) == pytest.approx(stats.t.ppf(0.95, 39) * apart.error)
+    assert Difference.of(np.array([1.0])).room(0.05) == np.inf
+    assert Difference.of(np.repeat([-1.0, 1.0], 20) + 3).error == apart.error  # of a simulator
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.5])
@@ -337,7 +289,7 @@ def test_a_drift_that_the_drawn_orders_line_up_is_no_gain_in_one_of_twenty_cases
     for pairs in range(2, 10):
         drift = 1 + noise * rng.standard_normal(pairs)  # the second of a pair costs more
         orders = 1 - 2 * (np.arange(2**pairs)[:, None] >> np.arange(pairs) & 1)
-        kept = [PairedMean.of(order * drift).is_below_zero() for order in orders]
+        kept = [Difference.of(each * drift, in_turns=True).is_below_zero(0.05) for each in orders]
         assert np.mean(kept) <= 0.05
         assert any(kept) == (pairs > 4)  # of four pairs one order in sixteen does it
 

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.journal import Journal
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
-from sb3_yann.compare import PairedMean, allowed_excess
+from sb3_yann.compare import Difference, allowed_excess
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import (
     BoundExcess,
@@ -40,11 +40,12 @@ class Costs(NamedTuple):
     predicted, promised : float
         What the twin had predicted, and how much less than for the MPC.
     mpc : float
-        What the plant showed of the MPC, which took turns with the policy: its episodes' cost, less
-        what the twin says that their starts differ by.
+        What the plant showed of the MPC, which took turns with the policy.
+    more : float, default nan
+        What the policy cost more, over pairs of episodes, less what the twin says that their starts
+        differ by.
     error : float, default 0
-        Standard error of ``actual - mpc``, over pairs of episodes, widened where those that follow
-        each other are correlated.
+        Its standard error, widened where pairs that follow each other are correlated.
     pairs : int, default 0
         Episodes of the policy that have one of the MPC beside them.
     own_reward : bool, default False
@@ -60,6 +61,7 @@ class Costs(NamedTuple):
     predicted: float
     promised: float
     mpc: float
+    more: float = np.nan
     error: float = 0.0
     pairs: int = 0
     own_reward: bool = False
@@ -67,9 +69,9 @@ class Costs(NamedTuple):
     chance: float = 0.0
 
     @property
-    def difference(self) -> PairedMean:
+    def difference(self) -> Difference:
         """The policy's cost less the MPC's."""
-        return PairedMean(self.actual - self.mpc, self.error, self.pairs, self.chance)
+        return Difference(self.more, self.error, self.pairs, self.chance)
 
 
 def compare(
@@ -103,15 +105,24 @@ def compare(
     longer = _longer(journal, problem, own)
     if not pairs:
         return Costs(mean, predicted, promised, np.nan, own_reward=pays_own, longer=longer)
-    more = actual[:pairs] - _costs(problem, of_mpc[:pairs], pays_own)
+    mpc = _costs(problem, of_mpc, pays_own)
+    more = actual[:pairs] - mpc[:pairs]
     if now is not None and not pays_own:
         starts = [predicted_costs(now, each[:pairs], plant.mpc) for each in (own, of_mpc)]
         more = more - (starts[0] - starts[1])
-    found = PairedMean.of(more)
-    mpc = mean - found.mean
-    error = found.error
-    chance = found.chance
-    return Costs(mean, predicted, promised, mpc, error, pairs, pays_own, longer, chance)
+    found = Difference.of(more, in_turns=True)
+    return Costs(
+        actual=mean,
+        predicted=predicted,
+        promised=promised,
+        mpc=float(mpc.mean()),
+        more=found.mean,
+        error=found.error,
+        pairs=pairs,
+        own_reward=pays_own,
+        longer=longer,
+        chance=found.chance,
+    )
 
 
 def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
@@ -144,8 +155,8 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     alarms = sum(each.alarm is not None for each in played)
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
-    room = min(costs.difference.room(), MOST * abs(costs.mpc))
-    if not costs.actual <= costs.mpc + room < np.inf:  # nor does NaN pass
+    room = min(costs.difference.room(0.05), MOST * abs(costs.mpc))
+    if not costs.more <= room < np.inf:  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
     return ""
@@ -153,7 +164,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
 
 def is_kept(costs: Costs) -> bool:
     """Return whether the plant has shown that the policy surely costs less than the MPC."""
-    return costs.difference.is_below_zero()
+    return costs.difference.is_below_zero(0.05)
 
 
 def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
@@ -181,7 +192,7 @@ def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]
 def is_confirmed(journal: Journal, costs: Costs) -> bool:
     """Return whether the plant gave at least half of what the twin had promised, without alarm."""
     quiet = not any(each.alarm for each, by_policy in journal.batch if by_policy)
-    gained = costs.mpc - costs.actual
+    gained = -costs.more
     return quiet and 0 < ENOUGH * costs.promised <= gained < np.inf
 
 

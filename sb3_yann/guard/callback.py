@@ -117,13 +117,15 @@ class ImprovementGuard(BaseCallback):
         The simulator: an id, a function that makes an env, or an env other than the training env.
         The first two play all starts side by side. Of a twin all members are played, start by
         start.
-    n_eval_episodes : int, default 100
-        Number of seeded starts.
-    n_new_starts : int, default 50
-        Number of new starts that confirm a policy before it is accepted, 0 for none. Where it loses
-        some, the ten hardest join the known starts, and an earlier policy or the MPC is restored.
+    n_eval_episodes : int, default 40
+        Number of seeded starts. A candidate plays as many of them as it takes: five, then twice as
+        many each, until it is surely better than the accepted policy, or hopeless.
+    n_new_starts : int, default 20
+        Number of further starts that confirm a policy before it is accepted, 0 for none; as many as
+        it takes. Where it loses there, the ten hardest join the known starts, and others follow.
     n_final_starts : int, default 10 * n_new_starts
-        Number of new starts that confirm the accepted policy when training ends.
+        Number of new starts that confirm the accepted policy when training ends: forty, and more
+        until its gain is sure. A strict rule plays all.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
     eval_freq : int, default 1
@@ -178,8 +180,8 @@ class ImprovementGuard(BaseCallback):
         self,
         env: Source | PlantTwin,
         *,
-        n_eval_episodes: int = 100,
-        n_new_starts: int = 50,
+        n_eval_episodes: int = 40,
+        n_new_starts: int = 20,
         n_final_starts: int | None = None,
         seed: int = 1_000_000,
         eval_freq: int = 1,

@@ -1,15 +1,15 @@
 """How a candidate is decided on: `decide` tries it on known starts, then on new ones.
 
-`decide` changes nothing: it returns the evidence from there on. A candidate that fails as a whole
-may pass in single regions or in part; a policy that loses on new starts gives way to a smaller
-correction, to an earlier policy, or to the MPC. What "no worse" means is in `sb3_yann.compare`.
+`decide` changes nothing: it returns the evidence from there on. Each trial is one sequence of
+pairs: a few starts, then twice as many, until the policy is surely better, or hopeless. A candidate
+that fails may pass in some regions, or in part. What "no worse" means is in `sb3_yann.compare`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -23,12 +23,15 @@ from sb3_yann.compare import (
     Scores,
     Starts,
     Verdict,
-    is_above,
+    format_distinct,
     less_safe,
+    level_of_look,
+    looks,
+    no_worse,
 )
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
-from sb3_yann.guard.state import Decision, Evidence, Outcome
+from sb3_yann.guard.state import Decision, Evidence, Outcome, Play
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
@@ -41,13 +44,15 @@ from sb3_yann.rollout import (
     rollout,
 )
 
+FIRST_LOOK = 5
+"""Starts of a trial after which it is looked at first."""
+FIRST_FINAL_LOOK = 40
+"""The same at the end: the worst 5 % of so many are two."""
+INTERIM_LEVEL = 0.2
+"""Of what confirms a policy until the end, one-sided: it has passed on the known starts."""
 PARTS_OF_THE_WAY = 0.5, 0.25
 """How far towards a refused candidate, and which shares of a correction that lost, are tried."""
-MAX_LOST_SHARE = 0.2
-"""Share of losing starts beyond which regions are not dropped one after the other."""
-
-Play = Callable[[ActorCheckpoint, Sequence[int]], Scores]
-"""From a checkpoint and seeds to the scores of its episodes; raises Unplayable."""
+TOO_LITTLE = "too little a gain"
 
 
 class Unplayable(Exception):
@@ -74,6 +79,11 @@ class GuardSettings:
         rule = {name: getattr(self.rule, name) for name in names}
         return {"env": self.env, "seeds": self.seeds, **rule}
 
+    @property
+    def least_gain(self) -> float:
+        """What a policy must gain; a strict rule takes any gain."""
+        return self.rule.least_gain if self.rule.cvar_alpha else 0.0
+
 
 def decide(
     evidence: Evidence, candidate: ActorCheckpoint, play: Play, settings: GuardSettings
@@ -88,98 +98,314 @@ def decide(
     diverged = candidate.has_diverged()
     if not diverged and not np.any(changed & evidence.scores.visits.any(axis=0)):
         return None
-
-    # The whole candidate on the known starts; else single regions; else part of the way to it.
-    scores, verdict = try_on_known(evidence, candidate, play)
-    hopeless = verdict.breaks_limit
-    after, share = evidence, 0.0
-    if scores is not None and verdict.accepted:
-        after, share = evidence.with_visited(candidate, scores), 1.0
-    elif scores is not None and not hopeless:
-        hopeless = verdict.above_mpc and not settings.keep_if_worse
-        if rule.by_region:
-            after = _accept_regions(evidence, candidate, scores, play)
-    if not verdict.accepted and not diverged and rule.backtrack:
-        if before.has_networks_of(after.accepted):
-            after, share = _accept_part_of_the_way(evidence, candidate, play)
-
-    # Whatever is new is confirmed on new starts.
-    tried, confirmed = after.accepted, Verdict()
-    if not before.has_networks_of(tried):
-        after, confirmed = _confirm(after, play, rule, settings.n_new_starts)
-    if not tried.has_networks_of(after.accepted):
-        share = 0.0
-
-    reason = verdict.reason or confirmed.reason
-    rejections = evidence.rejections + 1 if reason else 0
-    hopeless = hopeless or confirmed.breaks_limit
+    tried = _accept(evidence, candidate, play, settings)
+    after, verdict = tried.evidence, tried.verdict
+    reason, share = verdict.reason, float(verdict.accepted)
+    hopeless = verdict.breaks_limit or (verdict.above_mpc and not settings.keep_if_worse)
+    # What is as good as the accepted policy costs no patience.
+    rejections = evidence.rejections + (TOO_LITTLE not in reason) if reason else 0
     restored = bool(reason) and (rejections >= settings.patience or hopeless)
+    # Candidates that follow each other are alike: parts of the first and of the last are tried.
+    if reason and not diverged and TOO_LITTLE not in reason and (restored or rejections == 1):
+        for part, its_share in _parts(before, candidate, tried.scores, tried.others, rule):
+            found = _accept(after, part, play, settings)
+            after = found.evidence
+            if found.verdict.accepted:
+                share = its_share
+            if found.verdict.accepted or TOO_LITTLE in found.verdict.reason:
+                break  # a smaller part gains less
     after = replace(after, rejections=0 if restored else rejections)
     regions = _accepted_regions(before, candidate, after.accepted) if reason else []
-    return after, _decision(after, settings, scores, reason, restored, regions, share)
+    return after, _decision(after, tried.cost, reason, restored, regions, share)
 
 
 def decide_at_end(
     evidence: Evidence, play: Play, settings: GuardSettings
 ) -> tuple[Evidence, Decision | None]:
-    """Return the evidence after the final new starts, and the decision where it is a refusal."""
-    rule = settings.rule
-    bar = rule.standard_errors, rule.least_gain if rule.cvar_alpha else 0.0
-    after, verdict = _confirm(evidence, play, rule, settings.n_final_starts, *bar)
-    if verdict.accepted:
-        return after, None
-    regions = _accepted_regions(evidence.mpc, evidence.accepted, after.accepted)
-    reason = f"at the end, {verdict.reason}"
-    return after, _decision(after, settings, evidence.scores, reason, True, regions)
+    """Confirm what is accepted on the final new starts; return the evidence, and a refusal.
+
+    Where it loses, its parts and the latest earlier checkpoints are tried, else the MPC is
+    accepted. All that are tried share the probability of an error.
+    """
+    tried, rule = evidence.accepted, settings.rule
+    if settings.n_final_starts == 0 or not tried.has_learned():
+        return evidence, None
+    trial = _NewStarts(evidence, play, settings, at_end=True)
+    scores, verdict = trial.verdict(tried, level_of_look(rule.significance, 1))
+    evidence = replace(evidence, next_seed=trial.next_seed)
+    if scores is not None and verdict.accepted:
+        lost = np.flatnonzero(trial.new.lost(scores))
+        return replace(evidence, lost=tuple(trial.new.seeds[i] for i in lost)), None
+
+    cost = evidence.mean_cost(evidence.scores)
+    after, _ = _with_hard_starts(evidence.without_passed(tried), trial.new, scores)
+    mpc = after = replace(after, accepted=after.mpc, scores=after.starts.mpc)
+    of_mpc = None if scores is None else trial.new.mpc.at(slice(len(scores.costs)))
+    parts = [each for each, _ in _parts(mpc.mpc, tried, scores, of_mpc, rule)]
+    for number, policy in enumerate([*parts, *reversed(mpc.passed)], start=2):
+        known, its_scores, found = try_on_known(mpc, policy, play, settings)
+        if its_scores is None or not found.accepted:
+            continue
+        part = known.with_visited(policy, its_scores)
+        if trial.verdict(part.accepted, level_of_look(rule.significance, number))[1].accepted:
+            after = part.with_passed(part.accepted)
+            break
+    after = replace(after, next_seed=trial.next_seed)
+    regions = _accepted_regions(evidence.mpc, tried, after.accepted)
+    reason = f"at the end, {verdict.reason}; {_what_acts(after, tried)}"
+    return after, _decision(after, cost, reason, True, regions)
 
 
 def try_before_training(
     evidence: Evidence, candidate: ActorCheckpoint, play: Play, settings: GuardSettings
 ) -> tuple[Evidence, Decision | None]:
     """Return the evidence after a policy that has learnt before, and the decision on a refusal."""
-    scores, verdict = try_on_known(evidence, candidate, play)
+    evidence, scores, verdict = try_on_known(evidence, candidate, play, settings)
     if scores is not None and verdict.accepted:
         return evidence.with_visited(candidate, scores), None
-    reason = f"before training, {verdict.reason}"
-    return evidence, _decision(evidence, settings, scores, reason, True)
+    cost = evidence.mean_cost(scores)
+    return evidence, _decision(evidence, cost, f"before training, {verdict.reason}", True)
 
 
 def try_on_known(
-    evidence: Evidence, candidate: ActorCheckpoint, play: Play
-) -> tuple[Scores | None, Verdict]:
-    """Return a candidate's scores on the known starts, and the verdict on it."""
+    evidence: Evidence, candidate: ActorCheckpoint, play: Play, settings: GuardSettings
+) -> tuple[Evidence, Scores | None, Verdict]:
+    """Play a candidate from the known starts until they tell; return its scores and the verdict.
+
+    The evidence that is returned has the accepted policy's scores on the same starts.
+    """
     if candidate.has_diverged():
         reason = "a parameter of the actor is not a finite number, or too large"
-        return None, Verdict(reason, breaks_limit=True)
-    try:
-        scores = play(candidate, evidence.starts.seeds)
-    except Unplayable as error:
-        return None, Verdict(str(error), breaks_limit=True)
-    return scores, evidence.verdict(scores)
+        return evidence, None, Verdict(reason, breaks_limit=True)
+    starts, scores, verdict = evidence.starts, evidence.starts.mpc.at(slice(0)), Verdict()
+    for look, count in enumerate(looks(FIRST_LOOK, len(settings.seeds)), start=1):
+        stop = slice(starts.n_hard + count)
+        try:
+            evidence = evidence.known_up_to(stop.stop, play)
+            seeds = starts.seeds[len(scores.costs) : stop.stop]
+            scores = scores.extended_by(play(candidate, seeds))
+        except Unplayable as error:
+            return evidence, None, Verdict(str(error), breaks_limit=True)
+        verdict = no_worse(
+            scores,
+            evidence.scores.at(stop),
+            starts.mpc.at(stop),
+            starts.tolerance,
+            names=starts.seeds,
+            n_hard=starts.n_hard,
+            level=level_of_look(settings.rule.significance, look),
+            least_gain=settings.least_gain,
+        )
+        if verdict.is_hopeless or (verdict.accepted and verdict.is_sure):
+            break
+    if verdict.accepted and verdict.is_hopeless:
+        verdict = verdict._replace(reason=f"{TOO_LITTLE} over the accepted policy")
+    return evidence, scores, verdict
+
+
+class _Tried(NamedTuple):
+    """What came of a candidate: its mean cost, its scores, and those it was compared with."""
+
+    evidence: Evidence
+    verdict: Verdict
+    cost: float
+    scores: Scores | None = None
+    others: Scores | None = None
+
+
+def _accept(
+    evidence: Evidence, candidate: ActorCheckpoint, play: Play, settings: GuardSettings
+) -> _Tried:
+    """Accept a candidate that is no worse on the known starts, and confirmed on new ones."""
+    evidence, scores, verdict = try_on_known(evidence, candidate, play, settings)
+    cost = evidence.mean_cost(scores)
+    if scores is None:
+        return _Tried(evidence, verdict, cost)
+    others = evidence.scores.at(slice(len(scores.costs)))
+    if not verdict.accepted:
+        return _Tried(evidence, verdict, cost, scores, others)
+    after = evidence.with_visited(candidate, scores)
+    if settings.n_new_starts == 0 or not after.accepted.has_learned():
+        return _Tried(after, verdict, cost, scores, others)
+    trial = _NewStarts(evidence, play, settings)
+    new, verdict = trial.verdict(after.accepted, settings.rule.significance)
+    if verdict.accepted:
+        after = replace(after, next_seed=trial.next_seed, new=trial.new)
+        after = after.with_passed(after.accepted)
+        return _Tried(after, verdict, cost, scores, others)
+    if new is not None:
+        of_mpc = trial.new.mpc.at(slice(len(new.costs)))
+        scores, others = scores.extended_by(new), others.extended_by(of_mpc)
+    evidence = replace(evidence, next_seed=trial.next_seed)
+    after = _after_loss(evidence, trial.new, new, play)
+    return _Tried(after, verdict, cost, scores, others)
+
+
+class _NewStarts:
+    """Starts that have decided on no candidate but by confirming it; the MPC plays them once.
+
+    They are the same until a policy loses there, and others at the end.
+    """
+
+    def __init__(
+        self, evidence: Evidence, play: Play, settings: GuardSettings, at_end: bool = False
+    ) -> None:
+        self.mpc, self.play, self.rule = evidence.mpc, play, settings.rule
+        self.next_seed, self.at_end = evidence.next_seed, at_end
+        self.most = settings.n_final_starts if at_end else settings.n_new_starts
+        self.least_gain = settings.least_gain if at_end else 0.0
+        self.level = 0.0 if at_end else INTERIM_LEVEL
+        starts = evidence.starts
+        none = Starts((), starts.mpc.at(slice(0)), starts.tolerance)
+        self.new = none if at_end or evidence.new is None else evidence.new
+
+    def verdict(self, policy: ActorCheckpoint, level: float) -> tuple[Scores | None, Verdict]:
+        """Return a policy's scores, and whether it is no worse than the MPC.
+
+        At the end the gain must be sure, and large enough, but for a strict rule.
+        """
+        scores, verdict = self.new.mpc.at(slice(0)), Verdict()
+        first = FIRST_FINAL_LOOK if self.at_end else FIRST_LOOK
+        strict = not self.rule.cvar_alpha
+        for look, count in enumerate(looks(first, self.most), start=1):
+            self._extend(count)
+            had = slice(len(scores.costs), count)
+            try:
+                scores = scores.extended_by(self.play(policy, self.new.seeds[had]))
+            except Unplayable as error:
+                return None, Verdict(f"on new starts, {error}")
+            mpc = self.new.mpc.at(slice(count))
+            verdict = no_worse(
+                scores,
+                mpc,
+                mpc,
+                self.new.tolerance,
+                names=self.new.seeds,
+                level=self.level or level_of_look(level, look),
+                least_gain=self.least_gain,
+                tail_errors=self.rule.standard_errors if self.at_end else 0.0,
+            )
+            if self.at_end and not strict and verdict.accepted:
+                verdict = verdict._replace(reason=self._why_not_enough(scores, mpc, verdict))
+            sure = verdict.is_sure and not (self.at_end and strict)
+            if verdict.is_hopeless or (verdict.accepted and sure):
+                break
+        if verdict.accepted:
+            return scores, verdict
+        reason = f"on {len(scores.costs)} new starts, {verdict.reason}"
+        return scores, verdict._replace(reason=reason)
+
+    def _why_not_enough(self, scores: Scores, mpc: Scores, verdict: Verdict) -> str:
+        gained = mpc.costs.mean() - scores.costs.mean()
+        little = not gained >= self.least_gain * np.abs(mpc.costs).mean()
+        if verdict.is_sure and not little:
+            return ""
+        shown = format_distinct(scores.costs.mean(), mpc.costs.mean())
+        return f"mean cost {shown[0]}, MPC {shown[1]}: {TOO_LITTLE if little else 'not sure'}"
+
+    def _extend(self, count: int) -> None:
+        """Let the MPC play more, without those where its own cost is not finite."""
+        missing = count - len(self.new.seeds)
+        if missing <= 0:
+            return
+        seeds = range(self.next_seed, self.next_seed + missing)
+        mpc = self.play(self.mpc, seeds)
+        self.next_seed = seeds.stop
+        finite = np.flatnonzero(np.isfinite(mpc.costs))
+        if len(finite) == 0 and not self.new.seeds:
+            raise ValueError(
+                f"The MPC's own cost is a finite number on none of {missing} new starts of the "
+                "guard's env, so policies cannot be compared there. Its rewards must be finite."
+            )
+        self.new = replace(
+            self.new,
+            seeds=(*self.new.seeds, *(seeds[i] for i in finite)),
+            mpc=self.new.mpc.extended_by(mpc.at(finite)),
+        )
+
+
+def _with_hard_starts(
+    evidence: Evidence, new: Starts, scores: Scores | None
+) -> tuple[Evidence, NDArray[np.int64]]:
+    """Let the hardest starts of a policy that lost on new ones join the known ones; return which.
+
+    Others take the place of the new ones.
+    """
+    hard = np.zeros(1, dtype=np.int64) if scores is None else new.hardest(scores)
+    return replace(evidence, starts=evidence.starts.with_hard(new, hard), new=None), hard
+
+
+def _after_loss(evidence: Evidence, new: Starts, scores: Scores | None, play: Play) -> Evidence:
+    """Return the evidence after a policy has lost on new starts.
+
+    What is accepted must pass on all of these; else the latest earlier checkpoint that does is
+    accepted, or the MPC.
+    """
+    after, hard = _with_hard_starts(evidence, new, scores)
+    count = slice(1 if scores is None else len(scores.costs))
+    mpc = new.mpc.at(count)
+    for checkpoint, known in evidence.earlier():
+        try:
+            its = play(checkpoint, new.seeds[count])
+        except Unplayable:
+            continue
+        if no_worse(its, mpc, mpc, new.tolerance).accepted:
+            return replace(after, accepted=checkpoint, scores=its.at(hard).extended_by(known))
+        after = after.without_passed(checkpoint)
+    return replace(after, accepted=after.mpc, scores=after.starts.mpc)
+
+
+def _parts(
+    accepted: ActorCheckpoint,
+    candidate: ActorCheckpoint,
+    scores: Scores | None,
+    others: Scores | None,
+    rule: AcceptanceRule,
+) -> Iterator[tuple[ActorCheckpoint, float]]:
+    """Yield parts of a candidate that was refused, and which share of the way to it each is.
+
+    By region: the networks of those through which it wins more than it loses, by the episodes that
+    come through.
+    """
+    if rule.by_region and scores is not None and others is not None:
+        more = np.nan_to_num(scores.costs - others.costs, nan=np.inf)
+        more[less_safe(scores.unsafe, others.unsafe).any(axis=1)] = np.inf
+        visits, changed = scores.visits | others.visits, accepted.changed_regions(candidate)
+        lost = np.where(visits, np.maximum(more, 0.0)[:, None], 0.0).sum(axis=0)
+        won = np.where(visits, np.maximum(-more, 0.0)[:, None], 0.0).sum(axis=0)
+        kept = changed & (won > lost)
+        if kept.any() and np.any(changed & visits.any(axis=0) & ~kept):
+            yield accepted.with_regions(candidate, np.flatnonzero(kept).tolist()), 0.0
+    if rule.backtrack:
+        for share in PARTS_OF_THE_WAY:
+            from_mpc = not accepted.has_learned()
+            yield (
+                candidate.shrunk(share) if from_mpc else accepted.part_way(candidate, share),
+                share,
+            )
 
 
 def _decision(
     evidence: Evidence,
-    settings: GuardSettings,
-    scores: Scores | None,
+    candidate_cost: float,
     reason: str,
     restored: bool,
     regions: Sequence[int] = (),
     share: float = 0.0,
 ) -> Decision:
-    first = slice(len(settings.seeds))  # hard starts come and go: costs must be comparable
-    costs, mpc_costs = evidence.scores.costs[first], evidence.starts.mpc.costs[first]
+    starts, costs = evidence.starts, evidence.scores.costs
     verdict: Outcome = "accepted"
     if reason:
         verdict = "accepted in part" if regions or share else "rejected"
+    more = (costs - starts.mpc.costs[: len(costs)])[starts.n_hard :]
     return Decision(
         verdict=verdict,
         reason=reason,
         restored=restored,
-        candidate_cost=np.nan if scores is None else float(scores.costs[first].mean()),
-        accepted_cost=float(costs.mean()),
-        mpc_cost=float(mpc_costs.mean()),
-        worst_start=float(np.max(costs - mpc_costs)),
+        candidate_cost=candidate_cost,
+        accepted_cost=evidence.mean_cost(evidence.scores),
+        mpc_cost=evidence.mean_cost(starts.mpc),
+        worst_start=float(np.max(more, initial=-np.inf)),
         regions=tuple(regions),
         share=share,
     )
@@ -193,154 +419,6 @@ def _accepted_regions(
     return [int(region) for region in np.flatnonzero(new)]
 
 
-def _accept_part_of_the_way(
-    evidence: Evidence, candidate: ActorCheckpoint, play: Play
-) -> tuple[Evidence, float]:
-    """Accept what lies half or a quarter of the way to a refused candidate; return the share."""
-    for share in PARTS_OF_THE_WAY:
-        between = evidence.accepted.part_way(candidate, share)
-        try:
-            scores = play(between, evidence.starts.seeds)
-        except Unplayable:
-            continue
-        if evidence.improves(scores):
-            return evidence.with_visited(between, scores), share
-    return evidence, 0.0
-
-
-def _accept_regions(
-    evidence: Evidence, candidate: ActorCheckpoint, scores: Scores | None, play: Play
-) -> Evidence:
-    """Accept regions of a refused candidate; its scores are None where it cannot be played."""
-    # In another box of theta no mixture is what was played, anywhere.
-    if scores is not None and evidence.accepted.is_confined_as(candidate):
-        evidence = _accept_all_but_losing(evidence, candidate, scores, play)
-    return _accept_one_by_one(evidence, candidate, scores, play)
-
-
-def _accept_all_but_losing(
-    evidence: Evidence, candidate: ActorCheckpoint, scores: Scores, play: Play
-) -> Evidence:
-    """Drop the regions by which few starts lose, until the others can be accepted.
-
-    Losing starts come through the dropped region most, winning ones least. Only its episodes are
-    played again.
-    """
-    before, starts = evidence.accepted, evidence.starts
-    visited = (evidence.scores.visits | scores.visits).any(axis=0)
-    kept = np.flatnonzero(before.changed_regions(candidate) & visited).tolist()
-    while len(kept) > 1:
-        lost = starts.excess(scores) > 1.0
-        if not lost.any() or lost.mean() > MAX_LOST_SHARE:
-            break
-        won = scores.costs < evidence.scores.costs - starts.tolerance.margin
-        blame = scores.visits[lost].sum(axis=0)[kept]
-        credit = scores.visits[won].sum(axis=0)[kept]
-        if not blame.any():
-            break
-        dropped = kept.pop(int(np.argmax(blame / (blame + credit + 1e-9))))
-        mixed = before.with_regions(candidate, kept)
-        again = np.flatnonzero(scores.visits[:, dropped])
-        try:
-            scores = scores.replaced(again, _play_some(evidence, mixed, again, play))
-        except Unplayable:
-            break
-        if evidence.improves(scores):
-            return evidence.with_visited(mixed, scores)
-    return evidence
-
-
-def _accept_one_by_one(
-    evidence: Evidence, candidate: ActorCheckpoint, scores: Scores | None, play: Play
-) -> Evidence:
-    """Accept the regions of the candidate that improve the accepted policy, one by one."""
-    for region in np.argsort(-evidence.scores.visits.sum(axis=0), kind="stable").tolist():
-        visiting = np.flatnonzero(evidence.scores.visits[:, region])
-        if len(visiting) == 0 or not evidence.accepted.changed_regions(candidate)[region]:
-            continue
-        mixed = evidence.accepted.with_regions(candidate, [region])
-        known, trial = visiting[:0], evidence.scores
-        if scores is not None:
-            # The candidate's own episodes, if they meet no region where the mixture is another.
-            other = mixed.changed_regions(candidate)
-            known = visiting[~scores.visits[visiting][:, other].any(axis=1)]
-            trial = trial.replaced(known, scores.at(known))
-            if len(known) and _lose_already(evidence, trial, known):
-                continue  # whatever the others cost
-        others = np.setdiff1d(visiting, known)
-        try:
-            trial = trial.replaced(others, _play_some(evidence, mixed, others, play))
-        except Unplayable:
-            continue
-        if evidence.improves(trial):
-            evidence = evidence.with_accepted(mixed, trial)
-    return evidence
-
-
-def _lose_already(evidence: Evidence, trial: Scores, index: NDArray[np.int64]) -> bool:
-    """Return whether some episodes are lost against the MPC, or less safe than those accepted."""
-    starts, own = evidence.starts.at(index), trial.at(index)
-    allowed = np.minimum(evidence.scores.unsafe, evidence.starts.mpc.unsafe)[index]
-    less = less_safe(own.unsafe, allowed, starts.tolerance.excess_room)
-    return starts.is_lost(own) or bool(np.any(less))
-
-
-def _play_some(
-    evidence: Evidence, checkpoint: ActorCheckpoint, index: NDArray[np.int64], play: Play
-) -> Scores:
-    """Return the scores of a checkpoint on some of the known starts."""
-    if len(index) == 0:
-        return evidence.scores.at(index)
-    return play(checkpoint, [evidence.starts.seeds[i] for i in index])
-
-
-def _confirm(
-    evidence: Evidence,
-    play: Play,
-    rule: AcceptanceRule,
-    n_starts: int,
-    standard_errors: float = 0.0,
-    least_gain: float = 0.0,
-) -> tuple[Evidence, Verdict]:
-    """Play what is accepted from new starts; return the evidence from there on, and the verdict.
-
-    Where it loses, the better one of half or a quarter of its correction, and the latest earlier
-    checkpoint that passes all of these starts, is accepted instead; else the MPC. The hardest
-    starts join the known ones. Where the rule says so, single regions of what lost may still be
-    accepted, and are confirmed on other new starts.
-    """
-    first, tried = Verdict(), evidence.accepted
-    for _ in range(3):  # what is left of a policy that lost is tried on others
-        lost = evidence.accepted
-        if n_starts == 0 or not lost.has_learned():
-            break
-        evidence, new = _new_starts(evidence, play, n_starts)
-        new = replace(new, standard_errors=standard_errors, least_gain=least_gain)
-        scores: Scores | None = None
-        try:
-            scores = play(lost, new.seeds)
-            verdict = new.verdict(scores)
-        except Unplayable as error:
-            verdict = Verdict(f"on new starts, {error}")
-        if verdict.accepted:
-            evidence = evidence.with_passed(lost, evidence.scores)
-            break
-        first = verdict if first.accepted else first
-        hard = new.hardest(scores)
-        known = None if scores is None else evidence.scores.extended_by(scores.at(hard))
-        smaller = lost if rule.backtrack else evidence.mpc
-        safe = evidence = _fall_back(evidence.without_passed(lost), smaller, new, hard, play)
-        if rule.by_region:
-            evidence = _accept_regions(safe, lost, known, play)
-        if evidence.accepted is safe.accepted:
-            break
-    else:  # what has not been confirmed on new starts is not accepted
-        evidence = safe
-    if first.accepted:
-        return evidence, first
-    return evidence, first._replace(reason=f"{first.reason}; {_what_acts(evidence, tried)}")
-
-
 def _what_acts(evidence: Evidence, tried: ActorCheckpoint) -> str:
     """Say what is accepted in the place of a policy that lost."""
     accepted = evidence.accepted
@@ -352,81 +430,6 @@ def _what_acts(evidence: Evidence, tried: ActorCheckpoint) -> str:
     if _accepted_regions(evidence.mpc, tried, accepted):
         return "what it has learnt in other regions is kept"
     return "an earlier policy is restored"
-
-
-def _new_starts(evidence: Evidence, play: Play, n_starts: int) -> tuple[Evidence, Starts]:
-    """Return as many new starts, without those where the MPC's own cost is not finite."""
-    seeds = range(evidence.next_seed, evidence.next_seed + n_starts)
-    mpc = play(evidence.mpc, seeds)
-    finite = np.flatnonzero(np.isfinite(mpc.costs))
-    if len(finite) == 0:
-        raise ValueError(
-            f"The MPC's own cost is a finite number on none of {n_starts} new starts of the "
-            "guard's env, so policies cannot be compared there. Its rewards must be finite."
-        )
-    new = Starts((*seeds,), mpc, evidence.starts.tolerance, len(finite)).at(finite)
-    return replace(evidence, next_seed=seeds.stop), new
-
-
-def _fall_back(
-    evidence: Evidence, lost: ActorCheckpoint, new: Starts, hard: NDArray[np.int64], play: Play
-) -> Evidence:
-    """Accept a smaller correction or the latest earlier checkpoint that passes, else the MPC.
-
-    Each is tried on the new starts, of which ``hard`` join the known ones.
-    """
-    known = evidence.starts.joined_with(new.at(hard))
-    smaller: list[tuple[ActorCheckpoint, Scores | None]] = []
-    if lost.has_learned():
-        smaller = [(lost.shrunk(share), None) for share in PARTS_OF_THE_WAY]
-    best, scores = evidence.mpc, known.mpc
-    for group in (smaller, [*reversed(evidence.passed)]):
-        for checkpoint, had in group:
-            found = _scores_if_passed(evidence.starts, known, checkpoint, had, new, hard, play)
-            if found is not None:
-                if not is_above(found.costs, scores.costs):
-                    best, scores = checkpoint, found
-                break
-    after = replace(evidence, accepted=best, starts=known, scores=scores)
-    return after if best is evidence.mpc else after.with_passed(best, scores)
-
-
-def _scores_if_passed(
-    before: Starts,
-    known: Starts,
-    checkpoint: ActorCheckpoint,
-    had: Scores | None,
-    new: Starts,
-    hard: NDArray[np.int64],
-    play: Play,
-) -> Scores | None:
-    """Return a checkpoint's scores on the known starts where it is no worse than the MPC there.
-
-    The hard ones come first: they are few, and most checkpoints lose some. Then come the other new
-    ones, and those known ``before`` that its scores ``had`` lack.
-    """
-    others = np.setdiff1d(np.arange(len(new.seeds)), hard)
-    lacking = np.arange(0 if had is None else len(had.costs), len(before.seeds))
-    parts = []
-    for starts in (new.at(hard), new.at(others), before.at(lacking)):
-        scores = starts.mpc  # of no starts
-        if starts.seeds:
-            try:
-                scores = play(checkpoint, starts.seeds)
-            except Unplayable:
-                return None
-            if starts.is_lost(scores):
-                return None
-        parts.append(scores)
-    on_known = parts[2] if had is None else had.extended_by(parts[2])
-    everywhere = on_known.extended_by(parts[0])
-    for starts, scores in (
-        (new.at(np.concatenate([hard, others])), parts[0].extended_by(parts[1])),
-        (known, everywhere),
-    ):
-        if starts.is_lost(scores) or starts.mean_is_above(scores):
-            return None
-    return everywhere
 
 
 class Player:

@@ -8,6 +8,7 @@ import math
 import os
 import warnings
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
@@ -18,12 +19,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann._validation import Array, check_type
-from sb3_yann.compare import Scores, Starts, Verdict, is_above, no_worse
+from sb3_yann.compare import Scores, Starts
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import StartsAsMPC
 
+Play = Callable[[ActorCheckpoint, Sequence[int]], Scores]
+"""From a checkpoint and seeds to the scores of its episodes."""
 Outcome = Literal["accepted", "accepted in part", "rejected"]
-MAX_PASSED = 20
+MAX_PASSED = 5
 """Earlier accepted checkpoints that are kept, at most."""
 MAX_PASSED_BYTES = 10_000_000
 """Their size, at most."""
@@ -38,10 +41,15 @@ class Evidence:
     accepted, mpc : ActorCheckpoint
         The policy accepted last, and the MPC with the weights that it goes on to learn from.
     starts, scores : Starts and Scores
-        The known starts, hard ones that joined them included; the accepted policy's scores there.
+        The known starts, hard ones that joined them first; the accepted policy's scores on as many
+        of them as it has played.
     next_seed, rejections : int, of the next new start; refusals in a row
-    passed : tuple of (ActorCheckpoint, Scores or None), the latest last
-        Earlier accepted checkpoints, with their scores on the first of the known starts.
+    passed : tuple of ActorCheckpoint, the latest last
+        Accepted checkpoints that new starts have confirmed.
+    lost : tuple of int
+        Seeds of the final starts that the accepted policy has lost, which the rule allows.
+    new : Starts or None
+        Those on which policies are confirmed, until one loses there.
     """
 
     accepted: ActorCheckpoint
@@ -49,21 +57,37 @@ class Evidence:
     starts: Starts
     scores: Scores
     next_seed: int
-    passed: tuple[tuple[ActorCheckpoint, Scores | None], ...] = ()
+    passed: tuple[ActorCheckpoint, ...] = ()
     rejections: int = 0
+    lost: tuple[int, ...] = ()
+    new: Starts | None = None
 
-    def verdict(self, scores: Scores) -> Verdict:
-        """Return whether a policy is no worse on the known starts."""
-        starts = self.starts
-        return no_worse(scores, self.scores, starts.mpc, starts.tolerance, starts.n_starts)
+    def mean_cost(self, scores: Scores | None) -> float:
+        """Return a policy's mean cost over all known starts but the hard ones; nan without scores.
 
-    def improves(self, scores: Scores) -> bool:
-        """Return whether the mean cost falls, and nothing speaks against the policy."""
-        return is_above(self.scores.costs, scores.costs) and self.verdict(scores).accepted
+        From those that it has played: the MPC's mean cost, times what it costs of the MPC's there.
+        """
+        mpc = self.starts.mpc.costs[self.starts.n_hard :]
+        if scores is None or len(scores.costs) <= self.starts.n_hard:
+            return math.nan
+        costs = scores.costs[self.starts.n_hard :]
+        own = mpc[: len(costs)]
+        if len(costs) == len(mpc) or not np.abs(own).sum():
+            return float(costs.mean())
+        more = (costs - own).sum() / np.abs(own).sum()
+        return float(mpc.mean() + more * np.abs(mpc).mean())
+
+    def known_up_to(self, count: int, play: Play) -> Evidence:
+        """Return the evidence with the accepted policy's scores on so many starts at least."""
+        had = len(self.scores.costs)
+        if had >= count:
+            return self
+        more = play(self.accepted, self.starts.seeds[had:count])
+        return replace(self, scores=self.scores.extended_by(more))
 
     def with_accepted(self, checkpoint: ActorCheckpoint, scores: Scores) -> Evidence:
         """Return the evidence with another accepted policy."""
-        return replace(self, accepted=checkpoint, scores=scores)
+        return replace(self, accepted=checkpoint, scores=scores, lost=())
 
     def with_visited(self, candidate: ActorCheckpoint, scores: Scores) -> Evidence:
         """Return the evidence with a candidate accepted in the regions that its episodes visit.
@@ -76,17 +100,24 @@ class Evidence:
             candidate = self.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
         return self.with_accepted(candidate, scores)
 
+    def earlier(self) -> Iterator[tuple[ActorCheckpoint, Scores]]:
+        """Yield the accepted policy and earlier ones, the latest first, with their known scores."""
+        if not self.accepted.has_networks_of(self.mpc):
+            yield self.accepted, self.scores
+        for each in reversed(self.without_passed(self.accepted).passed):
+            yield each, self.scores.at(slice(0))
+
     def without_passed(self, checkpoint: ActorCheckpoint) -> Evidence:
         """Return the evidence without an earlier checkpoint, which lost on new starts after all."""
-        passed = [each for each in self.passed if not each[0].has_networks_of(checkpoint)]
+        passed = [each for each in self.passed if not each.has_networks_of(checkpoint)]
         return replace(self, passed=tuple(passed))
 
-    def with_passed(self, checkpoint: ActorCheckpoint, scores: Scores | None) -> Evidence:
+    def with_passed(self, checkpoint: ActorCheckpoint) -> Evidence:
         """Return the evidence with one more earlier checkpoint, as far as memory allows."""
         kept = self.without_passed(checkpoint)
         if checkpoint.has_networks_of(self.mpc):  # which is always there
             return kept
-        passed = (*kept.passed, (checkpoint, scores))
+        passed = (*kept.passed, checkpoint)
         most = min(len(passed), MAX_PASSED, max(1, MAX_PASSED_BYTES // checkpoint.size))
         return replace(kept, passed=passed[-most:])
 
@@ -296,8 +327,8 @@ ADVICE = {
 def summary_of(state: GuardState, policy: StartsAsMPC) -> str:
     """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
     decisions, n_starts = state.decisions, len(state.settings["seeds"])
-    cost = float(state.evidence.scores.costs[:n_starts].mean())
-    mpc_cost = float(state.evidence.starts.mpc.costs[:n_starts].mean())
+    cost = state.evidence.mean_cost(state.evidence.scores)
+    mpc_cost = state.evidence.mean_cost(state.evidence.starts.mpc)
     more = "less" if cost < mpc_cost else "more"
     change = relative_change(cost, mpc_cost)
     size = f"{100 * abs(change):.2g} % {more}" if math.isfinite(change) else more
@@ -310,6 +341,11 @@ def summary_of(state: GuardState, policy: StartsAsMPC) -> str:
             f"{mpc_cost:.6g}."
         )
     lines = [f"The policy accepted last {line}"]
+    if lost := state.evidence.lost:
+        lines.append(
+            f"Of the final starts it loses {len(lost)} by more than the margin, which the rule "
+            f"allows: seeds {', '.join(map(str, lost[:10]))}{', ...' * (len(lost) > 10)}."
+        )
     if not state.accepted.is_actor_of(policy):
         lines.append(
             "The model's policy is another one, which no guard has accepted: "

@@ -33,7 +33,6 @@ from guard_samples import (
     verdicts,
 )
 from sb3_yann import restore_accepted
-from sb3_yann.guard import decide
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.rollout import evaluate
@@ -74,14 +73,14 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     model, guard = tried(spoil_left, env=OftenRight, n_new_starts=20)
     decision = guard.decisions[0]
     assert decision.verdict == "accepted in part"
-    assert "7 of 20 new starts lose against the MPC, seed 1000" in decision.reason
-    assert decision.reason.endswith("; what it has learnt in other regions is kept")
+    assert decision.reason == "on 5 new starts, start 1000011 costs 4 more than with the MPC"
     assert decision.regions == (REGION[RIGHT],)
     weights = last_layer(model)[:, :, -1]
     assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()
-    known = guard.state.evidence.starts.seeds
-    assert known[:10] == tuple(range(FIRST, FIRST + 10))
-    assert len(known) == 17 and all(seed % 3 == 0 for seed in known[10:])
+    starts = guard.state.evidence.starts
+    hard, known = starts.seeds[: starts.n_hard], starts.seeds[starts.n_hard :]
+    assert sorted(known) == [*range(FIRST, FIRST + 10)]
+    assert hard and all(seed % 3 == 0 for seed in hard)
 
 
 @pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
@@ -92,7 +91,7 @@ def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, 
     assert guard.state.evidence.next_seed == FIRST + 10 + seeds
     assert is_mpc(model) == (final is not None)
     if final is not None:
-        assert guard.decisions[-1].reason.startswith("at the end, 10 of 30 new starts lose")
+        assert guard.decisions[-1].reason.startswith("at the end, on 30 new starts, start 1000")
 
 
 def test_without_by_region_the_whole_of_it_is_refused() -> None:
@@ -112,12 +111,12 @@ def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> No
     first, second = guard.decisions[:2]
     assert "new starts" in first.reason
     assert "new starts" not in second.reason and "costs" in second.reason
-    assert guard.state.evidence.next_seed == FIRST + 30
+    assert guard.state.evidence.next_seed == FIRST + 15
 
 
 def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
-    # The first twenty new starts show the right only: all of it is accepted.
-    simulator = partial(OftenRight, after=FIRST + 30)
+    # The first five new starts show the right only: all of it is accepted.
+    simulator = partial(OftenRight, after=FIRST + 15)
     model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
 
     def a_little_better(policy) -> None:
@@ -132,7 +131,7 @@ def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() 
 
     steps = [At([STEPS], spoiled), At([2 * STEPS], still_better)]
     train(model, 2 * STEPS, *steps, guard)
-    assert [each.verdict for each in guard.decisions] == ["accepted", "rejected"]
+    assert verdicts(guard) == ["accepted", "accepted", "rejected"]  # the last one at the end
     assert actor_bits(model.policy) == accepted_bits(guard)
     assert is_mpc(model)
     assert guard.decisions[-1].accepted_cost == pytest.approx(guard.decisions[-1].mpc_cost)
@@ -150,20 +149,20 @@ def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
     model = build(gradient_steps=0)
     guard = make_guard(Brittle, n_new_starts=20, rule=WHOLE, patience=5)
     train(model, STEPS, At([STEPS], lambda policy: correct(policy, LEFT, -0.5)), guard)
-    (decision,) = guard.decisions
-    assert "violates a limit" in decision.reason and decision.restored
+    decision = guard.decisions[0]
+    assert "on 5 new starts, 2 of 5 starts with violations" in decision.reason and decision.restored
 
 
 def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
     # Only the very last of them shows the left.
-    simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 20 + 199)
+    simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 5 + 199)
     model, guard = tried(spoil_left, env=simulator, n_new_starts=20)
     whole, end = guard.decisions
     assert whole.verdict == "accepted"
-    assert end.verdict == "accepted in part" and end.reason.startswith("at the end, 1 of 200 new")
+    assert end.verdict == "accepted in part" and end.reason.startswith("at the end, on 200 new")
     assert not last_layer(model)[REGION[LEFT], :, -1].any()
     assert actor_bits(model.policy) == accepted_bits(guard)
-    assert guard.state.evidence.starts.seeds[10:] == (FIRST + 10 + 20 + 199,)
+    assert guard.state.evidence.starts.seeds[0] == FIRST + 10 + 5 + 199
 
 
 def test_new_starts_are_others_each_time_and_after_a_load(tmp_path) -> None:
@@ -197,17 +196,17 @@ SHARED_NETWORK = {"networks": "shared"}
 def test_of_a_step_too_far_half_is_accepted() -> None:
     model = build(gradient_steps=0, actor=SHARED_NETWORK)
     guard = make_guard(n_new_starts=0, rule=GENTLE)
-    train(model, STEPS, At([STEPS], lambda policy: push(policy, 2.4)), guard)
+    train(model, STEPS, At([STEPS], lambda policy: push(policy, 1.2)), guard)
     (decision, *_) = guard.decisions
     assert (decision.verdict, decision.share) == ("accepted in part", 0.5)
-    assert decision.candidate_cost > decision.mpc_cost > decision.accepted_cost
+    assert decision.candidate_cost > decision.accepted_cost < decision.mpc_cost
     assert not is_mpc(model)
 
 
 def test_without_backtracking_it_is_refused() -> None:
     model = build(gradient_steps=0, actor=SHARED_NETWORK)
     guard = make_guard(n_new_starts=0, rule={**GENTLE, "backtrack": False})
-    train(model, STEPS, At([STEPS], lambda policy: push(policy, 2.4)), guard)
+    train(model, STEPS, At([STEPS], lambda policy: push(policy, 1.2)), guard)
     assert (guard.decisions[0].verdict, guard.decisions[0].share) == ("rejected", 0.0)
     assert is_mpc(model)
 
@@ -240,15 +239,17 @@ def test_a_fall_back_to_the_mpc_is_called_that() -> None:
 
 
 @pytest.mark.parametrize("rule", [{}, {"least_gain": 0.0}, {"cvar_alpha": 0}])
-def test_what_gains_little_is_the_mpc_at_the_end_but_where_any_gain_will_do(rule) -> None:
+def test_what_gains_little_is_refused_at_no_cost_of_patience_but_where_any_gain_will_do(
+    rule,
+) -> None:
     model = build(gradient_steps=0)
-    guard = make_guard(n_final_starts=60, rule={**GENTLE, **rule})
-    train(model, STEPS, At([STEPS], lambda policy: correct(policy, RIGHT, 1e-4)), guard)
-    assert guard.decisions[0].verdict == "accepted"
-    assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
+    guard = make_guard(n_final_starts=60, rule={**GENTLE, **rule}, patience=1)
+    train(model, STEPS + 1, At([STEPS], lambda policy: correct(policy, RIGHT, 1e-4)), guard)
+    first = guard.decisions[0]
+    assert (first.verdict == "accepted") is bool(rule)
     assert is_mpc(model) is not bool(rule)
-    last = guard.decisions[-1].reason
-    assert ("too little a gain; the guard falls back to the MPC" in last) is not bool(rule)
+    if not rule:
+        assert first.reason == "too little a gain over the accepted policy" and not first.restored
 
 
 def half_good(policy: YannPolicy) -> None:
@@ -301,29 +302,13 @@ def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
     model, guard = tried(half_good)
     assert guard.decisions[0].regions == (REGION[RIGHT],)
     played = evaluate(model, Slide, guard.settings.seeds)
-    np.testing.assert_allclose(guard.state.evidence.scores.costs, played.costs, atol=1e-5)
+    evidence = guard.state.evidence
+    order = np.argsort(evidence.starts.seeds)
+    np.testing.assert_allclose(evidence.scores.costs[order], played.costs, atol=1e-5)
     assert guard.decisions[0].accepted_cost == pytest.approx(played.costs.mean())
     assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
     assert guard.decisions[0].candidate_cost > guard.decisions[0].mpc_cost
     assert guard.decisions[0].step == 1  # neither shrinks nor grows
-
-
-@pytest.mark.parametrize("most_lost", [0.0, 0.5], ids=["one by one", "all but those that lose"])
-def test_only_the_starts_that_come_through_a_region_are_played_again(
-    most_lost, monkeypatch
-) -> None:
-    monkeypatch.setattr(decide, "MAX_LOST_SHARE", most_lost)
-    simulator = Slide()
-    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=0)
-    count: list[int] = []
-    before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
-    train(model, STEPS, At([STEPS], half_good), before, guard, after)
-    assert guard.decisions[0].regions == (REGION[RIGHT],)
-    left, right = guard.state.evidence.scores.visits[:, [REGION[LEFT], REGION[RIGHT]]].sum(0)
-    assert 0 < left < right < 10
-    # One by one, the candidate's own episodes stand for those that come through one region only.
-    episodes = 10 if most_lost == 0 else 10 + left
-    assert count[1] - count[0] == episodes * STEPS
 
 
 def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
@@ -362,23 +347,20 @@ def test_moments_that_the_accepted_policy_has_not_got_are_zero_elsewhere() -> No
             assert not state["exp_avg_sq"][region].any()
 
 
-def test_a_candidate_in_another_box_is_accepted_with_it_or_mixed_within_the_old() -> None:
+def test_a_candidate_in_another_box_is_accepted_with_it_or_leaves_the_old() -> None:
     box = 2 * np.ones(build().policy.problem.n_theta)
 
     def confined(change, policy) -> None:
         change(policy)
         policy.confine_correction(-box, box)
 
-    for change, verdict, kept in ((half_good, "accepted in part", False), (good, "accepted", True)):
+    for change, verdict, kept in ((half_good, "rejected", False), (good, "accepted", True)):
         model, guard = build(gradient_steps=0), make_guard()
         before = ActorCheckpoint.of(model.policy)
         train(model, STEPS + 1, At([STEPS], partial(confined, change)), guard)
         assert guard.decisions[0].verdict == verdict
         assert bool(model.actor.mu.confines.any()) == kept
-        assert float(last_layer(model)[REGION[RIGHT], 0, -1].detach()) == 0.5
-        other = ActorCheckpoint.of(build(gradient_steps=0).policy)
         assert before.changed_regions(guard.state.accepted).all() == kept
-        assert not before.changed_regions(other)[REGION[LEFT]]
 
 
 def good(policy: YannPolicy) -> None:
@@ -392,7 +374,7 @@ def weights(model) -> np.ndarray:
 class LateLosses(Slide):
     """Of the starts from a seed on, on some the left costs a lot, and on some any correction."""
 
-    late = FIRST + 10 + 40
+    late = FIRST + 10 + 10
 
     def reset(self, *, seed=None, options=None):
         late = seed is not None and seed >= self.late
@@ -415,8 +397,8 @@ def test_what_is_put_back_at_the_end_is_tried_on_all_of_the_new_starts() -> None
     model, guard = build(gradient_steps=0), make_guard(LateLosses, n_new_starts=20)
     first = At([1], partial(correct, region=RIGHT, value=0.4))
     train(model, 2 * STEPS, first, At([STEPS + 1], left_as_well), guard)
-    assert guard.decisions[-1].reason.startswith("at the end, 120 of 200 new starts lose")
-    seeds = range(FIRST + 10 + 40, FIRST + 10 + 40 + 200)
+    assert guard.decisions[-1].reason.startswith("at the end, on ")
+    seeds = range(FIRST + 10 + 10, FIRST + 10 + 10 + 200)
     costs, mpc = (evaluate(each, LateLosses, seeds).costs for each in (model, build()))
     assert np.all(costs <= mpc + guard.state.evidence.starts.tolerance.margin)
     assert costs.mean() <= mpc.mean() + 1e-6
@@ -440,7 +422,7 @@ def test_a_policy_whose_mean_cost_on_new_starts_is_above_the_mpc_s_is_refused() 
     model, guard = tried(
         partial(correct, region=RIGHT, value=0.5), env=simulator, n_new_starts=50, patience=5
     )
-    assert "mean cost 4.0375 on 50 new starts, MPC 4" in guard.decisions[0].reason
+    assert guard.decisions[0].reason == "on 5 new starts, mean cost 4.0375, MPC 4"
     assert is_mpc(model)
     assert (
         guard.state.evidence.starts.tolerance.margin > 0.0375
@@ -450,7 +432,7 @@ def test_a_policy_whose_mean_cost_on_new_starts_is_above_the_mpc_s_is_refused() 
 @pytest.mark.parametrize("how", ["one learn", "two", "a load in between"])
 def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path) -> None:
     class LaterLeft(LateLosses):
-        late = FIRST + 10 + (20 if how == "one learn" else 20 + 200)
+        late = FIRST + 10 + (5 if how == "one learn" else 5 + 200)
 
         def reset(self, *, seed=None, options=None):
             observation = super().reset(seed=seed, options=options)
@@ -472,7 +454,7 @@ def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path
             model.save(tmp_path / "model")
             model = DDPG.load(tmp_path / "model", env=Slide(), device="cpu")
         train(model, STEPS, At([1], spoiled), guard := make_guard(LaterLeft, **options))
-    assert verdicts(guard)[:2] == ["accepted", "rejected"]
+    assert guard.decisions[-1].reason.endswith("; an earlier policy is restored")
     assert weights(model)[REGION[RIGHT]] == np.float32(0.4)
     assert weights(model)[REGION[LEFT]] == 0
 
@@ -570,7 +552,8 @@ def restless(policy) -> None:
 
 
 def decided(max_input_step):
-    model, guard = tried(restless, rule={"max_input_step": max_input_step}, n_new_starts=50)
+    rule = {"max_input_step": max_input_step, **WHOLE}
+    model, guard = tried(restless, rule=rule, n_new_starts=50)
     return model, guard
 
 

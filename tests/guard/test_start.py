@@ -144,7 +144,7 @@ def test_what_is_given_reaches_the_settings_and_what_is_not_has_its_default() ->
     assert some == GuardSettings("CSTR-v0", range(40, 47), **given, keep_if_worse=True, rule=rule)
     plain = ImprovementGuard(Slide).settings
     assert plain == GuardSettings(
-        "Slide", range(1_000_000, 1_000_100), n_new_starts=50, n_final_starts=500, eval_freq=1,
+        "Slide", range(1_000_000, 1_000_040), n_new_starts=20, n_final_starts=200, eval_freq=1,
         patience=5, keep_if_worse=False, rule=AcceptanceRule(),
     )  # fmt: skip
     assert ImprovementGuard(Slide, n_new_starts=4).settings.n_final_starts == 40
@@ -232,7 +232,7 @@ def test_the_tolerance_is_a_share_of_the_mpc_s_median_cost() -> None:
     typical = np.median(evidence.mpc.costs)
     found = evidence.tolerance
     assert (found.margin, found.cvar_alpha, found.typical) == (0.02 * typical, 0.1, typical)
-    assert evidence.n_starts == 10 and evidence.seeds == (*range(1_000_000, 1_000_010),)
+    assert evidence.n_hard == 0 and sorted(evidence.seeds) == [*range(1_000_000, 1_000_010)]
 
 
 def test_a_fault_while_the_first_episodes_are_played_leaves_the_next_learn_a_clean_start() -> None:
@@ -242,7 +242,7 @@ def test_a_fault_while_the_first_episodes_are_played_leaves_the_next_learn_a_cle
         def reset(self, *, seed=None, options=None):
             if seed is not None and seed >= FIRST:
                 Busy.calls += 1
-                if Busy.calls == 13:  # while the MPC is in the policy's place
+                if Busy.calls == 11:  # while the MPC is in the policy's place
                     raise OSError("licence server busy")
             return super().reset(seed=seed, options=options)
 

@@ -39,9 +39,10 @@ from guard_samples import (
 )
 from resumed import model_bits
 from sb3_yann import Decision
+from sb3_yann.compare import Scores, Starts, Tolerance
 from sb3_yann.guard import callback
 from sb3_yann.guard import state as record
-from sb3_yann.guard.state import ADVICE, summary_of
+from sb3_yann.guard.state import ADVICE, Evidence, summary_of
 from weights import is_mpc
 
 NAMES = [each.name for each in dataclasses.fields(Decision)]
@@ -376,17 +377,25 @@ def decision(verdict: str, accepted: float, reason: str = "", mpc: float = 40.0)
 
 
 def said_of(
-    decisions: list[Decision], n: int = 5, is_mpc: bool = False, updates: int = 9, acts: bool = True
+    decisions: list[Decision],
+    n: int = 5,
+    is_mpc: bool = False,
+    updates: int = 9,
+    acts: bool = True,
+    lost: tuple[int, ...] = (),
 ) -> list[str]:
     """Return the lines about decisions on n starts, and one hard start that is left out."""
     last = decisions[-1] if decisions else decision("accepted", 40.0)
-    costs = SimpleNamespace(costs=np.array([last.accepted_cost] * n + [999.0]))
-    mpc = SimpleNamespace(costs=np.array([last.mpc_cost] * n + [999.0]))
-    checkpoint = SimpleNamespace(has_networks_of=lambda _: is_mpc, is_actor_of=lambda _: acts)
+    costs, mpc = (
+        Scores(np.array([999.0] + [each] * n), np.zeros((n + 1, 9)))
+        for each in (last.accepted_cost, last.mpc_cost)
+    )
+    checkpoint: Any = SimpleNamespace(has_networks_of=lambda _: is_mpc, is_actor_of=lambda _: acts)
+    starts = Starts((*range(n + 1),), mpc, Tolerance(1.0), n_hard=1)
     state: Any = SimpleNamespace(
         decisions=decisions,
         settings={"seeds": range(n)},
-        evidence=SimpleNamespace(scores=costs, starts=SimpleNamespace(mpc=mpc), mpc=checkpoint),
+        evidence=Evidence(checkpoint, checkpoint, starts, costs, next_seed=9, lost=lost),
         accepted=checkpoint,
     )
     policy: Any = SimpleNamespace(critic_updates=updates, critic_warmup=5)
@@ -418,6 +427,14 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
 )
 def test_the_change_is_against_the_size_of_the_mpc_s_cost(last, words) -> None:
     assert words in said_of([last])[0]
+
+
+def test_the_final_starts_that_the_rule_lets_it_lose_are_listed() -> None:
+    said = said_of([decision("accepted", 30.0)], lost=(7, 12))
+    assert said[1] == (
+        "Of the final starts it loses 2 by more than the margin, which the rule allows: "
+        "seeds 7, 12."
+    )
 
 
 def test_nothing_was_tried_and_why() -> None:

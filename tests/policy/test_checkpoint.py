@@ -135,20 +135,19 @@ def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(mo
         correct(policy, RIGHT, value)
         some.append(ActorCheckpoint.of(policy))
     scores = Scores(np.zeros(1), np.zeros((1, 9)), np.zeros((1, 3), bool))
-    evidence = Evidence(mpc, mpc, Starts((0,), scores, Tolerance(1.0), 1), scores, next_seed=1)
+    evidence = Evidence(mpc, mpc, Starts((0,), scores, Tolerance(1.0)), scores, next_seed=1)
     for each in (*some[:3], some[0], mpc):  # the MPC is always there
-        evidence = evidence.with_passed(each, scores)
-    assert [each for each, _ in evidence.passed] == [some[1], some[2], some[0]]
-    assert all(had is scores for _, had in evidence.passed)
+        evidence = evidence.with_passed(each)
+    assert [*evidence.passed] == [some[1], some[2], some[0]]
     evidence = evidence.without_passed(some[2])
-    assert [each for each, _ in evidence.passed] == [some[1], some[0]]
+    assert [*evidence.passed] == [some[1], some[0]]
     monkeypatch.setattr(state, "MAX_PASSED", 2)
-    evidence = evidence.with_passed(some[3], None)
-    assert [each for each, _ in evidence.passed] == [some[0], some[3]]
+    evidence = evidence.with_passed(some[3])
+    assert [*evidence.passed] == [some[0], some[3]]
     for room, left in ((2.0, 2), (1.99, 1), (0.1, 1)):
         monkeypatch.setattr(state, "MAX_PASSED_BYTES", int(room * mpc.size))
-        found = evidence.with_passed(some[1], None).with_passed(some[2], None)
-        assert [each for each, _ in found.passed] == [some[1], some[2]][-left:]
+        found = evidence.with_passed(some[1]).with_passed(some[2])
+        assert [*found.passed] == [some[1], some[2]][-left:]
 
 
 def test_a_checkpoint_knows_whether_it_has_learned_anything() -> None:
