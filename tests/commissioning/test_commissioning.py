@@ -326,24 +326,24 @@ def test_another_cost_is_another_commissioning(tmp_path) -> None:
 
 def test_the_bound_grows_only_with_what_was_promised() -> None:
     journal = commission().journal
-    assert is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.6))
-    assert not is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.4))
-    assert not is_confirmed(journal, Costs(100.0, 101.0, -1.0, 100.0))
-    for unknown in (Costs(*4 * (np.nan,)), Costs(100.0, 90.0, np.inf, np.inf)):
+    assert is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.6, -0.6))
+    assert not is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.6, -0.4))
+    assert not is_confirmed(journal, Costs(100.0, 101.0, -1.0, 100.0, 0.0))
+    for unknown in (Costs(*4 * (np.nan,)), Costs(100.0, 90.0, np.inf, np.inf, -np.inf)):
         assert not is_confirmed(journal, unknown)
 
 
 def test_a_policy_is_taken_back_where_it_surely_costs_more() -> None:
     played = SimpleNamespace(violations=0, alarm=None)
     journal = SimpleNamespace(batch=[(played, True)], cut_off=0)
-    costs = Costs(10.3, 10.0, 0.5, 10.0, pairs=8)  # Student's t of 7 degrees of freedom: 1.895
+    costs = Costs(10.3, 10.0, 0.5, 10.0, 0.3, pairs=8)  # Student's t of 7 degrees of freedom: 1.895
     assert "it cost 10.3, the MPC in turns with it 10" in why_taken_back(journal, costs)
     assert why_taken_back(journal, costs._replace(error=0.2)) == ""
     assert why_taken_back(journal, costs._replace(error=0.15)) != ""
     assert why_taken_back(journal, costs._replace(pairs=1)) == ""  # one pair tells nothing
-    dear = costs._replace(actual=10.6, error=1.0)  # more than five per cent in any case
+    dear = costs._replace(more=0.6, error=1.0)  # more than five per cent in any case
     assert why_taken_back(journal, dear) != ""
-    assert why_taken_back(journal, costs._replace(mpc=np.nan)) != ""
+    assert why_taken_back(journal, costs._replace(more=np.nan)) != ""
 
 
 def test_shadow_computes_and_does_not_act() -> None:
@@ -421,10 +421,10 @@ def test_a_plant_that_its_model_describes_keeps_the_mpc(tmp_path) -> None:
 
 
 def test_a_policy_is_kept_where_it_surely_costs_less_in_turns() -> None:
-    costs = Costs(9.7, 10.0, 0.5, 10.0, 0.1, 8)
+    costs = Costs(9.7, 10.0, 0.5, 10.0, -0.3, 0.1, 8)
     assert is_kept(costs) and not is_kept(costs._replace(error=0.2))
     assert not is_kept(costs._replace(pairs=1, error=0.0))
-    assert not is_kept(costs._replace(actual=np.nan)) and not is_kept(costs._replace(mpc=np.nan))
+    assert not is_kept(costs._replace(more=np.nan))
 
 
 def test_a_reward_of_its_own_decides_what_is_kept() -> None:
