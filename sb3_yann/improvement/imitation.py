@@ -14,7 +14,6 @@ from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe
 from sb3_yann.control import LinearMPC
 from sb3_yann.improvement.model import Imagined, Scenarios, task_of
-from sb3_yann.improvement.refinement import descend
 from sb3_yann.improvement.simulator import of_law
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.yann import LawLayer
@@ -27,10 +26,6 @@ RATE = 1e-2  # of Adam at first; it falls to zero
 NEARBY = 3  # states beside each of a plan that its feedback answers
 SPREAD = 0.1  # how far they are, in standard deviations of the states in the episodes
 FITS = 6  # fits to plans in a model, at most: after each the policy's own states are planned from
-FAR = 0.5  # share below which, after half of the fits, a policy descends on its own costs instead
-STEPS = 150  # of that descent
-LOSS = 10.0  # how much more in it what a start loses against the MPC counts than what others gain
-FINE_RATE = 1e-3  # of Adam in it, at first
 HARDEST = 20  # scenarios that are planned anew after a fit
 NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
 
@@ -81,8 +76,7 @@ class Teacher:
     def show(self, act: Inputs | None = None, played: Imagined | None = None) -> None:
         """Plan the scenarios; those that a policy ``played``, from where it had got to.
 
-        What costs more than with the MPC, or breaks a bound by more, shows nothing; nor does what
-        costs more than the policy that acts until then.
+        What costs more than with the MPC, or breaks a bound by more, shows nothing.
         """
         pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
         planning = Planning(self.scenarios.plant, self.task, self.steps, pause)
@@ -92,9 +86,6 @@ class Teacher:
         safe = ~less_safe(shown.unsafe, self.mpc.unsafe).any(axis=1)
         taught = (first >= 0) & safe & (shown.costs <= self.mpc.costs)
         self.best = np.where(taught, np.fmin(self.best, shown.costs), self.best)
-        if played is not None:  # a plan that comes too late to save the episode shows what it can
-            safe = ~less_safe(shown.unsafe, played.unsafe).any(axis=1)
-            taught |= (first > 0) & safe & (shown.costs < played.costs)
         for i in np.flatnonzero(taught):
             for t in range(first[i], self.steps):
                 when, plan, _ = later.plans[t][i]
@@ -118,18 +109,15 @@ class Teacher:
     def hardest(self, played: Imagined) -> NDArray[np.int64]:
         """Return the steps (k,) to plan from next: -1 where a policy does nearly as well as plans.
 
-        One in four begins at its start, the others before it has cost as much as with plans.
+        Half of the others begin at their start, half amid the episode.
         """
-        behind = (played.costs - self.best) / units_of(self.mpc.costs)
-        behind[~np.isfinite(behind)] = np.inf
+        behind = np.where(np.isfinite(played.costs), played.costs - self.best, np.inf)
         behind[less_safe(played.unsafe, self.mpc.unsafe).any(axis=1)] = np.inf
         chosen = np.argsort(-behind, kind="stable")[:HARDEST]
         chosen = chosen[behind[chosen] > 0]
         begins = np.full(len(behind), -1, dtype=np.int64)
-        spent = self.problem.deviations.stage_cost(played.thetas[:-1], played.inputs)
-        late = np.sum(np.cumsum(spent, axis=0) < self.best, axis=0)[chosen]
-        begins[chosen] = self.rng.integers(0, np.clip(late, 1, self.steps), size=len(chosen))
-        begins[chosen[::4]] = 0
+        begins[chosen] = self.rng.integers(0, self.steps, size=len(chosen))
+        begins[chosen[::2]] = 0
         return begins
 
 
@@ -176,8 +164,7 @@ def imitate(
     Then the policy plays these episodes in the model, and learns more where it does worse than
     plans: from their starts, and from where it had got to (S. Ross, G. Gordon and D. Bagnell, *A
     reduction of imitation learning and structured prediction to no-regret online learning*, AISTATS
-    2011). The layer ends with the fit that cost the least. Where that saves less than half of what
-    plans do, it descends on its own costs. Return what it saves in the model: see
+    2011). The layer ends with the fit that cost the least. Return what it saves in the model: see
     :meth:`Teacher.saved`.
     """
     most, best = -np.inf, copy.deepcopy(layer.state_dict())
@@ -189,40 +176,11 @@ def imitate(
         say(f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model")
         if saved > most:
             most, best = saved, copy.deepcopy(layer.state_dict())
-        lost = fit >= FITS // 2 and most < FAR * teacher.gain
-        if most >= (1 - NEAR) * teacher.gain or lost or fit == FITS - 1:
+        if most >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
             break
         teacher.show(act, played)
     layer.load_state_dict(best)
-    if lost:
-        most = refine(layer, teacher)
-        say(f"descent: {100 * most:.3g} % of plans' {100 * teacher.gain:.3g} % in the model")
     return most
-
-
-def refine(layer: LawLayer, teacher: Teacher) -> float:
-    """Descend on what the policy's own episodes cost in the model, and keep the best weights.
-
-    Return what they save: see :meth:`Teacher.saved`.
-    """
-    scenarios = teacher.scenarios.wider(teacher.rng)
-    mpc = scenarios.play(of_law(teacher.problem)).costs
-    most, saved, best = -np.inf, 0.0, copy.deepcopy(layer.state_dict())
-    optimizer = th.optim.Adam(layer.network.weights(), lr=FINE_RATE)
-    for k in range(STEPS + 1):
-        played = scenarios.play(controller_of(policy_of(layer, teacher.problem)))
-        if (worth := worth_of(played.costs, mpc)) > most:
-            most, saved = worth, teacher.saved(played.costs[: len(teacher.best)])
-            best = copy.deepcopy(layer.state_dict())
-        if k < STEPS:
-            optimizer.param_groups[0]["lr"] = FINE_RATE * (1 - k / STEPS)
-            optimizer.zero_grad()
-            weights = np.where(played.costs > mpc, 1 + LOSS, 1.0) / units_of(mpc)
-            descend(layer, scenarios, teacher.task, played, weights)
-            optimizer.step()
-    optimizer.zero_grad()
-    layer.load_state_dict(best)
-    return saved
 
 
 def units_of(mpc: Array) -> Array:
@@ -237,11 +195,6 @@ def gain_of(costs: Array, mpc: Array) -> float:
     finite = np.isfinite(mpc)
     saved = (mpc[finite] - costs[finite]) / units_of(mpc)[finite]
     return float(np.mean(saved)) if finite.any() else 0.0
-
-
-def worth_of(costs: Array, mpc: Array) -> float:
-    """Return the gain, less ``LOSS`` times what scenarios cost more than with the MPC."""
-    return gain_of(costs, mpc) + LOSS * gain_of(np.maximum(costs, mpc), mpc)
 
 
 def fit_layer(

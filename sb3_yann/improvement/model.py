@@ -241,22 +241,6 @@ class Scenarios:
         given = [e.thetas[np.minimum(np.arange(steps), len(e)), row.given] for e in episodes]
         return cls(model, None, row.begin(thetas), np.stack(given, axis=1))
 
-    def wider(self, rng: np.random.Generator) -> Scenarios:
-        """Return these, and as many that begin anywhere, with the same references."""
-        row, starts, n = (
-            self.model.dynamics.row,
-            self.model.starts,
-            self.model.problem.model.n_states,
-        )
-        thetas = row.shown(self.starts).copy()
-        thetas[:, :n] = rng.uniform(starts.low, starts.high, thetas[:, :n].shape)
-        return Scenarios(
-            self.model,
-            None if self.members is None else np.tile(self.members, 2),
-            np.concatenate([self.starts, row.begin(thetas)]),
-            np.tile(self.given, (1, 2, 1)),
-        )
-
     @cached_property
     def plant(self) -> TwinPlant:
         """What acts in them."""

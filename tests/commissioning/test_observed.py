@@ -37,14 +37,12 @@ def test_the_twin_predicts_what_episodes_cost_that_it_has_not_seen() -> None:
     np.testing.assert_allclose(predicted_costs(found, episodes, law), played.costs, rtol=2e-3)
 
 
-def test_what_is_improved_in_the_twin_is_better_on_the_plant() -> None:
+def test_five_episodes_are_too_few_for_a_small_gain_and_the_answer_says_how_many_more() -> None:
     ours = model()
     found = improve(ours, observed(), updates=2000, n_starts=20)
-    seeds = range(800, 840)
-    mpc = evaluate(offset_free_problem()[0].explicit(), plant, seeds).costs
-    change = evaluate(ours, plant, seeds).costs - mpc
-    assert found.accepted and change.mean() < -0.001 * mpc.mean()  # there is little to gain
-    assert change.max() < 0.05 * mpc.mean()
+    assert not found.accepted and found.interval[0] < 0 < found.interval[1]
+    assert "to settle it, log about" in str(found)
+    assert ours.actor.mu.network.is_zero()
 
 
 def test_the_watchdog_is_quiet_and_sees_what_the_observer_smooths() -> None:

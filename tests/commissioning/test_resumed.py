@@ -98,7 +98,11 @@ def test_a_commissioning_that_stops_after_a_batch_goes_on_as_if_it_had_not(
         for batches in (1, 2, 3):
             run = commission(tmp_path / name) if name == "cut" else run
             run.run(batches)
-        assert [each.verdict for each in run.batches] == ["accepted", "the MPC acts", "accepted"]
+        assert [each.verdict for each in run.batches] == [
+            "the MPC acts",
+            "the MPC acts",
+            "accepted",
+        ]
         trained = model_bits(run.model), run.policy.max_correction, all_bits(run.batches)
         outcomes.append([*trained, events(tmp_path / name)])
     assert outcomes[0] == outcomes[1]

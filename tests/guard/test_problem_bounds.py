@@ -116,7 +116,7 @@ def push(policy: Any) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) -> None:
     mpc, make = carriage(kind)
-    options = {"problem": mpc, "networks": "shared"}
+    options = {"problem": mpc, "networks": "shared", "keep_bounds": False}
     model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0,
                  learning_starts=10**6)  # fmt: skip
     own = evaluate(model, make, range(20, 24))
@@ -143,7 +143,7 @@ def test_the_page_to_sign_fails_and_names_the_bound_its_excess_and_the_unit(
     kind: str, tmp_path: Path
 ) -> None:
     mpc, make = carriage(kind)
-    options = {"problem": mpc, "networks": "shared"}
+    options = {"problem": mpc, "networks": "shared", "keep_bounds": False}
     model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0)
     push(model.policy)
     page = report(model, tmp_path / "page.html", env=make, seeds=range(20, 24)).read_text()

@@ -118,7 +118,7 @@ def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm
     model = build(DummyVecEnv([plant] * 3), algorithm, gradient_steps=-1)
     before, guard = (
         copy.deepcopy(model.actor),
-        ImprovementGuard(plant, n_eval_episodes=3, eval_freq=6),
+        ImprovementGuard(plant, n_eval_episodes=3, n_final_starts=0, eval_freq=6),
     )
     tried: list[int] = []
     learnt: list[dict[str, th.Tensor]] = []

@@ -60,6 +60,16 @@ class IdentifiedOutputs(ReadOnlyArrays):
         Mean and covariance of the states in the log, from which a prediction begins.
     drift : ndarray, shape (n,)
         Motion in one sample at the operating point, which ``model`` leaves out.
+
+    Examples
+    --------
+    >>> u = np.random.default_rng(0).normal(size=(200, 1))
+    >>> y = np.zeros((201, 1))
+    >>> for k in range(200):
+    ...     y[k + 1] = 0.8 * y[k] + 0.5 * u[k]
+    >>> found = identify_outputs(y, u, dt=1.0)
+    >>> found.order, found.predict(y, u, ahead=5).shape
+    (1, (196, 1))
     """
 
     model: LinearModel
