@@ -119,7 +119,8 @@ class LinearMPC(MPCProblem):
         Linear terms p and q of the stage cost.
     parametric_bounds : list of str, optional
         Bounds that change at run time, such as ["u_max"]: they join theta. The problem's own are
-        the widest, and each may move in to the other side.
+        the widest, and each may move in to the other side. A law counts them from the widest:
+        ask :meth:`PiecewiseAffine.plant_input`, also where the model has no operating point.
     control_horizon : int or sequence of int, optional
         The number of samples in which the inputs move, before they stay; or for how many samples
         each move is held, which sum up to the horizon. The default is each sample.
