@@ -311,7 +311,8 @@ class Difference(NamedTuple):
             left = differences - mean
         if not in_turns:
             return cls(mean, error, n)
-        chance, size = 0.0, float(left @ left)
+        chance = 0.0
+        size = float(left @ left)
         if n <= FEW_PAIRS:
             orders = 1 - 2 * (np.arange(2**n)[:, None] >> np.arange(n) & 1)
             as_low = differences.sum() + COST_ROUNDING * np.abs(differences).sum()
@@ -383,7 +384,8 @@ def no_worse(
     allowed = np.minimum(accepted.unsafe, mpc.unsafe)
     less = less_safe(policy.unsafe, allowed, tolerance.excess_room)
     excess = tolerance.excess(mpc.costs, policy.costs)
-    costs, of_mpc = policy.costs[n_hard:], mpc.costs[n_hard:]
+    costs = policy.costs[n_hard:]
+    of_mpc = mpc.costs[n_hard:]
     before = of_mpc if accepted is mpc else accepted.costs[n_hard:]
     above_mpc = is_above(costs, of_mpc)
     typical = np.maximum(np.abs(of_mpc), np.median(np.abs(of_mpc)))  # each relative to its own cost

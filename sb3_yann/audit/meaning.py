@@ -19,12 +19,15 @@ from sb3_yann.control.model.labels import labels_of
 from sb3_yann.rollout import Trajectories
 from sb3_yann.wrappers import SetPoint
 
-WRONG, RIGHT = 0.5, 0.05
-"""Share of the states' movement in a step that the model leaves open: more in the order shown, and
-less in another one, or in other units. No noise and no wrong model does that."""
+WRONG = 0.5
+"""Share of the states' movement in a step that the model leaves open, at least, as they are shown.
+"""
+RIGHT = 0.05
+"""The most that it leaves open in another order, or in other units, where those are meant: no noise
+and no wrong model does that."""
 STEPS_PER_STATE = 10
 """Steps for each state that must be seen."""
-MOST = 5
+MOST_REORDERED = 5
 """States of which all orders are tried; of more, two are exchanged."""
 UNITS = (
     *((factor, 0.0) for factor in (1000.0, 100.0, 60.0, 10.0, 0.1, 1 / 60, 0.01, 0.001)),
@@ -39,7 +42,7 @@ SIGN_STARTS = 5
 LEAST_EFFECT = 1e-3
 """Of the states' standard deviation: an effect that is smaller may be rounding."""
 Mask = NDArray[np.bool_]
-EXPLAINED = 0.95
+EXPLAINED_REWARD = 0.95
 """Share of the rewards' variance from which on they are taken for minus the stage cost."""
 FEWEST_REWARDS = 10
 """Steps that must be seen."""
@@ -124,7 +127,7 @@ def _rescaled(factors: Array, shifts: Array, x: Array) -> Array:
 
 def _orders(n: int) -> Iterator[list[int]]:
     """Yield other orders: what each entry that is shown may be."""
-    if n <= MOST:
+    if n <= MOST_REORDERED:
         yield from (list(each) for each in [*permutations(range(n))][1:])
         return
     for i, j in combinations(range(n), 2):
@@ -250,7 +253,7 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories, stacklevel: int
     if np.count_nonzero(known) < FEWEST_REWARDS or not np.any(rewards[known]):
         return
     share = max(_explained(-cost, rewards, known) for cost in costs)
-    if share < EXPLAINED:
+    if share < EXPLAINED_REWARD:
         warnings.warn(
             f"The env has a reward of its own, and it is ignored: the MPC's stage cost explains "
             f"{100 * share:.0f} % of it over {np.count_nonzero(known)} steps of the MPC. What "

@@ -90,7 +90,8 @@ def rests_beside(problem: LinearMPC, theta: Array, begins: NDArray[np.bool_]) ->
     errors = theta[:, problem.layout.state] @ C.T
     half = np.abs(C) @ unit[problem.layout.state]
     if r.shape[1]:
-        errors, half = errors - r, unit[references]
+        errors = errors - r
+        half = unit[references]
     changed = begins | np.r_[True, np.any(r[1:] != r[:-1], axis=1)]
     parts = np.split(errors, np.flatnonzero(changed)[1:])
     found = [_rest(part) for part in parts if len(part) >= SHORTEST]

@@ -198,7 +198,7 @@ def test_an_mpc_gets_a_model_with_one_network_and_moves_no_random_state(tmp_path
     th.manual_seed(3)
     assert drawn == (np.random.rand(), float(th.rand(1)))  # noqa: NPY002
     assert isinstance(found.model, DDPG) and found.model.policy.problem == problem()
-    assert found.accepted and relative(found.model).mean() < 0.995
+    assert found.accepted and relative(found.model).mean() < 0.99
     assert found.export(tmp_path / "controller.npz").paths
     assert len(found.model.actor.mu.network.first.nodes) == 1
 

@@ -104,7 +104,8 @@ def arx(episodes: Sequence[Episode], lags: int, start: int, ridge: float = 0.0) 
     """Return the ARX model of so many lags; a row of its regressors is as of `with_lags`."""
     rows = with_lags(episodes, lags, start)
     steps = sum(map(len, rows))
-    q, m = rows[0].states.shape[1], rows[0].inputs.shape[1]
+    q = rows[0].states.shape[1]
+    m = rows[0].inputs.shape[1]
     sizes = (q, m, rows[0].disturbances.shape[1])
     return regress(rows, sizes, None, max(ridge, TINY_RIDGE) * steps)
 
@@ -119,14 +120,16 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
         return sum(max(len(each) - lags + 1, 0) for each in episodes)
 
     tried = [p for p in LAGS if rows(p) > max(3 * p * width + 10, steps / 2)] or [1]
-    start, best = tried[-1] - 1, np.inf
+    start = tried[-1] - 1
+    best = np.inf
     for p in tried:
         found = arx(episodes, p, start)
         floor = FLOOR * np.eye(q)  # below it all is rounding
         log_det = np.linalg.slogdet(found.covariance + floor)[1]
         criterion = found.steps * log_det + 2 * q * p * width
         if criterion < best:
-            best, lags = criterion, p
+            best = criterion
+            lags = p
     # The state needs a longer past than the criterion's.
     lags = max(lags, min(tried[-1], max(4, round(1.5 * lags))))
     return lags, arx(episodes, lags, lags - 1)
