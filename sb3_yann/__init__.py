@@ -24,8 +24,7 @@ import sb3_yann_envs
 __version__ = "0.1.0"
 
 _NAMES = {
-    "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning "
-    "SteadyOffsetWarning",
+    "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning",
     "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
     "sb3_yann.commissioning": "Batch Commissioning",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "

@@ -2,7 +2,6 @@ from sb3_yann.audit import CostAudit as CostAudit
 from sb3_yann.audit import CostFinding as CostFinding
 from sb3_yann.audit import CostMismatchError as CostMismatchError
 from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
-from sb3_yann.audit import SteadyOffsetWarning as SteadyOffsetWarning
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
 from sb3_yann.commissioning import Batch as Batch

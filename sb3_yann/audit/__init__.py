@@ -1,17 +1,6 @@
-"""What to know before training: whether the reward is the MPC's cost, and what there is to gain."""
+"""What to know before training: whether an env shows, takes and pays what the problem says."""
 
 from sb3_yann.audit.callback import CostAudit
-from sb3_yann.audit.finding import (
-    CostFinding,
-    CostMismatchError,
-    CostMismatchWarning,
-    SteadyOffsetWarning,
-)
+from sb3_yann.audit.reward import CostFinding, CostMismatchError, CostMismatchWarning
 
-__all__ = [
-    "CostAudit",
-    "CostFinding",
-    "CostMismatchError",
-    "CostMismatchWarning",
-    "SteadyOffsetWarning",
-]
+__all__ = ["CostAudit", "CostFinding", "CostMismatchError", "CostMismatchWarning"]

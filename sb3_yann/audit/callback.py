@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, check_bool, check_int, check_positive
-from sb3_yann.audit.causes import Cause, likely_cause, not_finite
-from sb3_yann.audit.finding import (
+from sb3_yann.audit.meaning import warn_of_order
+from sb3_yann.audit.reward import (
+    MIN_STEPS,
     CostFinding,
     CostMismatchError,
     CostMismatchWarning,
-    SteadyOffsetWarning,
-    make_finding,
+    Line,
+    Steps,
+    likely_cause,
+    mismatch_in_words,
+    not_finite,
+    wrappers_of,
 )
-from sb3_yann.audit.meaning import warn_of_order
-from sb3_yann.audit.offset import steady_offset
-from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy.observations import require_frozen
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
@@ -34,8 +36,7 @@ class CostAudit(BaseCallback):
     Actor and critic are exact only where the reward is minus the stage cost, scaled and shifted as
     the policy's :class:`CriticOptions` say. The audit compares the first steps of every `learn`,
     and names a likely cause and wrappers of the env. Steps with ``info["violation"]``, and those
-    that terminate an episode, may cost more. While the plant rests it sees nothing. Outputs that
-    come to rest beside their references get a :class:`SteadyOffsetWarning` with its cure.
+    that terminate an episode, may cost more. While the plant rests it sees nothing.
 
     Parameters
     ----------
@@ -65,13 +66,13 @@ class CostAudit(BaseCallback):
     """
 
     model: OffPolicyAlgorithm
-    reward_alone = False  # a guard has asked for the rest itself
+    order_checked = False  # a guard has done it itself
 
     def __init__(
         self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        self.steps = check_int("steps", steps, FEWEST, "Fewer say nothing.")
+        self.steps = check_int("steps", steps, MIN_STEPS, "Fewer say nothing.")
         self.tolerance = check_positive("tolerance", tolerance, "Rounding is no mismatch.")
         self.strict = check_bool("strict", strict)
         self.finding: CostFinding | None = None
@@ -79,18 +80,18 @@ class CostAudit(BaseCallback):
     def _init_callback(self) -> None:
         self.policy = require_yann_policy(self.model.policy, "CostAudit")
         watch_buffer(self.model)
-        self.finding, self._seen = None, 0
-        self._records: list[list[dict[str, Any]]] = [[] for _ in range(self.training_env.num_envs)]
+        self.finding = None
+        self._records: list[dict[str, Any]] = []
 
     def _on_step(self) -> bool:
-        if self._seen < self.steps:
+        if self.finding is None and len(self._records) < self.steps:
             self._record()
-            if self._seen >= self.steps:
+            if len(self._records) >= self.steps:
                 self._judge()
         return True
 
     def _on_training_end(self) -> None:
-        if self._seen < self.steps:
+        if self.finding is None and self._records:
             self._judge()
 
     def _record(self) -> None:
@@ -99,113 +100,113 @@ class CostAudit(BaseCallback):
         rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
         # On-policy algorithms call what the env took "clipped".
         actions = self.locals.get("clipped_actions", self.locals["actions"])
-        for i, records in enumerate(self._records):
-            info, done = self.locals["infos"][i], bool(self.locals["dones"][i])
+        for i, info in enumerate(self.locals["infos"]):
+            done = bool(self.locals["dones"][i])
+            terminated = done and not info.get("TimeLimit.truncated", False)
             following = info["terminal_observation"] if done else self.locals["new_obs"][i]
-            records.append(
+            self._records.append(
                 {
                     "observation": np.array(self.model._last_obs[i]),  # type: ignore[index]
                     "following": np.array(following),  # copies: an env may write into its arrays
                     "action": np.array(actions[i], dtype=np.float64),
                     "reward": float(rewards[i]),
-                    "step": len(records) + 1,
-                    "violation": may_change_reward(info),
-                    "truncated": done and bool(info.get("TimeLimit.truncated", False)),
-                    "done": done,
+                    "counted": not (may_change_reward(info) or terminated),
                 }
             )
-        self._seen += len(self._records)
 
     def _judge(self) -> None:
-        records = [each for of_one_env in self._records for each in of_one_env]
-        if not records:  # no step was taken
-            return
-        lost = np.array([not _is_finite(each) for each in records], dtype=bool)
-        sample = self._sample(records, lost)
-        self._records = []
-        enough = np.count_nonzero(sample.counted) >= FEWEST
+        names = self._records[0]
+        records = {name: np.array([each[name] for each in self._records]) for name in names}
+        shown = records["observation"], records["following"]
+        finite = np.isfinite(records["reward"])
+        for each in shown:
+            finite &= np.isfinite(each.reshape(len(finite), -1)).all(axis=1)
+        lost = ~finite
+        theta, following = (self._theta(each[finite]) for each in shown)
+        u = self.policy.inputs(records["action"][finite])
+        counted = records["counted"][finite]
+        steps = self._steps(
+            theta[counted],
+            following[counted],
+            u[counted],
+            records["reward"][finite][counted],
+            shown[0][finite][counted],
+        )
+        enough = len(steps.rewards) >= MIN_STEPS
         if not enough and not lost.any():
             return
-        cause = self._of_the_vec_normalize()
-        if cause is None and enough and not sample.matches_stage_cost(self.tolerance):
-            cause = likely_cause(sample, self.tolerance)
+        if not self.order_checked:
+            warn_of_order(self.policy.problem, theta, u, following, stacklevel=2)
+        line = Line.through(steps)
+        cause, explanation = self._vec_normalize_switched_on()
+        if not cause and enough and not steps.match(self.tolerance):
+            cause, explanation = likely_cause(steps, line, self.tolerance)
+        wrappers: tuple[str, ...] = ()
+        message = f"The reward is the cost of the problem in all of {len(steps.rewards)} steps."
+        if cause:
+            wrappers = wrappers_of(self.training_env)
+            message = " ".join(mismatch_in_words(steps, line, explanation, wrappers))
         if lost.any():
-            cause = not_finite(lost, records, cause)
-        beside = self._resting_beside(sample) if enough else ""
-        if not self.reward_alone:
-            steps = sample.theta, sample.u, sample.following
-            warn_of_order(self.policy.problem, *steps, stacklevel=2)
-        self.finding = make_finding(sample, cause, self.training_env, beside)
-        if beside:
-            warnings.warn(beside, SteadyOffsetWarning, stacklevel=2)
-        if cause is not None:
-            if self.strict:
-                raise CostMismatchError(self.finding.message)
-            warnings.warn(self.finding.message, CostMismatchWarning, stacklevel=2)
-        elif self.verbose:
-            print(f"Cost audit: {self.finding.message}")
+            fault = not_finite(lost, records["reward"], self.training_env.num_envs)
+            rest = f" In the others, {cause}: {explanation}" if cause else ""
+            cause = "not finite"
+            message = f"The rewards cannot all be compared: {fault}{rest}"
+        self._records = []
+        self.finding = CostFinding(
+            matches=not cause,
+            cause=cause,
+            message=message,
+            scale=line.scale,
+            offset=line.offset,
+            r2=line.r2,
+            steps=len(steps.rewards),
+            wrappers=wrappers,
+        )
+        if not cause:
+            if self.verbose:
+                print(f"Cost audit: {message}")
+        elif self.strict:
+            raise CostMismatchError(message)
+        else:
+            warnings.warn(message, CostMismatchWarning, stacklevel=2)
 
-    def _resting_beside(self, sample: Sample) -> str:
-        """Return how far outputs rest beside their references, empty where nobody asks."""
-        return "" if self.reward_alone else steady_offset(self.policy.problem, sample)
+    def _theta(self, observations: Array) -> Array:
+        if not len(observations):
+            return np.zeros((0, self.policy.problem.n_theta))
+        return np.asarray(self.policy.theta(observations).double().cpu().numpy())
 
-    def _sample(self, records: list[dict[str, Any]], lost: NDArray[np.bool_]) -> Sample:
-        """Return the records without the lost ones, after which another episode begins."""
-
-        def column(name: str) -> Any:
-            return np.array([each[name] for each in records])[~lost]
-
-        def theta(name: str) -> Array:
-            return np.asarray(self.policy.theta(column(name)).double().cpu().numpy())
-
-        every_env = np.repeat(np.arange(len(self._records)), [len(each) for each in self._records])
-        ended = np.array([each["done"] for each in records], dtype=bool) | lost
-        env = every_env[~lost]
-        first = np.r_[True, np.diff(env) != 0][: len(env)]
-        begins = first | np.r_[True, ended[:-1]][~lost]
-        problem, options = self.policy.problem, self.policy.critic_options
-        observations = column("observation").reshape(len(env), records[0]["observation"].size)
-        terminated = column("done") & ~column("truncated")
-        return Sample(
-            theta=theta("observation"),
-            following=theta("following"),
-            u=self.policy.inputs(column("action")),
-            rewards=column("reward"),
-            counted=~(column("violation") | terminated),
-            terminated=terminated,
-            episode=np.cumsum(begins),
-            begins=begins,
-            first=first,
-            blank=~np.any(observations, axis=1),
+    def _steps(
+        self, theta: Array, following: Array, u: Array, rewards: Array, observations: Array
+    ) -> Steps:
+        options = self.policy.critic_options
+        return Steps(
+            theta=theta,
+            following=following,
+            u=u,
+            rewards=rewards,
             rounding=self._rounding(observations),
             scale=options.reward_scale,
             offset=options.reward_offset,
-            stage_cost=problem.deviations.stage_cost,
-            step=problem.deviations.predict,
-            theta_ss=problem.theta_ss,
-            gamma=self.model.gamma,
+            stage_cost=self.policy.problem.deviations.stage_cost,
         )
 
     def _rounding(self, observations: Array) -> Array:
         """Return by how much theta may err, (steps, n_theta); see AffineObservation."""
         digits = observations.dtype if observations.dtype.kind == "f" else np.float64
         size = np.abs(observations).astype(np.float64)
+        size = size.reshape(len(size), math.prod(size.shape[1:]))
         if (seen := self.policy.to_theta) is not None:
             # What a normalization hides of its size is in the offset.
             size = size @ np.abs(seen.matrix).T + np.abs(seen.offset)
         return np.asarray(size * float(np.finfo(digits).eps))
 
-    def _of_the_vec_normalize(self) -> Cause | None:
-        """Return what has been set since the policy was built and let it pass."""
+    def _vec_normalize_switched_on(self) -> tuple[str, str]:
+        """Return what has been set since the policy was built and let it pass, empty for none."""
         if (normalize := self.model.get_vec_normalize_env()) is None:
-            return None
+            return "", ""
         try:
             require_frozen(normalize)
         except ValueError as error:
             what = "reward" if normalize.norm_reward else "observation"
-            return Cause(f"normalized {what}", str(error))
-        return None
-
-
-def _is_finite(record: dict[str, Any]) -> bool:
-    return all(np.all(np.isfinite(record[each])) for each in ("observation", "following", "reward"))
+            return f"normalized {what}", str(error)
+        return "", ""

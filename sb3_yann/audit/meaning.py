@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.finding import CostMismatchWarning
+from sb3_yann.audit.reward import CostMismatchWarning
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.rollout import Trajectories

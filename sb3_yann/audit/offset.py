@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.sample import Sample
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import with_units
 
@@ -47,25 +46,6 @@ class Rests(NamedTuple):
     times: int
     beside: Array
     worst: int
-
-
-def steady_offset(problem: LinearMPC, sample: Sample) -> str:
-    """Return how far tracked outputs rest beside a reference that holds, and the cure, in words.
-
-    It is empty where none does, where nothing came to rest, and where theta holds a disturbance.
-    """
-    layout = problem.layout
-    if not layout.n_references or layout.n_disturbances:
-        return ""
-    found = rests_beside(problem, sample.theta, sample.begins)
-    if found is None:
-        return ""
-    i = found.worst
-    return (
-        f"Where a reference held, {found.times} times, the tracked output {i} came to rest "
-        f"{found.beside[i]:.3g} beside r[{i}]: the plant is not its model. An observer may "
-        f"remove that, or cost more on the way: headroom(mpc, env) plays it. Where it pays: {CURE}"
-    )
 
 
 def rests_beside(problem: LinearMPC, theta: Array, begins: NDArray[np.bool_]) -> Rests | None:

@@ -317,7 +317,7 @@ class ImprovementGuard(BaseCallback):
         passed = all_callbacks(self.locals.get("callback"))
         if self._audit is None and not any(isinstance(each, CostAudit) for each in passed):
             self._audit = CostAudit()
-            self._audit.reward_alone = True
+            self._audit.order_checked = True
             self._audit.init_callback(self.model)
             self._audit.on_training_start(self.locals, self.globals)
 

@@ -19,7 +19,6 @@ from audit_samples import (
 )
 from sample_plants import LinearPlant, asymmetric_pendulum_mpc, two_input_mpc
 from sb3_yann import AffineObservation, NonFiniteWarning
-from sb3_yann.audit.causes import Cause, all_of
 
 
 @pytest.mark.parametrize("wrong", WRONG)
@@ -30,35 +29,6 @@ def test_a_reward_or_observation_of_another_meaning_is_named(wrong) -> None:
     assert finding.cause == cause
     assert finding.wrappers == (() if wrapper is None else (wrapper,))
     assert text in finding.message
-
-
-@pytest.mark.skipif(not hasattr(wrappers, "RepeatAction"), reason="from Gymnasium 1.3 on")
-def test_gymnasium_s_own_repetition_is_named_too() -> None:
-    finding = audited(wrappers.RepeatAction(plant(), 3)).finding
-    assert (finding.cause, finding.wrappers) == ("repeated action", ("RepeatAction",))
-
-
-def test_a_reward_that_comes_late_is_named() -> None:
-    class Late(gym.Wrapper):
-        reward = 0.0
-
-        def step(self, action):
-            observation, reward, *rest = self.env.step(action)
-            reward, self.reward = self.reward, reward
-            return observation, reward, *rest
-
-    assert audited(Late(plant())).finding.cause == "late reward"
-
-
-def test_an_action_that_acts_late_is_named() -> None:
-    class Late(gym.ActionWrapper):
-        held = np.zeros(2)
-
-        def action(self, action):
-            action, self.held = self.held, action
-            return action
-
-    assert audited(Late(plant())).finding.cause == "late action"
 
 
 def test_a_reward_that_is_not_a_number_is_named() -> None:
@@ -175,29 +145,3 @@ def test_what_float32_cannot_tell_is_no_mismatch(start) -> None:
 
 def test_an_env_at_rest_says_nothing_against_the_reward() -> None:
     assert audited(wrappers.TimeLimit(LinearPlant(MPC, 0.0), 20)).finding.matches
-
-
-@pytest.mark.parametrize("weight", [0.02, 0.3])
-def test_an_input_that_is_saturated_all_the_time_does_not_make_weights_a_normalization(
-    weight,
-) -> None:
-    def saturated(env, theta, action, outcome):
-        observation, _, *rest = outcome
-        cost = 1.5 * theta[0] ** 2 + 0.4 * theta[1] ** 2 + weight * np.sum(action**2)
-        return observation, -cost, *rest
-
-    mpc = asymmetric_pendulum_mpc()
-    env = Changed(wrappers.TimeLimit(LinearPlant(mpc, 2.0), 20), saturated)
-    finding = audited(env, mpc).finding
-    assert finding.cause == "other weights"
-    assert "Pass policy_kwargs" not in finding.message
-
-
-def test_causes_that_explain_the_data_equally_are_all_named_without_a_cure() -> None:
-    one = Cause("one", "this is so.", cure=" Pass this.")
-    other = Cause("other", "that is so.", cure=" Pass that.")
-    assert all_of([one]).explanation == "this is so. Pass this."
-    both = all_of([one, other])
-    assert both.name == "one"
-    assert "(1) one: this is so. (2) other: that is so." in both.explanation
-    assert "Pass" not in both.explanation

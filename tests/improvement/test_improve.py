@@ -26,7 +26,7 @@ from sb3_yann import (
     YannPolicy,
     improve,
 )
-from sb3_yann.audit.finding import CostMismatchWarning
+from sb3_yann.audit.reward import CostMismatchWarning
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import Check, Improvement
 from sb3_yann.wrappers import SetPoint
