@@ -74,8 +74,7 @@ def main() -> None:
     draw_law()
     draw_training(mpc, fresh, model)
     save(plots.decisions_figure(model.guard_state.decisions), "decisions")
-    shown = {"quantities": ["C_B", "T", 4], "time_unit": "h"}
-    save(plots.loops_figure(mpc, runs, **shown), "loops")
+    save(plots.loops_figure(mpc, runs, quantities=["C_B", "T", 4]), "loops")
 
 
 if __name__ == "__main__":

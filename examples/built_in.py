@@ -50,7 +50,7 @@ def main() -> None:
     torch.set_num_threads(1)  # the networks are too small to share among cores
     console = Console(highlight=False)
 
-    plant = LinearModel.from_env(make_env, x_ss=[0, 0], u_ss=[0])
+    plant = LinearModel.from_env(make_env, x_ss=[0, 0], u_ss=[0]).named(time_unit="s")
     console.print(plant.report())
     cost = {"Q": np.diag([1.0, 0.1]), "R": [[0.001]]}  # what Gymnasium's documentation says
     limits = {"x_min": [-2, -8], "x_max": [2, 8], "u_min": -2, "u_max": 2}
@@ -66,7 +66,7 @@ def main() -> None:
     console.print(summary_table("Cost of 50 unseen starts, Pendulum-v1", before, after))
     runs = {"before (linear MPC)": before, "after training": after}
     Path("out").mkdir(exist_ok=True)
-    plots.loops_figure(mpc, runs, time_unit="s").savefig("out/built_in.png")
+    plots.loops_figure(mpc, runs).savefig("out/built_in.png")
     console.print("Picture: out/built_in.png")
 
 

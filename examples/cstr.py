@@ -47,9 +47,7 @@ def main() -> None:
         "each decision is in out/guard.csv."
     )
     runs = {"before (linear MPC)": before, "after training": after}
-    figure = plots.loops_figure(
-        model.policy.problem, runs, quantities=["T", "C_A", "U"], time_unit="h"
-    )
+    figure = plots.loops_figure(model.policy.problem, runs, quantities=["T", "C_A", "U"])
     figure.savefig("out/cstr.png")
     console.print("Trajectories: out/cstr.png    Curves: tensorboard --logdir out/tensorboard")
 

@@ -29,7 +29,7 @@ def design() -> LinearMPC:
     log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
     x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
     plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
-    plant = plant.named(["h1", "h2", "h3", "h4"], ["v1", "v2"], [*["cm"] * 4, "V", "V"])
+    plant = plant.named(["h1", "h2", "h3", "h4"], ["v1", "v2"], [*["cm"] * 4, "V", "V"], "s")
     # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
     weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
     wanted = Tracking([0, 1], plant.x_ss[:2] - 4, plant.x_ss[:2] + 4)
@@ -70,7 +70,7 @@ def main() -> None:
     console.print(summary_table("Cost of 50 unseen set-point sequences", before, after))
     both = {"before (linear MPC)": mpc.explicit(), "after training": model}
     runs = {name: evaluate(policy, make, TEST_SEEDS[:1]) for name, policy in both.items()}
-    figure = plots.loops_figure(mpc, runs, quantities=[0, 1, 6, 7, 8], time_unit="s")
+    figure = plots.loops_figure(mpc, runs, quantities=[0, 1, 6, 7, 8])
     figure.savefig("out/own_plant.png")
     console.print("Picture: out/own_plant.png    The guard's decisions: out/own_plant.csv")
 

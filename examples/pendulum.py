@@ -47,7 +47,7 @@ def main() -> None:
 
     console.print(comparison_table("Cost of ten test episodes, ClippedPendulum-v0", before, after))
     runs = {"before (linear MPC)": before, "after training": after}
-    plots.loops_figure(model.policy.problem, runs, time_unit="s").savefig("out/pendulum.png")
+    plots.loops_figure(model.policy.problem, runs).savefig("out/pendulum.png")
     console.print("Trajectories: out/pendulum.png")
 
 

@@ -31,7 +31,7 @@ def hover() -> LinearMPC:
     """Return the MPC that hovers: a second ahead, with a soft bound on the tilt."""
     model = LinearModel.from_dynamics(derivative, np.zeros(12), [np.nan] * 4, DT)
     units = [*np.repeat(["m", "rad", "m/s", "rad/s"], 3), *["N"] * 4]
-    model = model.named(STATES, [f"rotor {k}" for k in range(4)], units)
+    model = model.named(STATES, [f"rotor {k}" for k in range(4)], units, "s")
     tilt = np.full(12, np.inf)
     tilt[3:5] = SOFT_TILT
     soft = SoftBounds(np.where(np.isfinite(tilt), 0.1, 0.0), penalty=300.0)
@@ -70,7 +70,7 @@ def main() -> None:
     console.print(f"The guard accepted {taken} of {len(guard.decisions)} candidates.")
     both = {"before (linear MPC)": mpc.online(), "after training": model}
     runs = {name: evaluate(each, make, TEST_SEEDS[:1]) for name, each in both.items()}
-    figure = plots.loops_figure(mpc, runs, quantities=[0, 2, 4], time_unit="s")
+    figure = plots.loops_figure(mpc, runs, quantities=[0, 2, 4])
     figure.savefig("out/quadrotor.png")
     console.print("Picture: out/quadrotor.png    The guard's decisions: out/quadrotor.csv")
 

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from experiments.markdown import number, quote, spread, table
+from experiments.measures import IMPROVED
 from experiments.optimum import cstr_optimum
+from experiments.pictures import save_in_short
 from experiments.plants import CASES
 from experiments.runner import RESULTS, Outcome, Run, load_all, run_all
 from sb3_yann import LinearMPC, PlantTwin, headroom, improve
@@ -27,7 +29,6 @@ from sb3_yann_envs import problems
 
 SEEDS = range(40, 43)
 TESTS = range(2000, 2050)
-IMPROVED = "improve in a simulator"
 PLANNED = "headroom"
 HEADER = (
     "plant",
@@ -260,6 +261,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(text)
         if found and quote(text, page, f"<!-- {mark}: begin -->\n", f"<!-- {mark}: end -->"):
             print(f"Written: {page}")
+    for path in save_in_short(outcomes, options.report):
+        print(f"Written: {path}")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ BARE = f"{OURS}, no settings"
 EXPLORED = f"{OURS}, a simulator explored"
 OBSERVER = "MPC with observer"
 REIDENTIFIED = "re-identified MPC"
+IMPROVED = "improve in a simulator"
 FIRST = (OPTIMUM, MPC, OBSERVER, REIDENTIFIED, "LQR", OURS)
 """The order of the tables."""
 

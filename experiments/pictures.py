@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from experiments.measures import MPC, OPTIMUM, OURS
+from experiments.measures import IMPROVED, MPC, OURS
 from experiments.runner import Outcome, Run
 from sb3_yann._validation import Array
 
@@ -21,8 +22,13 @@ from sb3_yann._validation import Array
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = "osD^vPX"
-LEVELS, FEW = (MPC, OPTIMUM), (OURS, "DDPG", "residual RL", "cloned MPC, then DDPG")
-"""What the README's picture shows."""
+RIVALS = {
+    "bioreactor": ("bioreactor", "bioreactor, an observer"),
+    "van de Vusse's reactor": ("van de Vusse's reactor", "van de Vusse's reactor, an observer"),
+    "worn tank": ("worn tank, set-points", "worn tank, an observer"),
+    "the paper's reactor": ("reactor", "reactor, an observer"),
+}
+"""Plants of the README's picture: how they are called without and with an observer."""
 
 
 def save_pictures(outcomes: Mapping[Run, Outcome], folder: Path) -> dict[str, Path]:
@@ -41,45 +47,65 @@ def save_pictures(outcomes: Mapping[Run, Outcome], folder: Path) -> dict[str, Pa
 
 
 def save_in_short(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
-    """Save ``in-short.png``, the README's picture: the first plant with a rival, in two panels."""
-    for plant in dict.fromkeys(run.plant for run in outcomes):
-        of_plant = {run: outcome for run, outcome in outcomes.items() if run.plant == plant}
-        fixed = {run.learner: out for run, out in of_plant.items() if run.learner in LEVELS}
-        found = _learners({run: out for run, out in of_plant.items() if run.learner in FEW})
-        if MPC in fixed and OURS in found and len(found) > 1:
-            folder.mkdir(parents=True, exist_ok=True)
-            path = folder / "in-short.png"
-            _two_panels(plant, found, fixed).savefig(path, dpi=110)
-            return [path]
-    return []
+    """Save ``in-short.png``, the README's picture: learning beside the best linear controller.
 
-
-def _two_panels(
-    plant: str, learners: Mapping[str, list[Outcome]], fixed: Mapping[str, Outcome]
-) -> Figure:
-    figure = Figure(figsize=(9, 4), layout="constrained")
+    A panel for each plant whose MPC was tried with an observer (offset-free) and improved: the cost
+    of each tested start in parts of the MPC's from the same start, sorted for each controller.
+    """
+    panels = {name: found for name in RIVALS if (found := _shares(outcomes, name))}
+    if not panels:
+        return []
+    folder.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(3 * len(panels), 3.6), layout="constrained")
     FigureCanvasAgg(figure)
-    tests, costs = figure.subplots(1, 2)
-    base = float(fixed[MPC].test_costs[-1].mean())
-    tested = {name: _tests(runs, base) for name, runs in learners.items()}
-    excess = {name: _excess(runs, base) for name, runs in learners.items()}
-    for k, name in enumerate(learners):
-        _band(tests, *tested[name], k, f"{name} ({len(learners[name])} seeds)")
-        _band(costs, *excess[name], k, name)
-    levels = {name: float(out.test_costs[-1].mean()) / base for name, out in fixed.items()}
-    for (name, level), style in zip(levels.items(), STYLES[1:], strict=False):
-        tests.axhline(level, label=name, color="black", linestyle=style, linewidth=1, zorder=1)
-    costs.axhline(0, color="black", linestyle=STYLES[1], linewidth=1, zorder=1)
-    cut = _cut_above(tests, tested, [*levels.values()])
-    _scales(None, costs, tested, excess)
-    tests.set(title=f"{plant}: test cost{cut}", ylabel="× the MPC's cost")
-    costs.set(title="excess cost of learning", ylabel="in episodes of the MPC")
-    for axes in (tests, costs):
-        axes.set_xlabel("training episodes")
+    row = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (name, found) in zip(row, panels.items(), strict=True):
+        for k, (label, (shares, mean)) in enumerate(found.items()):
+            style = {"color": COLORS[k], "linestyle": STYLES[k], "label": label}
+            axes.plot(np.arange(1, len(shares) + 1), np.sort(shares), **style)
+            words = {"color": COLORS[k], "transform": axes.transAxes}
+            axes.text(0.05, 0.92 - 0.08 * k, f"mean {100 * mean:+.1f} %", **words)
+        axes.axhline(1, color="black", linewidth=1, label=MPC)
+        axes.set(title=name, xlabel="starts, sorted for each")
         axes.grid(alpha=0.3)
-    handles, labels = tests.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    return figure
+    row[0].set(ylabel="cost / the MPC's from the same start", ylim=(0, 1.6))
+    handles: dict[str, Any] = {}
+    for axes in row:
+        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(
+        [*handles.values()], [*handles], loc="outside lower center", ncols=4, frameon=False
+    )
+    path = folder / "in-short.png"
+    figure.savefig(path, dpi=110)
+    return [path]
+
+
+def _shares(outcomes: Mapping[Run, Outcome], plant: str) -> dict[str, tuple[Array, float]]:
+    """Return each controller's costs in parts of the MPC's, and how its mean differs."""
+    base, linear = RIVALS[plant]
+    ours = _median_costs(outcomes, base)
+    over = _median_costs(outcomes, linear)
+    if ours is None or over is None:
+        return {}
+    mpc = ours[0]
+    every = {
+        "policy learnt from the MPC": ours[1],
+        "offset-free MPC, untrained": over[0],
+        "policy learnt from the offset-free MPC": over[1],
+    }
+    return {
+        name: (costs / mpc, float(costs.mean() / mpc.mean() - 1)) for name, costs in every.items()
+    }
+
+
+def _median_costs(outcomes: Mapping[Run, Outcome], plant: str) -> Array | None:
+    """Return what the first controller and the improved one cost at each start, (2, starts)."""
+    found = [
+        out.test_costs
+        for run, out in outcomes.items()
+        if (run.plant, run.learner) == (plant, IMPROVED)
+    ]
+    return np.median(found, axis=0) if found else None
 
 
 def _learners(outcomes: Mapping[Run, Outcome]) -> dict[str, list[Outcome]]:
@@ -149,30 +175,15 @@ def _band(axes: Axes, x: Array, y: Array, k: int, label: str) -> None:
     axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
 
 
-def _cut_above(
-    axes: Axes, tested: Mapping[str, tuple[Array, Array]], levels: Sequence[float]
-) -> str:
-    """Show what lies around our curve and the levels; return what the title says of the rest."""
-    bands = {name: np.quantile(y, [0.25, 0.75], axis=0) for name, (_, y) in tested.items()}
-    lowest = min(*levels, *(float(band.min()) for band in bands.values()))
-    highest = max(*levels, float(bands[OURS].max()))
-    room = (highest - lowest) or 0.1
-    # Rounded to a tenth of the room, so that the title gives the very number.
-    top = round(highest + 1.7 * room, 1 - int(np.floor(np.log10(room))))
-    axes.set_ylim(lowest - 0.3 * room, top)
-    hidden = any(band.max() > top for band in bands.values())
-    return f" (cut at {top:g})" if hidden else ""
-
-
 def _scales(
-    curves: Axes | None,
+    curves: Axes,
     costs: Axes,
     tested: Mapping[str, tuple[Array, Array]],
     excess: Mapping[str, tuple[Array, Array]],
 ) -> None:
     """Use logarithmic axes where one learner would flatten the others."""
     medians = np.concatenate([np.median(y, axis=0) for _, y in tested.values()])
-    if curves and np.all(medians > 0) and medians.max() > 5 * medians.min():
+    if np.all(medians > 0) and medians.max() > 5 * medians.min():
         curves.set_yscale("log")
         curves.yaxis.set_major_formatter("{x:g}")
         curves.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.2, 0.6)))

@@ -10,7 +10,7 @@ from pathlib import Path
 import sb3_yann
 from experiments.markdown import number, table
 from experiments.measures import EXPLORED, MPC, OPTIMUM, OURS, Row, plants_of, rows_of
-from experiments.pictures import save_in_short, save_pictures
+from experiments.pictures import save_pictures
 from experiments.published import paper_table
 from experiments.runner import Outcome, Run
 
@@ -70,7 +70,7 @@ def write_report(
     ]
     report = folder / "results.md"
     report.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-    return [report, *pictures.values(), *save_in_short(outcomes, folder)]
+    return [report, *pictures.values()]
 
 
 def in_short(outcomes: Mapping[Run, Outcome]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -73,6 +73,10 @@ class Log:
         Empty where nobody named them.
     lost_steps : int
         Steps left out, since they took another time than ``dt``.
+    units : tuple of str
+        Of states, inputs and disturbances in turn; empty where no header names them.
+    time_unit : str
+        Of ``dt``.
 
     Examples
     --------
@@ -89,6 +93,8 @@ class Log:
     input_names: tuple[str, ...] = ()
     disturbance_names: tuple[str, ...] = ()
     lost_steps: int = 0
+    units: tuple[str, ...] = ()
+    time_unit: str = ""
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -107,7 +113,8 @@ class Log:
         steps = sum(len(each) for each in self.episodes)
         lost = f"; {self.lost_steps} steps of another length left out" if self.lost_steps else ""
         return (
-            f"Log({len(self)} episode{'s' * (len(self) > 1)}, {steps:,} steps of dt = {self.dt:g}; "
+            f"Log({len(self)} episode{'s' * (len(self) > 1)}, {steps:,} steps of dt = {self.dt:g}"
+            f"{f' {self.time_unit}' if self.time_unit else ''}; "
             f"{', '.join(columns)}{lost})"
         )
 
@@ -131,6 +138,7 @@ class Log:
         *,
         disturbances: Arrays | None = None,
         time: Arrays | None = None,
+        time_unit: str = "",
     ) -> Log:
         """Return the log of arrays, one for each episode, or of a single one.
 
@@ -145,6 +153,8 @@ class Log:
         time : array_like, shape (T + 1,), or a sequence of such, optional
             When each row of the states was measured. Steps that differ from ``dt`` by more than
             10 % are left out, and the episode is cut there.
+        time_unit : str, optional
+            Of ``dt`` and ``time``, for reports and plots.
 
         Raises
         ------
@@ -169,7 +179,7 @@ class Log:
         lost = 0
         if time is not None:
             episodes, lost = _without_gaps(episodes, time, dt)
-        return cls(tuple(episodes), dt, lost_steps=lost)
+        return cls(tuple(episodes), dt, lost_steps=lost, time_unit=time_unit)
 
     @classmethod
     def from_csv(
@@ -183,6 +193,7 @@ class Log:
         episode: str | None = None,
         time: str | None = None,
         delimiter: str = ",",
+        time_unit: str = "",
     ) -> Log:
         """Return the log of a CSV file with a header, as a historian writes it.
 
@@ -194,7 +205,7 @@ class Log:
         path : path-like
             The file.
         states, inputs, disturbances : sequence of str
-            Names of columns.
+            Names of columns. Of a header ``T [K]`` the name is ``T``, and the unit ``K``.
         dt : float
             Sampling time.
         episode : str, optional
@@ -203,6 +214,8 @@ class Log:
             A column of times in the unit of ``dt``; an episode ends where a step takes another.
         delimiter : str, default ","
             Between two columns.
+        time_unit : str, optional
+            Of ``dt``; by default that of the column of times.
 
         Raises
         ------
@@ -213,18 +226,16 @@ class Log:
         for name, given in (("states", states), ("inputs", inputs)):
             if isinstance(given, str) or not given:
                 raise ValueError(f"{name} = {given!r} must be a list of column names.")
-        wanted = [*states, *inputs, *disturbances]
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, delimiter=delimiter)
-            header = rows.fieldnames or []
-            named = [*wanted, *(each for each in (episode, time) if each is not None)]
-            if missing := [name for name in named if name not in header]:
-                raise ValueError(f"{path} has no column {missing[0]!r}; it has {list(header)}.")
-            if twice := [name for name in named if header.count(name) > 1]:
-                raise ValueError(
-                    f"{path} has several columns {twice[0]!r}: give each its own name."
-                )
+            header = list(rows.fieldnames or [])
+            columns = {
+                name: _column(path, name, header)
+                for name in (*states, *inputs, *disturbances, episode, time)
+                if name is not None
+            }
             content = list(rows)
+        wanted = [columns[name] for name in (*states, *inputs, *disturbances)]
         if twice := [name for name in wanted if wanted.count(name) > 1]:
             raise ValueError(
                 f"Column {twice[0]!r} is named twice. Each state, input and disturbance has a "
@@ -244,7 +255,7 @@ class Log:
         ends = np.zeros(len(table) + 1, dtype=bool)
         ends[[0, -1]] = True
         if episode is not None:
-            labels = np.array([row[episode] for row in content])
+            labels = np.array([row[columns[episode]] for row in content])
             ends[1:-1] |= labels[1:] != labels[:-1]
         no_state = ~np.isfinite(table[:, :n]).all(axis=1)
         no_input = ~np.isfinite(table[:, n:]).all(axis=1)
@@ -252,7 +263,9 @@ class Log:
         ends[1:] |= no_state | no_input
         times = None
         if time is not None:
-            times = np.array([_number(path, k, row, time) for k, row in enumerate(content)])
+            times = np.array(
+                [_number(path, k, row, columns[time]) for k, row in enumerate(content)]
+            )
         edges = pairwise(np.flatnonzero(ends))
         parts = [slice(first, stop) for first, stop in edges if stop - first > 1]
         if not parts:
@@ -264,8 +277,15 @@ class Log:
             disturbances=[table[part, n + m :][:-1] for part in parts] if disturbances else None,
             time=None if times is None else [times[part] for part in parts],
         )
-        return cls(
-            log.episodes, dt, tuple(states), tuple(inputs), tuple(disturbances), log.lost_steps
+        names = [_name_and_unit(each)[0] for each in wanted]
+        units = tuple(_name_and_unit(each)[1] for each in wanted)
+        return replace(
+            log,
+            state_names=tuple(names[:n]),
+            input_names=tuple(names[n : n + m]),
+            disturbance_names=tuple(names[n + m :]),
+            units=units if any(units) else (),
+            time_unit=time_unit or _name_and_unit(columns[time] if time else "")[1],
         )
 
 
@@ -314,6 +334,22 @@ def split_episodes(
         fitted += [episode.part(0, border)] if border else []
         tested += [episode.part(border, len(episode))] if border < len(episode) else []
     return fitted, tested
+
+
+def _column(path: object, name: str, header: Sequence[str]) -> str:
+    """Return the column of this name, with or without its unit."""
+    found = [each for each in header if name in (each, _name_and_unit(each)[0])]
+    if not found:
+        raise ValueError(f"{path} has no column {name!r}; it has {list(header)}.")
+    if len(found) > 1:
+        raise ValueError(f"{path} has several columns {name!r}: give each its own name.")
+    return found[0]
+
+
+def _name_and_unit(header: str) -> tuple[str, str]:
+    """Return the name and the unit of a column: ``T [K]`` is T in K."""
+    name, bracket, unit = header.strip().removesuffix("]").rpartition(" [")
+    return (name.strip(), unit.strip()) if bracket and header.endswith("]") else (header, "")
 
 
 def _number(path: object, row: int, content: dict[str, str], name: str) -> float:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -154,3 +157,32 @@ def test_identify_takes_a_log_with_its_names(tmp_path) -> None:
         identify(log, dt=2)
     with pytest.raises(TypeError, match="takes a Log, or states and actions"):
         identify(x)
+
+
+def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=60)
+    x = np.zeros(61)
+    for k in range(60):
+        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+    rows = zip(10 * np.arange(60), x, u, strict=False)
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "time [s],T [K],valve\n" + "".join(f"{t},{a:.6f},{b:.6f}\n" for t, a, b in rows),
+        encoding="utf-8",
+    )
+    log = Log.from_csv(path, ["T"], ["valve"], dt=10, time="time")
+    assert Log.from_csv(path, ["T [K]"], ["valve"], dt=10).state_names == ("T",)
+    assert repr(log) == "Log(1 episode, 59 steps of dt = 10 s; 1 state (T), 1 input (valve))"
+    model = identify(log).model
+    assert (model.state_names, model.units, model.time_unit) == (("T",), ("K", ""), "s")
+    assert "sampled every 10 s" in model.report() and "time constant 44.81 s" in model.report()
+    assert replace(model, dt=5).time_unit == "s"
+    with pytest.raises(
+        ValueError, match=r"has no column 'T \[C\]'; it has \['time \[s\]', 'T \[K\]'"
+    ):
+        Log.from_csv(path, ["T [C]"], ["valve"], dt=10)
+    with pytest.raises(TypeError, match="time_unit = 3 must be a str"):
+        model.named(time_unit=3)

@@ -24,7 +24,7 @@ def clipped_pendulum() -> LinearMPC:
     array([0.])
     """
     model = LinearModel(pendulum.PRINTED_A, pendulum.PRINTED_B, pendulum.DT)
-    model = model.named(["angle", "speed"], ["torque"], ["rad", "rad/s", "N m"])
+    model = model.named(["angle", "speed"], ["torque"], ["rad", "rad/s", "N m"], time_unit="s")
     return LinearMPC(
         model,
         Q=pendulum.Q,
@@ -53,7 +53,7 @@ def cstr() -> LinearMPC:
     """
     model = LinearModel(reactor.PRINTED_A, reactor.PRINTED_B, reactor.DT)
     units = [*["mol/L"] * 3, "K", "kJ/(h m² K)"]
-    model = model.named(["C_A", "C_B", "C_S", "T"], ["U"], units)
+    model = model.named(["C_A", "C_B", "C_S", "T"], ["U"], units, time_unit="h")
     return LinearMPC(
         model,
         Q=reactor.Q,

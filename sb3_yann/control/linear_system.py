@@ -32,6 +32,8 @@ class LinearSystem(ReadOnlyArrays):
         Which disturbances an observer estimates.
     C : ndarray, shape (q, n), optional
         The outputs that sensors show, ``y = C x``. None where they show the states.
+    time_unit : str
+        Of ``dt``, for reports and plots.
     """
 
     A: Array
@@ -48,6 +50,12 @@ class LinearSystem(ReadOnlyArrays):
     units: tuple[str, ...] = ()
     estimated: tuple[int, ...] = ()
     C: Array | None = None
+    time_unit: str = ""
+
+    @property
+    def step_length(self) -> str:
+        """The sampling time in words."""
+        return f"{self.dt:.4g} {self.time_unit}".rstrip()
 
     @property
     def shown(self) -> Array:

@@ -91,8 +91,6 @@ def plot_loop(
     runs: Runs,
     quantity: Quantity,
     axes: Axes | None = None,
-    *,
-    time_unit: str = "",
 ) -> Axes:
     """Draw one quantity over time, in plant units, with its limits and its set-point.
 
@@ -110,8 +108,6 @@ def plot_loop(
         An entry of ``[theta, u]``: its index, or a name as in ``problem.labels()``, or an input's.
     axes : matplotlib Axes, optional
         Where to draw; a new figure's by default.
-    time_unit : str, optional
-        Of ``model.dt``, for the label.
 
     Raises
     ------
@@ -130,7 +126,7 @@ def plot_loop(
     entry = entry_of(problem, quantity, inputs=True)
     runs = _check_runs(problem, runs)
     axes = axes_or_new(axes, 6.4, 3.0)
-    _draw_loops([axes], problem, [runs], entry, time_unit)
+    _draw_loops([axes], problem, [runs], entry)
     legend_above(axes, columns=1 if len(runs) > 2 else 2)
     return axes
 
@@ -140,7 +136,6 @@ def loops_figure(
     runs: Runs,
     *,
     quantities: Sequence[Quantity] | None = None,
-    time_unit: str = "",
 ) -> Figure:
     """Return a figure of several quantities.
 
@@ -154,8 +149,6 @@ def loops_figure(
         By controller, the first one uppermost; their observations are theta.
     quantities : sequence of int or str, optional
         As of :func:`plot_loop`; all states and inputs by default.
-    time_unit : str, optional
-        Of ``model.dt``, for the label.
 
     Examples
     --------
@@ -163,7 +156,7 @@ def loops_figure(
     >>> from sb3_yann_envs import problems
     >>> mpc = problems.clipped_pendulum()
     >>> runs = {"MPC": evaluate(mpc.explicit(), "ClippedPendulum-v0", range(8))}
-    >>> len(loops_figure(mpc, runs, time_unit="s").axes)
+    >>> len(loops_figure(mpc, runs).axes)
     3
     """
     runs = _check_runs(problem, runs)
@@ -184,7 +177,7 @@ def loops_figure(
             for panel in own:
                 panel.set_axis_off()
             continue
-        _draw_loops([*own], problem, groups, entries[k], time_unit)
+        _draw_loops([*own], problem, groups, entries[k])
         for panel, group in zip(own, groups, strict=True):
             if column == 0 and many and len(groups) > 1:
                 panel.set_title(next(iter(group)), loc="left", fontsize="medium")
@@ -202,7 +195,7 @@ def loops_figure(
 
 
 def _draw_loops(
-    panels: Sequence[Axes], problem: LinearMPC, groups: Sequence[Runs], entry: int, time_unit: str
+    panels: Sequence[Axes], problem: LinearMPC, groups: Sequence[Runs], entry: int
 ) -> None:
     """Draw one quantity, of each group of controllers in a panel: they share their range."""
     n, number = problem.n_theta, 0
@@ -236,7 +229,8 @@ def _draw_loops(
         _draw_limits(panel, problem, entry, float(data.min()), float(data.max()))
         panel.set_ylabel(label)
         panel.grid(alpha=0.3)
-    panels[-1].set_xlabel(f"time ({time_unit})" if time_unit else "time")
+    unit = problem.model.time_unit
+    panels[-1].set_xlabel(f"time ({unit})" if unit else "time")
 
 
 def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:

@@ -33,7 +33,7 @@ def plant_part(subject: Subject) -> Part:
     ends = zip(problem.labels(units=True), problem.theta_min, problem.theta_max, strict=True)
     soft = problem.soft.penalty
     facts = [
-        ["horizon", f"{problem.horizon} steps of {model.dt:g}"],
+        ["horizon", f"{problem.horizon} steps of {model.step_length}"],
         ["weight of the states, Q", _matrix(problem.Q)],
         ["weight of the inputs, R", _matrix(problem.R)],
         ["discount of the MPC, gamma", number(problem.gamma)],

@@ -26,7 +26,7 @@ from sb3_yann_envs import problems
 def tank(**options) -> LinearMPC:
     model = LinearModel(
         [[0.9]], [[0.5]], 2.0, [12], [40], state_names=["level"], input_names=["flow"],
-        units={"level": "m", "flow": "L/s"},
+        units={"level": "m", "flow": "L/s"}, time_unit="s",
     )  # fmt: skip
     given = {"x_min": 9, "x_max": 15, "theta_min": 8, "theta_max": 16}
     limits = {"u_min": 39, "u_max": 41, "horizon": 2}
@@ -49,7 +49,7 @@ def test_the_table_shows_losses_as_well_as_gains() -> None:
 
 
 def test_few_episodes_are_lines_in_plant_units() -> None:
-    axes = plot_loop(tank(), {"MPC": episodes(3)}, "level", time_unit="s")
+    axes = plot_loop(tank(), {"MPC": episodes(3)}, "level")
     own = [line for line in axes.lines if len(line.get_ydata()) == 6]
     np.testing.assert_allclose([line.get_ydata()[0] for line in own], [12, 12 + 1 / 3, 12 + 2 / 3])
     assert own[0].get_xdata().tolist() == [0, 2, 4, 6, 8, 10]

@@ -19,6 +19,7 @@ from experiments.learning import (
     rows,
     runs,
 )
+from experiments.pictures import RIVALS, _shares, save_in_short
 from experiments.plants import CASES
 from experiments.runner import Outcome, Run, save
 
@@ -114,3 +115,22 @@ def test_a_run_compares_with_the_mpc_on_the_same_episodes(monkeypatch) -> None:
     largest, mean = learning.moves_of(played)
     assert largest == max(each.max() for each in steps)
     assert mean == pytest.approx(np.concatenate(steps).mean())
+
+
+def test_the_picture_pairs_costs_with_the_mpc_that_has_no_observer(tmp_path) -> None:
+    plain, observed = RIVALS["bioreactor"]
+    tried = {
+        Run(plain, IMPROVED, 40, 0): outcome([BASE, [8.0, 24.0]]),
+        Run(observed, IMPROVED, 40, 0): outcome([[9.0, 15.0], [5.0, 15.0]]),
+    }
+    shares = {
+        name: (list(costs), mean) for name, (costs, mean) in _shares(tried, "bioreactor").items()
+    }
+    assert shares == {
+        "policy learnt from the MPC": ([0.8, 0.8], pytest.approx(-0.2)),
+        "offset-free MPC, untrained": ([0.9, 0.5], pytest.approx(-0.4)),
+        "policy learnt from the offset-free MPC": ([0.5, 0.5], pytest.approx(-0.5)),
+    }
+    (path,) = save_in_short(tried, tmp_path)
+    assert path.name == "in-short.png" and path.stat().st_size > 10_000
+    assert save_in_short(PLANT_RUNS, tmp_path) == []

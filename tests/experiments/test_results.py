@@ -8,13 +8,11 @@ import types
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import experiments
 from experiments.__main__ import BEGIN, END, main
 from experiments.markdown import number, quote, spread, table
-from experiments.measures import OURS, rows_of
-from experiments.pictures import _cut_above, save_in_short
+from experiments.measures import rows_of
 from experiments.published import paper_table
 from experiments.results import in_short, write_report
 from experiments.runner import Outcome, Run
@@ -87,7 +85,7 @@ def test_the_report_is_whole(tmp_path) -> None:
     outcomes[Run("CSTR", "YANN-RL, guard off", 0, 50)] = learned(OPTIMUM)
     outcomes[Run("CSTR", "YANN-RL", 0, 200)] = learned(OPTIMUM, episodes=200)
     paths = write_report(outcomes, tmp_path / "docs", notes=notes)
-    names = ["results.md", "results-cstr.png", "results-pendulum-q-i.png", "in-short.png"]
+    names = ["results.md", "results-cstr.png", "results-pendulum-q-i.png"]
     assert [path.name for path in paths] == names
     assert all(path.stat().st_size > 1000 for path in paths)
     text = paths[0].read_text(encoding="utf-8")
@@ -154,21 +152,6 @@ def test_the_command_reports_what_failed(catalog, tmp_path, capsys) -> None:
     assert "3 of 4 runs" in said
     assert (tmp_path / "docs/results.md").exists()
     assert main(["--report-only", "--results", "elsewhere.sqlite"]) == 0
-
-
-def test_the_picture_of_the_readme_needs_a_rival(tmp_path) -> None:
-    (path,) = save_in_short(reactor(), tmp_path / "new")
-    assert path.name == "in-short.png" and path.stat().st_size > 10_000
-    assert save_in_short(pendulum(), tmp_path) == []
-
-
-def test_the_picture_of_the_readme_says_where_it_cuts_a_rival_off() -> None:
-    axes, x = Figure().subplots(), np.array([0.0, 10.0])
-    curves = {OURS: (x, np.array([[1.0, 0.8]])), "DDPG": (x, np.array([[1.5, 1.1]]))}
-    assert _cut_above(axes, curves, [1.0, 0.7]) == ""
-    np.testing.assert_allclose(axes.get_ylim(), [0.61, 1.51])
-    curves["TD3"] = x, np.array([[1.6, 1.1]])
-    assert _cut_above(axes, curves, [1.0, 0.7]) == " (cut at 1.51)"
 
 
 def test_the_readme_gets_the_short_table_between_its_marks(tmp_path) -> None:

@@ -138,7 +138,7 @@ def test_names_units_limits_and_costs_are_the_plant_s(whole) -> None:
     path, model = whole
     text = Outline(path).text
     assert "torque (N m) -2 2 hard" in text and "angle (rad) -2 2 hard" in text
-    assert "horizon 2 steps of 0.05" in text and "diag(1, 0.1)" in text
+    assert "horizon 2 steps of 0.05 s" in text and "diag(1, 0.1)" in text
     for played in (model.policy.problem.explicit(), model):
         mean = evaluate(played, "ClippedPendulum-v0", SEEDS).costs.mean()
         assert f"{mean:.6g}"[:6] in text  # the policy's law rounds to float32

@@ -93,7 +93,7 @@ def fit_log(
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
     system = system_of(found, sizes, given, log.dt, delays)
-    system = _with_exact_memory(system, delays, sizes[0])
+    system = replace(_with_exact_memory(system, delays, sizes[0]), time_unit=log.time_unit)
     late = [] if any(delays) else input_notes(found, fitted, sizes, episodes)
     if late:
         warnings.warn(" ".join(late), stacklevel=3)

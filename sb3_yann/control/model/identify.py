@@ -162,7 +162,8 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     )
     model = LinearModel(**vars(found.system))
     if log.state_names:
-        model = model.named(log.state_names, log.input_names)
+        labelled = len(log.state_names) + len(log.input_names)
+        model = model.named(log.state_names, log.input_names, log.units[:labelled])
     step = found.regression
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)

@@ -247,7 +247,9 @@ def identify_outputs(
         notes=[*system.notes, *_notes(log, found, plain, step, model.noise)],
         state_names=_state_names(log, model, found.delays),
         input_names=log.input_names,
+        units=dict(zip(log.input_names, log.units[q : q + m], strict=True)) if log.units else (),
         C=C,
+        time_unit=log.time_unit,
     )
     late = np.repeat(np.arange(m), found.delays)
     memory = np.diag(plain.spread[q : q + m][late] ** 2)

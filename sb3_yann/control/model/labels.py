@@ -68,6 +68,14 @@ def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
     return found if any(found) else ()
 
 
+def as_unit(what: str, given: str) -> str:
+    """Return one unit, which may be empty."""
+    if not isinstance(given, str):
+        raise TypeError(f"{what} = {given!r} must be a str, such as 's'.")
+    _require_text(what, [given])
+    return given
+
+
 def labels_of(model: LinearSystem) -> tuple[list[str], list[str]]:
     """Return the names of the states and of the inputs, ``x[0]`` and ``u[0]`` where none is given.
 
@@ -142,7 +150,7 @@ def short_repr(model: Any) -> str:
     if model.estimated:
         sizes += f", estimated={[*model.estimated]}"
     point = f"x_ss={model.x_ss.tolist()}, u_ss={model.u_ss.tolist()}"
-    return f"{type(model).__name__}({sizes}, dt={model.dt:g}, {point})"
+    return f"{type(model).__name__}({sizes}, dt={model.step_length}, {point})"
 
 
 def past_inputs(model: LinearSystem) -> list[tuple[int, str]]:

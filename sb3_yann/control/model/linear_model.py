@@ -22,7 +22,7 @@ from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.linear_system import names, zero_order_hold
 from sb3_yann.control.linearization.dynamics import linearize_dynamics
 from sb3_yann.control.linearization.linearize import linearize_env
-from sb3_yann.control.model.labels import Units, as_names, as_units, require_different
+from sb3_yann.control.model.labels import Units, as_names, as_unit, as_units, require_different
 from sb3_yann.control.model.plant import Plant
 from sb3_yann.control.model.statespace import from_control
 from sb3_yann.log import Arrays, Log
@@ -60,6 +60,8 @@ class LinearModel(Plant):
         estimates them. Equality ignores it, `dataclasses.replace` keeps it.
     C : array_like, shape (q, n), optional
         The outputs that sensors show, ``y = C x``. The default, None, is all states.
+    time_unit : str, optional
+        Of ``dt``, for reports and plots. Equality ignores it.
 
     Examples
     --------
@@ -76,6 +78,7 @@ class LinearModel(Plant):
     units: tuple[str, ...] = field(default=(), compare=False)
     estimated: tuple[int, ...] = field(default=(), compare=False)
     C: Array | None = None
+    time_unit: str = field(default="", compare=False)
 
     def __init__(  # noqa: PLR0913 (the matrices of a plant and its operating point)
         self,
@@ -94,6 +97,7 @@ class LinearModel(Plant):
         units: Units = (),
         estimated: Sequence[int] = (),
         C: ArrayLike | None = None,
+        time_unit: str = "",
     ) -> None:
         A = check_array("A", A, ("n", "n"))
         n = A.shape[0]
@@ -116,7 +120,23 @@ class LinearModel(Plant):
         step, kept = check_positive("dt", dt), as_units(units, labels)
         seen = check_indices("estimated", estimated, E.shape[1])
         shown = None if C is None else check_array("C", C, ("q", n))
-        super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept, seen, shown)
+        super().__init__(
+            A,
+            B,
+            step,
+            x,
+            u,
+            E,
+            d,
+            notes=tuple(notes),
+            drift=moved,
+            state_names=named[0],
+            input_names=named[1],
+            units=kept,
+            estimated=seen,
+            C=shown,
+            time_unit=as_unit("time_unit", time_unit),
+        )
 
     @classmethod
     def from_continuous(

@@ -31,15 +31,22 @@ class Plant(LinearSystem):
         state_names: Sequence[str] = (),
         input_names: Sequence[str] = (),
         units: Units = (),
+        time_unit: str | None = None,
     ) -> Self:
-        """Return the model with names and units; notes and drift stay.
+        """Return the model with names and units; notes and drift stay, as does a unit of time.
 
         Inputs on their way, the last states of a model with dead time, are named after the inputs
         where names and units are given of the others only.
         """
         if past := past_inputs(self):
             state_names, units = completed(self, past, state_names, input_names, units)
-        given = {"state_names": state_names, "input_names": input_names, "units": units}
+        given: dict[str, Any] = {
+            "state_names": state_names,
+            "input_names": input_names,
+            "units": units,
+        }
+        if time_unit is not None:
+            given["time_unit"] = time_unit
         return type(self)(**{**vars(self), **given})
 
     def about_zero(self) -> Self:

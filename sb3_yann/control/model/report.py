@@ -22,7 +22,7 @@ SLOW_SAMPLING, FAST_SAMPLING = 1.0, 50.0
 
 def describe(model: LinearSystem) -> str:
     """Return the report of `LinearModel.report`."""
-    modes = [f"  {_number(pole)}: {_mode(pole, model.dt)}" for pole in poles(model)]
+    modes = [f"  {_number(pole)}: {_mode(pole, model)}" for pole in poles(model)]
     lines = [*_head(model), "Poles:", *modes, _stability(model)]
     lines += [*_reach(model), *_scaling(model), *_sampling(model)]
     return "\n".join([*lines, *(f"Note: {note}" for note in model.notes)])
@@ -38,7 +38,10 @@ def _head(model: LinearSystem) -> list[str]:
     point = f"x_ss = {_vector(model.x_ss)}, u_ss = {_vector(model.u_ss)}"
     if model.n_disturbances:
         point += f", d_ss = {_vector(model.d_ss)}"
-    head = [f"Linear model: {sizes}, sampled every {model.dt:.4g}.", f"Operating point: {point}."]
+    head = [
+        f"Linear model: {sizes}, sampled every {model.step_length}.",
+        f"Operating point: {point}.",
+    ]
     if model.state_names or model.input_names or model.units:
         states, inputs = with_units(model)
         head.insert(1, f"States: {', '.join(states)}. Inputs: {', '.join(inputs)}.")
@@ -60,10 +63,11 @@ def time_constant(pole: complex) -> float:
     return float(-1 / np.log(size)) if size > 0 else 0.0
 
 
-def _mode(pole: complex, dt: float) -> str:
+def _mode(pole: complex, model: LinearSystem) -> str:
     """Return how the mode of a pole moves."""
     constant = time_constant(pole)
-    lasting = f"{abs(constant) * dt:.4g} ({abs(constant):.3g} samples)"
+    unit = f" {model.time_unit}" if model.time_unit else ""
+    lasting = f"{abs(constant) * model.dt:.4g}{unit} ({abs(constant):.3g} samples)"
     if np.isinf(constant):
         words = "integrates" if abs(pole - 1) <= ON_CIRCLE else "neither grows nor decays"
     elif abs(constant) < GONE:
@@ -73,7 +77,7 @@ def _mode(pole: complex, dt: float) -> str:
     angle = abs(np.angle(pole))
     if angle > 1e-9 and abs(pole) > 1e-9:
         period = 2 * np.pi / angle
-        words += f", oscillates with period {period * dt:.4g} ({period:.3g} samples)"
+        words += f", oscillates with period {period * model.dt:.4g}{unit} ({period:.3g} samples)"
     return words
 
 

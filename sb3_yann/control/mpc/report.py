@@ -69,7 +69,7 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
 
 
 def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
-    yield f"Horizon: {problem.horizon} steps of {problem.model.dt:g}."
+    yield f"Horizon: {problem.horizon} steps of {problem.model.step_length}."
     if isinstance(law, OnlineLaw):
         yield f"The law is solved online, with {law.n_constraints} constraints."
     else:
