@@ -8,6 +8,7 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.offset import CURE
+from sb3_yann.control import LinearMPC
 
 LITTLE = 0.005
 """A gain below this, relative to the MPC's cost, is not worth an observer or a new model."""
@@ -18,10 +19,10 @@ ROUNDING = 1e-9
 ADVICE = {
     "do not bother": "there is little to gain over the MPC.",
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
-    "re-identify": "a linear model of the plant as it is brings most of it: see "
-    "LinearModel.from_data, PlantTwin.reidentified, improve(model, twin).",
-    "learn": "most of it is beyond a linear model: improve(model, simulator or twin), or DDPG "
-    "under an ImprovementGuard.",
+    "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
+    "headroom(...).reidentified.",
+    "learn": "most of it is beyond a linear model: improve(mpc, {source}), or DDPG under an "
+    "ImprovementGuard.",
 }
 UNKNOWN = "not known"
 """The verdict where what was found may be chance, and where nothing was found in a poor model."""
@@ -61,6 +62,10 @@ class Headroom:
         Of the env, all that were taken.
     note : str
         What was left out; empty where nothing was.
+    reidentified : LinearMPC, optional
+        The same MPC with a model that these episodes, or a twin's log, tell.
+    budget : int
+        Steps of the env that `improve` is likely not to exceed; 0 in a twin.
 
     Examples
     --------
@@ -86,6 +91,8 @@ class Headroom:
     reidentified_played: Array | None = None
     steps: int = 0
     note: str = ""
+    reidentified: LinearMPC | None = None
+    budget: int = 0
 
     @property
     def total(self) -> float:
@@ -148,7 +155,8 @@ class Headroom:
             )
         if self.verdict == UNKNOWN:
             return f"nothing was found, but {poor}"
-        advice = self._with_d_max(ADVICE[self.verdict])
+        source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
+        advice = self._with_d_max(ADVICE[self.verdict]).format(source=source)
         played = self.observer_played
         if self.verdict == "add ObserveDisturbance first" and played is not None:
             if np.any(played > self.mpc_costs + LITTLE * np.abs(self.mpc_costs)):

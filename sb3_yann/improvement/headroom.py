@@ -35,6 +35,9 @@ LEFT = 0.05
 KEPT = 1e-3
 """A plan is played anew where the plant broke its promise by so much of the MPC's mean cost."""
 
+EPISODES_OF_IMPROVE = 300
+"""Episodes that `improve` takes at most by default: 120 to 290 on the plants of the tables."""
+
 
 def headroom(
     mpc: LinearMPC,
@@ -154,6 +157,7 @@ class _Search:
         self.d_max: Array | None = None
         self.played: dict[str, Array] = {}  # costs of each controller, losses included
         self.fair: dict[str, Array] = {}  # the MPC's where a bound is broken by more
+        self.reidentified: LinearMPC | None = None
         self.runs: list[Array] | None = None  # of the MPC with an observer
 
     def found(self) -> Headroom:
@@ -239,6 +243,7 @@ class _Search:
         except ValueError:  # a model without a steady state or a Riccati solution
             return
         if other is not self.mpc:
+            self.reidentified = other
             law = of_model(self.mpc, other)
             self.add("model", self.simulator.play(law, self.seeds))
             if self.fair["model"].mean() < self.base.costs.mean():
@@ -315,6 +320,8 @@ class _Search:
             reidentified_played=self.played.get("model"),
             steps=self.simulator.steps,
             note=note,
+            reidentified=self.reidentified,
+            budget=EPISODES_OF_IMPROVE * int(self.base.lengths.max()) if self.twin is None else 0,
         )
 
     def _rest(self) -> str:

@@ -181,6 +181,18 @@ def test_what_a_linear_model_cannot_do_is_left_to_learning() -> None:
     found = headroom(problems.clipped_pendulum(), "ClippedPendulum-v0", n_starts=3, seed=2001)
     assert found.verdict == "learn"
     assert found.nonlinearity == pytest.approx(found.total) and found.total > 0.005
+    assert "improve(mpc, make, max_steps=60_000)" in found.report()
+
+
+def test_the_re_identified_mpc_is_handed_over() -> None:
+    plant = partial(Heater, load=0.3)
+    found = headroom(heater(), plant, n_starts=3, max_steps=NO_PLANS)
+    runs = evaluate(found.reidentified.online(), plant, range(3))
+    rows = zip(runs.observations, runs.actions, strict=True)
+    costs = [heater().stage_cost(x[:-1], u).sum() for x, u in rows]
+    np.testing.assert_allclose(costs, found.reidentified_played, rtol=1e-6)
+    advice = dataclasses.replace(found, verdict="re-identify", offset=0, model_error=found.total)
+    assert "take the MPC headroom(...).reidentified" in advice.report()
 
 
 @pytest.mark.parametrize(
