@@ -19,15 +19,6 @@ MPC = LinearMPC(
 BOUNDS = {"plant": ([299, -5], [302, 3]), "normalized": ([-1, -1], [1, 1])}
 
 
-def test_a_bound_on_one_side_is_compared_on_that_side() -> None:
-    mpc = replace(MPC, u_min=[300, -5], u_max=[np.inf, np.inf])
-    above = np.array([np.inf, np.inf])
-    found = ActionUnits.of(mpc, np.array([300.0, -5]), above)
-    assert found is not None and found.kind == "plant"
-    assert ActionUnits.of(mpc, np.array([-5.0, -3]), above) is None
-    assert ActionUnits.of(mpc, np.array([300.0, -5]), np.array([1e6, np.inf])) is None
-
-
 @pytest.mark.parametrize("kind", BOUNDS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_bounds_tell_what_an_env_takes(kind: str, dtype: type) -> None:
@@ -37,23 +28,6 @@ def test_bounds_tell_what_an_env_takes(kind: str, dtype: type) -> None:
     np.testing.assert_allclose(units.input([low, high]), [own.u_min, own.u_max], atol=1e-12)
     u = np.random.default_rng(0).uniform(own.u_min, own.u_max, (9, 2))
     np.testing.assert_allclose(units.input(units.action(u)), u, atol=1e-12)
-
-
-def test_bounds_rounded_to_float32_still_fit() -> None:
-    mpc = replace(MPC, u_min=[300 - 1 / 3, -5], u_max=[300 + 2 / 3, 3])
-    low, high = np.float32([300 - 1 / 3, -5]), np.float32([300 + 2 / 3, 3])
-    units = ActionUnits.of(mpc, low, high)
-    assert units is not None and units.kind == "plant"
-
-
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [([299, -5], [302, 3.1]), ([299, -3], [302, 5]), ([-1, -1], [1, 2]), ([299], [302]),
-     ([-1, -3], [2, 5])],
-    ids=["a bound of its own", "one of each", "half normalized", "one input", "deviations"],
-)  # fmt: skip
-def test_other_bounds_tell_nothing(low: list[float], high: list[float]) -> None:
-    assert ActionUnits.of(MPC, np.array(low, float), np.array(high, float)) is None
 
 
 COLD = LinearMPC(

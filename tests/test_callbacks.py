@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -62,16 +60,6 @@ def test_without_the_callback_the_same_model_explores() -> None:
         assert_all_actions_are_the_policy_s(model, env)
 
 
-def test_a_loaded_model_does_not_explore_either(tmp_path) -> None:
-    model, env = noisy()
-    model.learn(10)
-    model.save(tmp_path / "model")
-    env.pairs.clear()
-    loaded = DDPG.load(tmp_path / "model", env=env)
-    loaded.learn(150, callback=NoActionNoise())
-    assert_all_actions_are_the_policy_s(loaded, env)
-
-
 def test_training_starts_at_once_and_still_without_noise() -> None:
     model, env = noisy(gradient_steps=1, policy_kwargs={"critic_warmup": 0}, learning_rate=0.1)
     model.learn(5, callback=NoActionNoise())
@@ -80,19 +68,6 @@ def test_training_starts_at_once_and_still_without_noise() -> None:
     with pytest.raises(AssertionError):  # the policy has moved on since
         assert_all_actions_are_the_policy_s(model, env)
     np.testing.assert_allclose(executed[0], DDPG(YannPolicy, env).predict(observations[0])[0])
-
-
-def test_running_without_learning_leaves_the_random_state_of_the_process_alone() -> None:
-    model, _ = noisy()
-    model.learn(1, callback=NoActionNoise())
-    before = random_states()
-    model.learn(250, callback=[NoActionNoise(), ControlDiagnostics()])
-    assert random_states() == before
-
-
-def random_states() -> list[object]:
-    legacy = np.random.get_state()[1].tolist()  # noqa: NPY002
-    return [random.getstate(), legacy, th.get_rng_state().tolist()]
 
 
 def test_an_on_policy_algorithm_is_refused() -> None:

@@ -9,7 +9,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3 import DDPG, PPO, SAC
 
 from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy, export
 from sb3_yann.cli import main
@@ -62,18 +62,6 @@ def test_solve_prints_the_report_and_saves_the_law(folder, capsys) -> None:
 def test_a_picture_without_a_suffix_is_said_to_lie_where_it_does(folder, capsys) -> None:
     assert main(["plot", "my_cart:cart", "law"]) == 0
     assert capsys.readouterr().out == "Written: law.png\n" and (folder / "law.png").exists()
-
-
-def test_an_online_law_s_file_is_told_from_an_explicit_one_s(folder, capsys) -> None:
-    problem().online().save(folder / "law.npz")
-    assert main(["plot", "law.npz", "law.png"]) == 1
-    assert "is solved online and has no regions" in capsys.readouterr().err
-
-
-def test_a_limit_that_is_too_small_is_said(folder, capsys) -> None:
-    assert main(["solve", "my_cart:cart", "--region-limit", "1", "--save", "law.npz"]) == 1
-    assert "region" in capsys.readouterr().err
-    assert not (folder / "law.npz").exists()
 
 
 def test_evaluate_plays_the_mpc_beside_the_model(model, capsys) -> None:
@@ -137,11 +125,6 @@ def test_report_writes_one_page(model, folder) -> None:
     assert without.read_text().startswith("<!") and len(played.read_text()) > 1.2 * len(
         without.read_text()
     )
-
-
-def test_td3_s_models_are_read_too(folder) -> None:
-    TD3(YannPolicy, Cart(), device="cpu", target_policy_noise=0.0).save(folder / "td3")
-    assert main(["evaluate", "td3", "--env", "my_cart:Cart", "--episodes", "1"]) == 0
 
 
 def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys) -> None:

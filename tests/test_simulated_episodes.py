@@ -13,10 +13,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from guard_samples import MPC, STEPS, Slide, build
-from sb3_yann import NoActionNoise, PlantTwin, SimulatedEpisodes
+from sb3_yann import NoActionNoise, SimulatedEpisodes
 from sb3_yann.policy import AffineObservation
 from sb3_yann.simulated_episodes import _Exploration
-from sb3_yann.twin.replay_buffer import episodes_of
 
 FEW = {"per_episode": 3}
 
@@ -105,17 +104,6 @@ def test_a_run_that_is_cut_off_goes_on_where_it_was() -> None:
     assert (parts.replay_buffer.simulated == whole.replay_buffer.simulated).all()
 
 
-def test_state_and_marks_are_saved(tmp_path) -> None:
-    model = learnt(build(), STEPS + 1, SimulatedEpisodes(Slide, **FEW))
-    model.save(tmp_path / "model")
-    model.save_replay_buffer(tmp_path / "buffer")
-    again = DDPG.load(tmp_path / "model", env=Slide())
-    again.load_replay_buffer(tmp_path / "buffer")
-    assert again.simulated == model.simulated
-    learnt(again, STEPS + 1, SimulatedEpisodes(Slide, **FEW))
-    assert again.simulated.episodes == 9
-
-
 @pytest.mark.parametrize("n_envs", [2, 4])
 def test_with_several_envs_each_column_holds_whole_episodes_but_for_its_last(n_envs) -> None:
     model = build(TD3, env=make_vec_env(Slide, n_envs), learning_rate=0.0, n_steps=3)
@@ -132,25 +120,6 @@ def test_with_several_envs_each_column_holds_whole_episodes_but_for_its_last(n_e
         assert ended[breaks].all()
 
 
-def test_an_episode_of_another_env_that_is_under_way_is_not_bridged() -> None:
-    class Longer(Slide):
-        def step(self, action):
-            observation, reward, *_, info = super().step(action)
-            return observation, reward, False, self.t == 2 * STEPS, info
-
-    venv = make_vec_env(iter_of(Slide, Longer), 2)
-    model = build(env=venv, learning_rate=0.0, n_steps=3)
-    learnt(model, 2 * (STEPS + 1), SimulatedEpisodes(Slide, per_episode=2))
-    buffer = model.replay_buffer
-    last = int(np.flatnonzero(~buffer.simulated[:, 0])[STEPS - 1])
-    assert buffer.timeouts[last].tolist() == [1, 1] and buffer.dones[last].tolist() == [1, 0]
-
-
-def iter_of(*makers):
-    given = iter(makers)
-    return lambda: next(given)()
-
-
 def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> None:
     venv = VecNormalize(make_vec_env(Slide, 1), training=False, norm_reward=False)
     venv.obs_rms.mean, venv.obs_rms.var = np.array([1.0]), np.array([4.0])
@@ -161,20 +130,6 @@ def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> No
     shown = model.replay_buffer.observations[: 3 * STEPS, 0].astype(float)
     taken = model.replay_buffer.actions[: 3 * STEPS, 0]
     np.testing.assert_allclose(taken, MPC.explicit()(shown), atol=1e-5)
-
-
-def test_a_twin_of_the_buffer_is_of_the_plant_alone() -> None:
-    class Long(Slide):
-        def step(self, action):
-            observation, reward, *_, info = super().step(action)
-            return observation, reward, False, self.t == 8, info
-
-    model = build(env=Long(), learning_rate=0.0, buffer_size=60)
-    learnt(model, 17, SimulatedEpisodes(Slide, per_episode=2))
-    assert [len(u) for _, u in episodes_of(model)] == [8, 8]
-    learnt(model, 50)  # rows of the simulator are overwritten
-    assert sum(len(u) for _, u in episodes_of(model)) > 40
-    assert isinstance(PlantTwin.from_buffer(model), PlantTwin)
 
 
 def test_noise_stays_within_the_action_space() -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DDPG, TD3
 
 from guard_samples import (
-    CENTER,
     FIRST,
     LAW,
     LEFT,
@@ -94,15 +92,6 @@ def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, 
         assert guard.decisions[-1].reason.startswith("at the end, on 30 new starts, start 1000")
 
 
-def test_without_by_region_the_whole_of_it_is_refused() -> None:
-    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=20, rule=WHOLE)
-    before = actor_bits(model.policy)
-    train(model, STEPS, At([STEPS], spoil_left), guard)
-    (decision,) = guard.decisions
-    assert (decision.verdict, decision.restored) == ("rejected", True)
-    assert actor_bits(model.policy) == accepted_bits(guard) == before
-
-
 def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> None:
     simulator = partial(OftenRight, after=FIRST + 10)
     model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
@@ -137,22 +126,6 @@ def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() 
     assert guard.decisions[-1].accepted_cost == pytest.approx(guard.decisions[-1].mpc_cost)
 
 
-def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
-    # On the left the better input, -1 + 0.5, is beyond the limit; the MPC's own, -1, is not.
-    class Brittle(OftenRight):
-        def step(self, action):
-            observation, reward, terminated, truncated, _ = super().step(action)
-            u = float(np.asarray(action)[0])
-            violation = 0.3 < u < 0.8 and not self.indifferent
-            return observation, reward, terminated, truncated, {"violation": violation}
-
-    model = build(gradient_steps=0)
-    guard = make_guard(Brittle, n_new_starts=20, rule=WHOLE, patience=5)
-    train(model, STEPS, At([STEPS], lambda policy: correct(policy, LEFT, -0.5)), guard)
-    decision = guard.decisions[0]
-    assert "on 5 new starts, 2 of 5 starts with violations" in decision.reason and decision.restored
-
-
 def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
     # Only the very last of them shows the left.
     simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 5 + 199)
@@ -163,30 +136,6 @@ def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
     assert not last_layer(model)[REGION[LEFT], :, -1].any()
     assert actor_bits(model.policy) == accepted_bits(guard)
     assert guard.state.evidence.starts.seeds[0] == FIRST + 10 + 5 + 199
-
-
-def test_new_starts_are_others_each_time_and_after_a_load(tmp_path) -> None:
-    seen: list[int] = []
-
-    class Counting(Slide):
-        def reset(self, *, seed=None, options=None):
-            seen.append(seed)
-            return super().reset(seed=seed, options=options)
-
-    model, guard = tried(better, env=Counting, n_new_starts=5)
-    new = {seed for seed in seen if seed is not None and seed >= FIRST + 10}
-    assert new == set(range(FIRST + 10, FIRST + 10 + 5 + 50))
-    assert guard.state.evidence.next_seed == FIRST + 65
-    model.save(tmp_path / "model")
-    loaded = type(model).load(tmp_path / "model", env=Slide())
-    assert loaded.guard_state.evidence.next_seed == FIRST + 65
-
-
-def test_the_mpc_itself_is_not_tried() -> None:
-    env = gym.make("Slide-v0")
-    model, guard = build(gradient_steps=0), make_guard(env.unwrapped, n_new_starts=20)
-    train(model, 2 * STEPS, guard)
-    assert guard.state.evidence.next_seed == FIRST + 10
 
 
 GENTLE = {"cvar_alpha": 0.05, "backtrack": True}
@@ -201,14 +150,6 @@ def test_of_a_step_too_far_half_is_accepted() -> None:
     assert (decision.verdict, decision.share) == ("accepted in part", 0.5)
     assert decision.candidate_cost > decision.accepted_cost < decision.mpc_cost
     assert not is_mpc(model)
-
-
-def test_without_backtracking_it_is_refused() -> None:
-    model = build(gradient_steps=0, actor=SHARED_NETWORK)
-    guard = make_guard(n_new_starts=0, rule={**GENTLE, "backtrack": False})
-    train(model, STEPS, At([STEPS], lambda policy: push(policy, 1.2)), guard)
-    assert (guard.decisions[0].verdict, guard.decisions[0].share) == ("rejected", 0.0)
-    assert is_mpc(model)
 
 
 def test_at_the_end_half_of_a_correction_is_kept_that_loses() -> None:
@@ -311,42 +252,6 @@ def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
     assert guard.decisions[0].step == 1  # neither shrinks nor grows
 
 
-def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
-    # To the right half the input violates; nothing else does.
-    simulator = partial(Slide, low=-4.0, limits=(-1.1, 0.9))
-    _, guard = tried(lambda policy: correct(policy, RIGHT, 2.0), env=simulator)
-    assert verdicts(guard) == ["rejected"]
-    assert "violations" in guard.decisions[0].reason
-
-
-def test_regions_may_be_taken_over_while_patience_lasts() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=2, keep_if_worse=True)
-    seen: list[bytes] = []
-    before, after = (
-        At([STEPS], lambda policy: seen.append(bits(policy.actor.state_dict()))) for _ in range(2)
-    )
-    train(model, STEPS + 1, At([STEPS], half_good), before, guard, after)
-    assert seen[0] == seen[1]  # the actor goes on as it was
-    assert guard.decisions[0].verdict == "accepted in part"
-    weight = last_layer(model)
-    assert float(weight[REGION[RIGHT], 0, -1].detach()) == 0.5
-    assert float(weight[REGION[LEFT], 0, -1].detach()) == 0
-
-
-def test_moments_that_the_accepted_policy_has_not_got_are_zero_elsewhere() -> None:
-    trained = build()
-    train(trained, 3)
-    mixed = ActorCheckpoint.of(build().policy).with_regions(
-        ActorCheckpoint.of(trained.policy), [REGION[RIGHT]]
-    )
-    assert mixed.optimizer["state"]
-    for state in mixed.optimizer["state"].values():
-        assert float(state["step"]) == 3
-        for region in (REGION[LEFT], REGION[CENTER]):
-            assert not state["exp_avg"][region].any()
-            assert not state["exp_avg_sq"][region].any()
-
-
 def test_a_candidate_in_another_box_is_accepted_with_it_or_leaves_the_old() -> None:
     box = 2 * np.ones(build().policy.problem.n_theta)
 
@@ -402,31 +307,6 @@ def test_what_is_put_back_at_the_end_is_tried_on_all_of_the_new_starts() -> None
     costs, mpc = (evaluate(each, LateLosses, seeds).costs for each in (model, build()))
     assert np.all(costs <= mpc + guard.state.evidence.starts.tolerance.margin)
     assert costs.mean() <= mpc.mean() + 1e-6
-
-
-class ALittleWorse(Slide):
-    """On the known starts half the input is best; on others the MPC's, by less than a margin."""
-
-    def reset(self, *, seed=None, options=None):
-        self.known = seed is None or seed < FIRST + 10
-        return super().reset(seed=seed, options=options)
-
-    def step(self, action):
-        away = float(np.asarray(action)[0]) - float(LAW(self.x)[0])
-        observation, reward, *rest = super().step(action)
-        return observation, reward if self.known else -1 - 0.15 * away**2, *rest
-
-
-def test_a_policy_whose_mean_cost_on_new_starts_is_above_the_mpc_s_is_refused() -> None:
-    simulator = partial(ALittleWorse, low=2.0, high=2.8)
-    model, guard = tried(
-        partial(correct, region=RIGHT, value=0.5), env=simulator, n_new_starts=50, patience=5
-    )
-    assert guard.decisions[0].reason == "on 5 new starts, mean cost 4.0375, MPC 4"
-    assert is_mpc(model)
-    assert (
-        guard.state.evidence.starts.tolerance.margin > 0.0375
-    )  # no single start would have been refused
 
 
 @pytest.mark.parametrize("how", ["one learn", "two", "a load in between"])
@@ -571,14 +451,3 @@ def test_beyond_the_bound_it_is_refused_with_the_reason() -> None:
     assert is_mpc(model)
     mpc = guard.state.evidence.starts.mpc
     assert not mpc.unsafe[:, 3].any()  # the MPC itself never counts
-
-
-def test_a_model_that_goes_on_knows_the_bound(tmp_path) -> None:
-    model, guard = decided(1.0)
-    bound = guard.state.max_input_step
-    model.save(tmp_path / "model")
-    again = type(model).load(tmp_path / "model", env=model.get_env(), device="cpu")
-    later = make_guard(rule={"max_input_step": 1.0})
-    again.learn(STEPS + 1, callback=[At([STEPS], restless), later], reset_num_timesteps=False)
-    np.testing.assert_array_equal(later.state.max_input_step, bound)
-    assert later.decisions[-1].verdict == "rejected"

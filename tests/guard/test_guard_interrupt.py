@@ -6,9 +6,8 @@ import signal
 from contextlib import suppress
 from functools import partial
 
-import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.callbacks import BaseCallback
 
 from guard_samples import (
     FIRST,
@@ -24,7 +23,6 @@ from guard_samples import (
     train,
 )
 from sb3_yann.guard import callback
-from sb3_yann.guard.start import InterruptHandler
 from weights import is_mpc
 
 
@@ -124,24 +122,6 @@ def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:
-    seen = []
-    before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
-    try:
-        model, guard = build(), make_guard(eval_freq=100)
-        candidate = []
-        train(
-            model,
-            20,
-            At([5], better),
-            guard,
-            At([6, 9], lambda policy: (ctrl_c(), candidate.append(actor_bits(policy)))),
-        )
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert seen == [1, 1] and candidate[0] != actor_bits(build().policy)
-
-
 def test_learn_again_and_again_and_the_handler_is_the_one_before() -> None:
     before = signal.getsignal(signal.SIGINT)
     model, guard = build(), make_guard(eval_freq=100)
@@ -165,19 +145,6 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
         train(model, 8, At([3], ctrl_c))  # without the guard
     assert bits(model.policy.actor.state_dict()) == candidate
     assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_a_checkpoint_in_between_holds_no_handler(tmp_path) -> None:
-    model, guard = build(), make_guard(eval_freq=100)
-    interrupted(model, 20, guard, CheckpointCallback(4, str(tmp_path)), At([13], ctrl_c))
-    paths = sorted(tmp_path.glob("*.zip"))
-    assert len(paths) == 3
-    handler = signal.getsignal(signal.SIGINT)
-    for path in paths:
-        again = type(model).load(path)
-        assert signal.getsignal(signal.SIGINT) is handler
-        assert not any(isinstance(each, InterruptHandler) for each in vars(again).values())
-        assert np.isfinite(again.predict(np.zeros(1, np.float32))[0]).all()
 
 
 @pytest.mark.parametrize("where", ["require_like_training", "first_evidence"])

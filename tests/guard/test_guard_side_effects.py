@@ -112,13 +112,6 @@ def test_a_check_moves_no_random_state_and_not_the_training_env(monkeypatch) -> 
     assert all(checks)
 
 
-def test_the_guard_leaves_the_policy_in_the_mode_it_found_it_in_for_the_next_step() -> None:
-    model, guard = build(), make_guard()
-    modes: list[bool] = []
-    train(model, 2 * STEPS, guard, At(range(99), lambda policy: modes.append(policy.training)))
-    assert not any(modes)
-
-
 def test_two_training_envs_side_by_side_count_their_episodes_together() -> None:
     model = build(env=DummyVecEnv([Slide, Slide]), gradient_steps=0)
     guard = make_guard()

@@ -76,7 +76,7 @@ def hasty(theta: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", ["hard states", "hard outputs"])
-def test_a_policy_that_is_cheaper_beyond_a_hard_bound_is_refused(kind: str) -> None:
+def test_a_policy_that_costs_less_beyond_a_hard_bound_is_refused(kind: str) -> None:
     mpc, make = carriage(kind)
     law = mpc.law()
     played = [evaluate(each, make, range(4)) for each in (law, hasty)]

@@ -24,7 +24,6 @@ from resumed import (
     loaded,
     model_bits,
 )
-from sb3_yann.policy import policies
 
 RARE = {"eval_freq": 3}
 """A candidate after every third episode."""
@@ -53,27 +52,6 @@ def test_with_a_simulator_nothing_is_lost(n_envs, algorithm, options, tmp_path) 
     guard = partial(guard_in_simulator, **options)
     whole, resumed = whole_and_resumed(tmp_path, guard, n_envs, algorithm)
     assert whole == resumed
-
-
-def test_moments_of_single_rows_are_kept(monkeypatch, tmp_path) -> None:
-    monkeypatch.setattr(policies, "FEW", 2)  # regions, from which on there is a RowAdam
-    whole, resumed = whole_and_resumed(tmp_path, guard_in_simulator, 1)
-    assert whole == resumed
-    assert "steps" in whole[0]["optimizers"][0]["state"]["0"]
-
-
-def test_between_two_calls_of_learn_a_model_may_be_saved_and_loaded(tmp_path) -> None:
-    found = []
-    for is_loaded in (False, True):
-        model = build(env=envs(1))
-        train(model, 4 * STEPS, guard_in_simulator())
-        model.save(tmp_path / "model")
-        model.save_replay_buffer(tmp_path / "buffer")
-        if is_loaded:
-            model = loaded(tmp_path, envs(1))
-        go_on(model, 4 * STEPS, guard_in_simulator())
-        found.append(model_bits(model))
-    assert found[0] == found[1]
 
 
 def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -> None:

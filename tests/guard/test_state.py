@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import os
-import warnings
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +35,6 @@ from guard_samples import (
     train,
     verdicts,
 )
-from resumed import model_bits
 from sb3_yann import Decision
 from sb3_yann.compare import Scores, Starts, Tolerance
 from sb3_yann.guard import callback
@@ -85,34 +82,6 @@ def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
             np.testing.assert_equal(float(row[name]), getattr(decision, name))
 
 
-def test_the_record_is_up_to_date_after_each_decision(tmp_path) -> None:
-    path = tmp_path / "guard.csv"
-    guard, lengths = make_guard(log_path=path), []
-    look = At([STEPS, 2 * STEPS, 3 * STEPS], lambda _: lengths.append(len(rows(path))))
-    three_decisions(guard, look)
-    assert lengths == [1, 2, 3]
-    assert [each.name for each in tmp_path.iterdir()] == ["guard.csv"]
-
-
-def test_a_record_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch) -> None:
-    path = tmp_path / "guard.csv"
-    guard = make_guard(log_path=path)
-    three_decisions(guard)
-    before = path.read_bytes()
-
-    def fail(*_, **__) -> None:
-        raise OSError("the disk is full")
-
-    monkeypatch.setattr(record, "_rows", fail)
-    with pytest.raises(OSError, match="full"):
-        record.write_csv(path, guard.decisions)
-    monkeypatch.undo()
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="full"):
-        record.write_csv(path, guard.decisions[:1])
-    assert path.read_bytes() == before
-
-
 def test_a_full_disk_ends_no_training_and_the_record_is_completed_later(
     tmp_path, monkeypatch
 ) -> None:
@@ -145,14 +114,6 @@ def test_a_record_of_another_run_is_kept_beside(tmp_path) -> None:
     assert len(rows(path)) == len(other.decisions)
 
 
-def test_a_second_learn_goes_on_with_its_own_record(tmp_path) -> None:
-    path = tmp_path / "guard.csv"
-    model = three_decisions(make_guard(log_path=path))
-    three_decisions(make_guard(log_path=path), model=model)
-    assert [each.name for each in tmp_path.iterdir()] == ["guard.csv"]
-    assert len(rows(path)) == len(model.guard_state.decisions) > 3
-
-
 def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:
     guard = make_guard()
     model = build(gradient_steps=0, tensorboard_log=str(tmp_path))
@@ -168,19 +129,6 @@ def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:
     np.testing.assert_allclose(shown["guard/accepted_change_percent"], change, rtol=1e-5)
     assert len(shown["guard/candidate_change_percent"]) == len(shown["guard/candidate_cost"]) == 3
     assert all(np.isfinite(values).all() for values in shown.values())
-
-
-def test_verbose_prints_a_line_for_each_decision_and_silence_is_the_default(capsys) -> None:
-    three_decisions(make_guard())
-    assert capsys.readouterr().out == ""
-    three_decisions(make_guard(verbose=1))
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3
-    assert lines[0].startswith("Episode 1: accepted in part (start ")
-    assert lines[1].startswith("Episode 2: rejected (a parameter of the actor is not a finite")
-    assert "candidate not known, accepted policy 4" in lines[1]
-    ends = "candidate 4 (-4.19 %), accepted policy 4 (-4.19 %), MPC 4.175"
-    assert lines[2].startswith("Episode 3: accepted; mean costs: ") and lines[2].endswith(ends)
 
 
 @pytest.mark.parametrize(
@@ -254,36 +202,6 @@ def test_a_simulator_made_by_a_partial_is_known_again_in_another_process() -> No
     assert one.settings.of_evidence != make_guard(partial(Slide, low=0.5)).settings.of_evidence
 
 
-def test_a_second_learn_goes_on_and_the_step_is_the_one_decided_last() -> None:
-    guard = make_guard()
-    model = three_decisions(guard)
-    steps: list[float] = []
-    train(model, STEPS, At([1], lambda policy: steps.append(policy.actor_step)), guard)
-    assert steps == [guard.decisions[-1].step] == [0.75]
-    assert len(guard.decisions) == 3
-
-
-def test_one_guard_may_serve_two_models_one_after_the_other() -> None:
-    guard = make_guard(patience=2, keep_if_worse=True)
-    for _ in range(2):
-        three_decisions(guard)
-        assert verdicts(guard) == ["accepted in part", "rejected", "accepted"]
-        assert [each.restored for each in guard.decisions] == [False, True, False]
-
-
-def test_a_saved_model_holds_the_guard_s_state_in_main_memory(tmp_path) -> None:
-    model = build()
-    train(model, 3 * STEPS, make_guard())
-    model.save(tmp_path / "model")
-    accepted = DDPG.load(tmp_path / "model", device="cpu").guard_state.accepted
-    tensors = [*accepted.actor.values(), *accepted.target.values()]
-    tensors += [each for state in accepted.optimizer["state"].values() for each in state.values()]
-    assert {str(each.device) for each in tensors} == {"cpu"}
-    memory = {each.data_ptr() for each in model.policy.state_dict().values()}
-    kept = model.guard_state.accepted
-    assert memory.isdisjoint(each.data_ptr() for each in kept.actor.values())
-
-
 def saved(folder: Path) -> Any:
     return DDPG.load(folder / "accepted_model.zip", device="cpu")
 
@@ -312,16 +230,6 @@ def test_the_file_holds_what_is_accepted_from_the_first_step_on(tmp_path) -> Non
     assert [each.name for each in folder.iterdir()] == ["accepted_model.zip"]
 
 
-def test_saving_changes_no_bit_of_the_training(tmp_path) -> None:
-    found = []
-    for options in ({}, {"save_path": tmp_path}):
-        model = build()
-        train(model, 4 * STEPS, guard := make_guard(**options))
-        found.append(model_bits(model))
-        assert len(guard.decisions) > 2
-    assert found[0] == found[1]
-
-
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_best_model_that_nobody_accepted_is_told_and_the_accepted_one_lies_beside(
     tmp_path, nested
@@ -338,19 +246,6 @@ def test_a_best_model_that_nobody_accepted_is_told_and_the_accepted_one_lies_bes
     assert is_mpc(saved(tmp_path))
 
 
-def test_a_folder_of_ones_own_is_used_and_a_callback_that_keeps_no_model_is_not_told(
-    tmp_path,
-) -> None:
-    model, guard = build(gradient_steps=0), make_guard(save_path=tmp_path / "mine")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        train(model, 2, guard, EvalCallback(Monitor(Slide()), eval_freq=99, verbose=0))
-    with pytest.warns(UserWarning, match="mine"):
-        train(model, 2, guard, evaluates(tmp_path / "best"))
-    assert (tmp_path / "mine" / "accepted_model.zip").is_file()
-    assert not (tmp_path / "best" / "accepted_model.zip").exists()
-
-
 def test_a_disk_that_is_full_stops_no_training(tmp_path, monkeypatch) -> None:
     model, guard = build(gradient_steps=0), make_guard(save_path=tmp_path)
 
@@ -361,12 +256,6 @@ def test_a_disk_that_is_full_stops_no_training(tmp_path, monkeypatch) -> None:
     with pytest.warns(UserWarning, match=r"accepted_model.zip could not be written \(No space"):
         train(model, STEPS, At([2], better), guard)
     assert not is_mpc(model) and [*tmp_path.iterdir()] == []
-
-
-def test_a_file_is_no_folder(tmp_path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match=r"save_path = .* is a file; name a folder"):
-        make_guard(save_path=tmp_path / "file")
 
 
 def decision(verdict: str, accepted: float, reason: str = "", mpc: float = 40.0) -> Decision:

@@ -171,15 +171,6 @@ def test_model_sees_physical_units_in_float64(name: str) -> None:
         np.testing.assert_allclose(got.numpy(), expected, rtol=1e-12, atol=1e-15)
 
 
-@EVERY_PROBLEM
-def test_linear_model_as_a_function_gives_the_same_value(name: str) -> None:
-    model = solved(name).model
-    A, B = (th.as_tensor(M.T.copy()) for M in (model.A, model.B))
-    rows = random_rows(name, 500)
-    other = critic(name, model=lambda theta, u: theta @ A + u @ B)
-    assert th.equal(other(rows), critic(name)(rows))
-
-
 class Halving(th.nn.Module):
     """A model with a parameter, in a module of its own."""
 
@@ -204,16 +195,6 @@ def test_model_that_is_given_says_where_the_value_is_taken() -> None:
 
 
 # --- what torch and Stable-Baselines3 see --------------------------------------------------------
-
-
-def test_state_dict_brings_everything_back() -> None:
-    rows = random_rows("reactor", 256)
-    value, other = critic("reactor"), critic("reactor")
-    train(value, rows, 0.7 * value(rows).detach() - 3, steps=5)
-    assert not th.equal(other(rows), value(rows))
-    other.load_state_dict(value.state_dict())
-    assert th.equal(other(rows), value(rows))
-    assert not [key for key in value.state_dict() if "running_" in key]
 
 
 @pytest.mark.parametrize(

@@ -186,17 +186,6 @@ def test_a_pinned_value_is_exactly_zero_at_the_equilibrium_whatever_is_learnt() 
         assert th.all(ours(middle).abs() < 1e-9)
 
 
-def test_a_value_that_is_loaded_is_that_of_its_file() -> None:
-    ours, other = value(True), value(True, gamma=0.99)
-    points = th.rand(20, 5)
-    ours(points)
-    state = {**other.state_dict(), "W": 2 * other.W}
-    ours.load_state_dict(state)
-    other.load_state_dict(state)
-    assert th.equal(ours(points), other(points))
-    assert_close(ours(points), by_torch(ours)(points))
-
-
 @pytest.mark.parametrize("shape", [(3, 3), (3, 6), (4,), (2, 3, 4)])
 def test_shapes_that_do_not_fit_are_refused_before_compiled_code_reads_them(shape) -> None:
     for module in (YannLayer(law_of("reactor")), value(True)):
@@ -222,12 +211,6 @@ def test_a_value_notices_a_change_of_its_model() -> None:
     assert_close(ours(points), by_torch(ours)(points))
 
 
-def test_layers_of_another_type_are_left_to_torch() -> None:
-    layer = YannLayer(law_of("reactor"))
-    later_layers(layer).double()
-    assert not network_of(layer).compiles
-
-
 class Double(th.nn.Module):
     def forward(self, weight: th.Tensor) -> th.Tensor:
         return 2 * weight
@@ -244,17 +227,6 @@ def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None
     assert_close(ours, theirs)
     for one, other in zip(gradients(ours, module), gradients(theirs, plain), strict=True):
         assert_close(one, other, 1e-4)
-
-
-@pytest.mark.parametrize("name", ["layer", "value"])
-def test_weights_that_are_lent_for_a_call_are_used(name: str) -> None:
-    module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
-    other = copy.deepcopy(module)
-    shaken(other, 0.1)
-    points = 0.1 * th.rand(20, n)  # where the law is not saturated
-    lent = dict(other.named_parameters())
-    assert th.equal(th.func.functional_call(module, lent, points), other(points))
-    assert not th.equal(module(points), other(points))
 
 
 def test_autocast_runs_the_operations_of_torch() -> None:

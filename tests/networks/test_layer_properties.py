@@ -49,7 +49,7 @@ def far_and_near(mpc: LinearMPC, seed: int) -> th.Tensor:
     return th.as_tensor(points, dtype=th.float32)
 
 
-@examples(25)
+@examples(15)
 @given(problems(), SEEDS, KINDS, HIDDEN)
 def test_layer_is_its_law_at_first_and_no_more_jumps_than_it(
     mpc: LinearMPC, seed: int, kind: str, hidden: tuple[int, ...]
@@ -66,7 +66,7 @@ def test_layer_is_its_law_at_first_and_no_more_jumps_than_it(
     assert np.all(as_range(law, found - u)[inside] <= (1e-6 if mpc.has_rate_bounds else 1e-7))
 
 
-@examples(25)
+@examples(15)
 @given(problems(), SEEDS, st.sampled_from([1e-9, 1e-6, 1e-4]), st.sampled_from([0.1, 0.5]))
 def test_shared_network_leaves_no_jump_whatever_its_weights(
     mpc: LinearMPC, seed: int, step: float, size: float
@@ -86,7 +86,7 @@ def test_shared_network_leaves_no_jump_whatever_its_weights(
         assert np.all(np.abs(change.double().numpy()) <= most)
 
 
-@examples(25)
+@examples(15)
 @given(problems(), SEEDS, st.sampled_from([YannLayer, SharedYannLayer]), HIDDEN)
 def test_order_of_the_regions_changes_nothing_at_first(
     mpc: LinearMPC, seed: int, layer: Any, hidden: tuple[int, ...]
@@ -141,7 +141,7 @@ def bounds_hold(layer: LawLayer, theta: th.Tensor, bound: float | None) -> None:
             assert bool(((low <= actions) & (actions <= high))[sure].all())
 
 
-@examples(40)
+@examples(25)
 @given(problems(), SEEDS, KINDS, HIDDEN, st.sampled_from([None, 0.0, 0.05, 1.0]), SIZES, POISON)
 def test_bounds_hold_for_any_weights(
     mpc: LinearMPC,
@@ -167,7 +167,7 @@ def test_bounds_hold_for_any_weights_of_many_regions(
     bounds_hold(shaken(layer, size, seed, poison), far_and_near(mpc, seed), bound)
 
 
-@examples(30)
+@examples(15)
 @given(problems(), st.data(), KINDS, HIDDEN, st.sampled_from([None, 0.1]))
 def test_what_is_not_finite_is_not_passed_off_as_an_input(
     mpc: LinearMPC, data: Any, kind: str, hidden: tuple[int, ...], bound: float | None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
 
 import numpy as np
@@ -54,17 +53,6 @@ def test_network_is_the_law_away_from_facets(name: str, width: int) -> None:
     np.testing.assert_allclose(u, law(theta.numpy()), rtol=0, atol=1e-9)
 
 
-@EVERY_LAW
-def test_float32_loses_what_the_suppression_constant_swallows(name: str) -> None:
-    law = law_of(name)
-    theta = well_inside(law, 5000, margin=1e-4)
-    network = PaperYann(law, 8)
-    error = np.abs(network(theta).detach().numpy() - law(theta.numpy()))
-    suppression = float(network.fixed["suppress_bias"].abs().max())
-    assert error.max() < 8 * np.finfo(np.float32).eps * suppression
-    assert error.max() > np.finfo(np.float32).eps  # the fast form is exact to rounding
-
-
 @pytest.mark.usefixtures("float64")
 def test_network_doubles_or_drops_the_law_on_facets() -> None:
     # The known defect of step indicators: on a shared facet two regions are active, or none.
@@ -103,34 +91,3 @@ def test_inactive_regions_stay_suppressed_whatever_is_learnt(name: str) -> None:
     theta = theta[th.as_tensor(smallest_slack(law, theta).max(axis=1) < -1e-4)]
     assert len(theta) > 20
     assert not th.any(network(theta))
-
-
-@pytest.mark.parametrize("width", [6, 7])
-@pytest.mark.usefixtures("float64")
-def test_every_trainable_entry_has_moved_after_the_second_update_and_no_other(width: int) -> None:
-    law = law_of("pendulum")
-    network = PaperYann(law, width)
-    before = copy.deepcopy(network)
-    theta = box_points(law, 5000).double()
-    optimizer = th.optim.Adam([p for p in network.parameters() if p.requires_grad], 1e-3)
-    for _ in range(2):
-        optimizer.zero_grad()
-        (network(theta) - 0.3).square().mean().backward()
-        optimizer.step()
-    for (name, new), old in zip(network.named_parameters(), before.parameters(), strict=True):
-        assert bool(th.all(new != old)) if new.requires_grad else th.equal(new, old), name
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"law": None}, TypeError, "law = None must be a PiecewiseAffine"),
-        ({"width": -1}, ValueError, "width = -1 must be a whole number of at least 0"),
-        ({"width": "wide"}, ValueError, "width = 'wide' must be a whole number"),
-        ({"scale": -1}, ValueError, "scale = -1 must be a finite number of at least 0"),
-        ({"scale": float("nan")}, ValueError, "scale = nan must be a finite number"),
-    ],
-)
-def test_bad_argument_is_named(changes, error, message) -> None:
-    with pytest.raises(error, match=message):
-        PaperYann(**{"law": law_of("reactor"), "width": 2} | changes)

@@ -128,29 +128,6 @@ def test_training_fits_what_the_quadratic_cannot() -> None:
     assert loss.item() < 0.2 * (5 * th.sin(3 * rows[:, :1])).square().mean().item()
 
 
-@EVERY_PROBLEM
-def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str) -> None:
-    law = law_of(name)
-    rows = random_rows(name, 256).requires_grad_()
-    critic(name)(rows).sum().backward()
-    assert rows.grad is not None
-    z = np.hstack(in_physical_units(name, rows.detach()))
-    slope = -2 * z @ solved(name).state_action_matrix(0.99)
-    scale = np.concatenate([np.ones(law.n_theta), (law.u_max - law.u_min) / 2])
-    np.testing.assert_allclose(
-        rows.grad.numpy(), slope * scale, rtol=1e-5, atol=1e-6 * np.abs(slope * scale).max()
-    )
-
-
-def test_state_dict_brings_everything_back() -> None:
-    rows = random_rows("reactor", 256)
-    value, other = critic("reactor"), critic("reactor")
-    train(value, rows, steps=5)
-    assert not th.equal(other(rows), value(rows))
-    other.load_state_dict(value.state_dict())
-    assert th.equal(other(rows), value(rows))
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -53,18 +53,6 @@ def test_rows_without_a_gradient_do_not_move_not_even_by_momentum(dense: bool) -
     assert th.equal(after[2], th.ones(2, 3))
 
 
-def test_a_gradient_that_is_not_coalesced_is_added_up() -> None:
-    found = []
-    for rows, values in (([1, 1], [[1.0], [2.0]]), ([1], [[3.0]])):
-        parameter = th.nn.Parameter(th.zeros(3, 1))
-        parameter.grad = th.sparse_coo_tensor(
-            th.tensor([rows]), th.tensor(values), (3, 1), check_invariants=True
-        )
-        RowAdam([parameter], lr=0.1).step()
-        found.append(parameter.detach())
-    assert th.equal(*found)
-
-
 def test_it_goes_on_from_a_saved_state() -> None:
     gradients = steps(dense=False)
     one = th.nn.Parameter(th.ones(ROWS, 2, 3))
@@ -98,9 +86,3 @@ def test_it_goes_on_from_what_an_adam_left() -> None:
     other.step()
     assert th.allclose(again, expected, atol=1e-6)
     assert other.state[again]["steps"].tolist() == [2.0] * ROWS
-
-
-@pytest.mark.parametrize("options", [{"lr": -1.0}, {"eps": -1e-8}, {"betas": (0.9, 1.0)}])
-def test_options_out_of_range_are_refused(options) -> None:
-    with pytest.raises(ValueError, match="must be at least 0, and betas"):
-        RowAdam([th.zeros(2, requires_grad=True)], **options)

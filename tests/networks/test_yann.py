@@ -110,12 +110,6 @@ def test_points_of_a_facet_that_float32_holds_exactly_go_to_the_first_region() -
 # --- the bounds --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("limit", [0.0, 0.1, 1.0, 2.0])
-def test_clamp_alive_is_the_clamp(limit: float) -> None:
-    x = th.cat([3 * th.randn(1000), th.tensor([-1.0, 1.0, th.inf, -th.inf, 0.0])])
-    assert th.equal(clamp_with_inward_gradient(x, -limit, limit), x.clamp(-limit, limit))
-
-
 @pytest.mark.parametrize(
     ("x", "passes_up", "passes_down"),
     [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import torch as th
 
@@ -48,19 +46,6 @@ def test_training_one_region_leaves_the_others_bit_for_bit(name: str) -> None:
     assert not th.equal(after[trained], before[trained])
 
 
-@EVERY_LAW
-def test_every_region_learns(name: str) -> None:
-    law = law_of(name)
-    layer = YannLayer(law)
-    theta = box_points(law, 20_000, stretch=1.5)
-    before = copy.deepcopy(layer)
-    train(layer, theta, target=0.3, steps=3)
-    visited = region_of(layer, theta).unique()
-    assert len(visited) > law.n_regions / 2
-    for new, old in zip(layer.parameters(), before.parameters(), strict=True):
-        assert bool((new != old).flatten(1).any(1)[visited].all())
-
-
 @INFEASIBLE
 @EVERY_LAW
 def test_equilibrium_is_where_it_was_after_training(name: str, infeasible: str) -> None:
@@ -96,24 +81,3 @@ def test_equilibrium_moves_where_no_region_is_pinned(name: str, infeasible: str)
 
 
 # --- what torch and Stable-Baselines3 see --------------------------------------------------------
-
-
-@EVERY_LAW
-def test_state_dict_brings_everything_back(name: str) -> None:
-    law = law_of(name)
-    layer = scrambled(YannLayer(law))
-    other = YannLayer(law)
-    theta = box_points(law, 1000, stretch=1.5)
-    assert not th.equal(other(theta), layer(theta))
-    other.load_state_dict(layer.state_dict())
-    assert th.equal(other(theta), layer(theta))
-
-
-def test_layer_does_not_share_memory_with_the_law() -> None:
-    law = law_of("pendulum")
-    layer = YannLayer(law)
-    with th.no_grad():
-        for buffer in layer.buffers():
-            buffer.fill_(7.0)
-    assert law == law_of("pendulum")
-    assert not np.any(law.gains == 7.0)

@@ -91,18 +91,6 @@ def test_output_is_zero_bit_for_bit_at_first(
         assert is_positive_zero(output)
 
 
-def test_initial_weights_are_nonzero_and_within_a_hundredth() -> None:
-    net = ZeroOutputNetwork(3, 2, (16, 16), n_nodes=4, pinned=pins(False, True))
-    for parameter in net.parameters():
-        assert 0.009 < parameter.abs().max() <= 0.01
-
-
-def test_scale_sets_the_range_of_the_initial_weights() -> None:
-    net = ZeroOutputNetwork(3, 2, (16, 16), scale=0.5)
-    for parameter in net.parameters():
-        assert 0.4 < parameter.abs().max() <= 0.5
-
-
 # --- training ----------------------------------------------------------------------------------
 
 
@@ -238,12 +226,6 @@ def test_fewer_than_two_nodes_are_refused() -> None:
 def test_bad_argument_of_a_network_is_named(changes, message) -> None:
     with pytest.raises(ValueError, match=message):
         ZeroOutputNetwork(**{"in_features": 2, "out_features": 1} | changes)
-
-
-def test_stack_without_an_index_is_refused() -> None:
-    net = ZeroOutputNetwork(2, 1, pinned=pins(True, False))
-    with pytest.raises(ValueError, match="index is None, but there are 2 networks"):
-        net(square())
 
 
 # --- large stacks ------------------------------------------------------------------------------

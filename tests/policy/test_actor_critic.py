@@ -79,14 +79,6 @@ def test_actor_and_critic_step_at_their_own_rates(way, tmp_path) -> None:
     assert policy.actor.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
 
 
-def test_rates_given_to_load_are_those_in_use(tmp_path) -> None:
-    model = build(learning_rate=1e-2, policy_kwargs={"critic_warmup": 0})
-    model.save(tmp_path / "model")
-    kwargs = {**model.policy_kwargs, "actor_lr_mult": 0.5}
-    loaded = DDPG.load(tmp_path / "model", custom_objects={"policy_kwargs": kwargs})
-    assert first_step(loaded.actor) == pytest.approx(5e-3, rel=1e-2)
-
-
 def test_the_actors_loss_leaves_the_critic_alone_which_still_learns() -> None:
     model = build(policy_kwargs={"critic_warmup": 0})
     critic, theta = model.critic, th.rand(32, model.observation_space.shape[0])
@@ -107,30 +99,6 @@ def test_an_optimizer_of_the_users_choice_is_taken_as_it_is() -> None:
     assert (chosen["fused"], chosen["eps"]) == (None, 1e-5)
     kwargs = {"optimizer_class": th.optim.SGD}
     assert type(build(policy_kwargs=kwargs).actor.optimizer) is th.optim.SGD
-
-
-def test_the_mode_is_switched_for_every_module() -> None:
-    policy = build().policy
-    for mode in (False, True):
-        policy.set_training_mode(mode)
-        for part in (policy.actor, policy.critic):
-            assert {module.training for module in part.modules()} == {mode}
-
-
-@pytest.mark.parametrize("frozen", ["actor", "critic"])
-def test_a_rate_of_zero_freezes_one_of_them(frozen) -> None:
-    mpc = scalar_mpc()
-    kwargs = {"problem": mpc, f"{frozen}_lr_mult": 0.0, "critic_warmup": 0}
-    model = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs, seed=0)
-    before = {name: p.clone() for name, p in model.policy.named_parameters()}
-    model.learn(20, callback=NoActionNoise())
-    moved = {
-        name.split(".")[0]
-        for name, p in model.policy.named_parameters()
-        if not th.equal(p, before[name])
-    }
-    assert frozen not in moved
-    assert ("actor" in moved) != (frozen == "actor")
 
 
 def test_constants_are_no_parameters_and_target_updates_leave_them_alone() -> None:
@@ -203,10 +171,3 @@ def test_beyond_32_regions_those_without_data_do_not_move_not_even_by_momentum()
     for old, new in zip(before.parameters(), network_of(model).parameters(), strict=True):
         moved = (old != new).flatten(1).any(1).nonzero()[:, 0].tolist()
         assert moved and set(moved) <= seen
-
-
-def test_an_optimizer_of_ones_own_gets_dense_gradients() -> None:
-    kwargs = {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {}, "critic_warmup": 0}
-    model = with_full_buffer(DDPG, two_inputs(), **kwargs)
-    updates(model, 2)
-    assert not any(each.grad.is_sparse for each in model.actor.parameters())

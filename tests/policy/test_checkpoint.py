@@ -118,16 +118,6 @@ def test_a_parameter_beyond_a_thousand_million_has_diverged(value: float, bad: b
     assert ActorCheckpoint.of(policy).has_diverged() == bad
 
 
-def test_its_size_counts_actor_target_and_two_moments_of_what_is_trained() -> None:
-    checkpoint = ActorCheckpoint.of(build().policy)
-    parts = [*checkpoint.actor.values(), *checkpoint.target.values()]
-    trained = [*checkpoint.networks().values()]
-    expected = sum(each.nbytes for each in parts) + 2 * sum(each.nbytes for each in trained)
-    assert checkpoint.size == expected
-    policy = build().policy
-    assert len(trained) == len([*policy.actor.mu.network.parameters()])
-
-
 def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(monkeypatch) -> None:
     policy, mpc, _ = pair()
     some = []

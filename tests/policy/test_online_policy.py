@@ -9,7 +9,7 @@ from stable_baselines3 import DDPG, TD3
 
 from general_problems import RATED, servo
 from policy_samples import POLICIES, build, scalar_mpc, starts, updates, with_full_buffer
-from sb3_yann import LinearMPC, NonFiniteWarning, OnlineLawWarning, YannPolicy
+from sb3_yann import LinearMPC, OnlineLawWarning, YannPolicy
 from sb3_yann.control import OnlineLaw
 from sb3_yann.control.mpc import choice
 from sb3_yann.networks import RowAdam, SharedYannLayer, YannLayer
@@ -109,13 +109,6 @@ def test_limits_of_correction_and_rate_hold() -> None:
     assert np.abs(model.predict(theta)[0] - law).max() < 1e-5
     rest = np.zeros((1, mpc.n_theta), np.float32)
     assert np.abs(model.predict(rest)[0] - mpc.online()(rest)) < 1e-6
-
-
-def test_an_observation_that_is_not_finite_gets_the_law() -> None:
-    model = build(policy_kwargs={"law": "online"})
-    with pytest.warns(NonFiniteWarning, match="the law acts"):
-        u = model.predict(np.array([np.nan], np.float32))[0]
-    assert u == 0
 
 
 def test_observations_that_are_sampled_again_are_not_solved_again() -> None:

@@ -14,7 +14,6 @@ from policy_samples import build, scalar_mpc
 from sb3_yann import AffineObservation
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 
-Make = Callable[..., Any]
 KINDS: dict[str, dict[str, Any]] = {
     "a network for each region": {},
     "a shared network": {"networks": "shared"},
@@ -55,24 +54,12 @@ def require_refused(model, load: Callable[[], Any], what: str = "") -> None:
     assert same(state_of(model), before)
 
 
-def test_the_other_problems_have_as_many_regions_and_not() -> None:
-    regions = [scalar_mpc(**each).explicit().n_regions for each in ({}, *OTHERS.values())]
-    assert regions[0] == regions[1] != regions[2]
-
-
 @pytest.mark.parametrize("exact_match", [True, False])
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_of_another_problem_change_nothing(kind, other, exact_match) -> None:
     model, foreign = model_of(kind), model_of(kind, **OTHERS[other]).get_parameters()
     require_refused(model, lambda: model.set_parameters(foreign, exact_match), r"actor\.mu\.")
-
-
-@pytest.mark.parametrize("part", ["actor", "actor_target"])
-def test_an_actor_of_another_problem_changes_nothing(part) -> None:
-    model, other = model_of("a shared network"), model_of("a shared network", R=[[2]])
-    foreign = getattr(other.policy, part).state_dict()
-    require_refused(model, lambda: getattr(model.policy, part).load_state_dict(foreign))
 
 
 def test_a_guards_checkpoint_of_another_problem_changes_nothing() -> None:
@@ -87,28 +74,11 @@ def test_a_critic_of_other_weights_is_told_where_the_law_is_the_same() -> None:
     )
 
 
-def test_another_map_of_observations_is_told() -> None:
-    own, other = (AffineObservation(k * np.eye(1), np.zeros(1)) for k in (2, 3))
-    model, foreign = (build(policy_kwargs={"observation": each}) for each in (own, other))
-    parameters = foreign.get_parameters()
-    require_refused(model, lambda: model.set_parameters(parameters), r"features_extractor\.matrix")
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_parameters_of_the_same_problem_are_loaded_exactly(kind, algorithm) -> None:
     learnt, model = model_of(kind, algorithm), build(algorithm, scalar_mpc(), KINDS[kind])
     model.set_parameters(learnt.get_parameters())
-    assert same(state_of(model), state_of(learnt))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_saved_model_is_loaded_exactly(kind, tmp_path) -> None:
-    learnt = model_of(kind)
-    learnt.save(tmp_path / "model")
-    assert same(state_of(DDPG.load(tmp_path / "model")), state_of(learnt))
-    model = build(mpc=scalar_mpc(), policy_kwargs=KINDS[kind])
-    model.set_parameters(str(tmp_path / "model"))
     assert same(state_of(model), state_of(learnt))
 
 

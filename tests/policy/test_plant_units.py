@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import DDPG
 from stable_baselines3.common.logger import configure
 
@@ -142,12 +141,6 @@ def test_an_env_in_deviations_is_refused() -> None:
     assert "takes deviations from u_ss = [40.0]" in refused(units.plant("deviation", "deviation"))
 
 
-def test_other_bounds_of_the_inputs_are_named() -> None:
-    env = RescaleAction(units.plant("plant", "plant"), 0.0, 1.0)
-    message = refused(env)
-    assert "[[0.0], [1.0]]" in message and "[38.0]" in message
-
-
 @pytest.mark.parametrize(
     ("said", "message"),
     [("deviation", "must be an AffineObservation"), (3, "must be an AffineObservation"),
@@ -167,12 +160,6 @@ def test_deviations_that_are_shown_are_named_once_as_training_begins() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model.predict(np.zeros(2))
-
-
-def test_a_word_that_is_no_longer_needed_warns() -> None:
-    with pytest.warns(DeprecationWarning, match="absolute= does nothing"):
-        model = build(units.plant("plant", "plant"), "absolute")
-    assert model.policy.observation is None
 
 
 @pytest.mark.parametrize("shows", units.SAYS)

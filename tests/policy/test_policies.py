@@ -57,9 +57,7 @@ def test_the_policy_is_known_by_name(algorithm) -> None:
 @pytest.mark.slow
 @CRITICS
 @pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
-@pytest.mark.parametrize(
-    ("gamma", "discounted"), [(0.9, False), (0.9, True), (1 - 1e-3, False), (1 - 1e-3, True)]
-)
+@pytest.mark.parametrize(("gamma", "discounted"), [(0.9, True), (1 - 1e-3, False)])
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, critic) -> None:
     mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal=None)
     kwargs = {"critic": critic}
@@ -134,7 +132,7 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("problem", [None, "CSTR-v0", "sb3_yann_envs.problems:cstr"])
+@pytest.mark.parametrize("problem", [None, "sb3_yann_envs.problems:cstr"])
 def test_a_fresh_process_predicts_without_any_solver(problem, tmp_path) -> None:
     kwargs = {"critic_warmup": 0} if problem is None else {"critic_warmup": 0, "problem": problem}
     env = "CSTR-v0" if problem is None else plain_cstr()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import functools
 from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium as gym
@@ -13,17 +11,16 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from policy_samples import (
     actions,
-    build,
     make_policy,
     scalar_mpc,
     unbounded,
 )
 from sample_plants import LinearPlant
-from sb3_yann import AffineObservation, CriticOptions, LinearModel, LinearMPC, YannPolicy
+from sb3_yann import AffineObservation, LinearModel, LinearMPC, YannPolicy
 
 
 @pytest.mark.parametrize(
@@ -78,17 +75,6 @@ def test_an_env_in_plant_units_is_driven_as_the_problem_says() -> None:
     reached = env.step(model.predict(theta)[0])[0]
     own = mpc.deviations.model.step(theta, mpc.explicit()(theta))
     assert reached == pytest.approx(own, abs=1e-6)
-
-
-def test_an_env_that_takes_deviations_is_told_so() -> None:
-    env = gym.wrappers.RescaleAction(Heater(), np.float32(-3), np.float32(7))
-    with pytest.raises(ValueError, match=r"takes deviations from u_ss = \[3.0\].*leave x_ss"):
-        DDPG(YannPolicy, env, policy_kwargs={"problem": heater_mpc(0, 10)})
-
-
-def test_a_law_without_input_bounds_is_no_policy() -> None:
-    with pytest.raises(ValueError, match="u_min"):
-        make_policy(unbounded(), actions(), problem=scalar_mpc(u_min=None, u_max=None))
 
 
 @pytest.mark.parametrize("algorithm", [SAC, PPO])
@@ -156,27 +142,11 @@ def test_options_of_a_critic_that_mean_nothing_are_named(options, error, message
         make_policy(unbounded(), actions(), problem=scalar_mpc(), critic=options)
 
 
-@pytest.mark.parametrize("critic", [{"reward_scale": 2.0}, CriticOptions(reward_scale=2.0)])
-def test_options_of_a_critic_compare_by_value_when_a_model_is_loaded(critic, tmp_path) -> None:
-    build(policy_kwargs={"critic": critic}).save(tmp_path / "model")
-    for changes in ({}, {"critic": copy.deepcopy(critic)}):
-        kwargs = {"problem": scalar_mpc(), "critic": critic, "n_critics": 1, **changes}
-        loaded = DDPG.load(tmp_path / "model", policy_kwargs=kwargs)
-        assert loaded.policy.critic_options == CriticOptions(reward_scale=2.0)
-    with pytest.raises(ValueError, match="policy kwargs"):
-        DDPG.load(tmp_path / "model", policy_kwargs={**kwargs, "critic": CriticOptions()})
-
-
 def test_a_net_arch_may_leave_out_or_join_actor_and_critic() -> None:
     policy = make_policy(unbounded(), actions(), problem=scalar_mpc(), net_arch={"pi": [3, 5]})
     assert policy.net_arch == {"pi": [3, 5], "qf": [64, 64]}
     policy = make_policy(unbounded(), actions(), problem=scalar_mpc(), net_arch=[7, 7])
     assert policy.net_arch == {"pi": [7, 7], "qf": [7, 7]}
-
-
-def test_integer_actions_are_refused() -> None:
-    with pytest.raises(TypeError, match="int32"):
-        make_policy(unbounded(), spaces.Box(-1, 1, (1,), np.int32), problem=scalar_mpc())
 
 
 @pytest.mark.parametrize("normalized", ["norm_obs", "norm_reward"])
@@ -185,30 +155,6 @@ def test_a_normalizing_env_is_refused(normalized) -> None:
     env = VecNormalize(make_vec_env("sb3_yann:CSTR-v0"), **switches)
     with pytest.raises(ValueError, match="VecNormalize"):
         DDPG(YannPolicy, env)
-
-
-def test_a_factory_and_a_decorator_hide_neither_discount_nor_normalization() -> None:
-    class Logged(YannPolicy):
-        pass
-
-    plain = Logged.__init__
-
-    @functools.wraps(plain)
-    def logged(self, *args, **kwargs):
-        return plain(self, *args, **kwargs)
-
-    Logged.__init__ = logged
-    for policy in (Logged, lambda *args, **kwargs: YannPolicy(*args, **kwargs)):
-        assert DDPG(policy, "CSTR-v0", gamma=0.93, device="cpu").policy.gamma == 0.93
-        venv = VecNormalize(DummyVecEnv([lambda: gym.make("CSTR-v0")]), norm_reward=False)
-        with pytest.raises(ValueError, match="VecNormalize still moves its statistics"):
-            DDPG(policy, venv, device="cpu")
-
-
-def test_a_policy_that_an_algorithm_builds_in_its_own_way_has_its_discount() -> None:
-    model = DDPG("YannPolicy", "CSTR-v0", gamma=0.95, device="cpu")
-    again = YannPolicy(model.observation_space, model.action_space, model.lr_schedule)
-    assert again.gamma == 0.95
 
 
 def test_a_policy_that_finds_no_algorithm_says_so_and_takes_a_discount() -> None:

@@ -41,13 +41,6 @@ def scramble(model) -> None:
             th.nn.init.normal_(parameter, std=1e3)
 
 
-def test_a_bound_of_zero_is_the_mpc_bit_for_bit(mpc) -> None:
-    model = build(mpc=mpc, policy_kwargs={"max_correction": 0})
-    scramble(model)
-    states = starts(mpc, 10_000, stretch=3)
-    np.testing.assert_array_equal(model.predict(states)[0], build(mpc=mpc).predict(states)[0])
-
-
 @POLICIES
 def test_the_bound_holds_after_training(algorithm) -> None:
     mpc = two_inputs()
@@ -175,19 +168,3 @@ def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) ->
         q = model.critic.q1_forward(th.as_tensor(theta), action).numpy()[:, 0]
     stage = -mpc.stage_cost(theta, u)  # all there is, where the next state is the origin
     assert np.allclose(q, stage, rtol=1e-5) == (critic == "afterstate")
-
-
-@pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModule])
-def test_a_saved_model_brings_its_prediction_model_with_it(make, tmp_path) -> None:
-    model = with_full_buffer(mpc=two_inputs(), critic={"prediction_model": make()}, critic_warmup=0)
-    updates(model, 5)
-    model.save(tmp_path / "model")
-    model.policy.save(tmp_path / "policy")
-    theta = th.as_tensor(starts(two_inputs()))
-    expected = model.critic(theta, model.actor(theta))[0]
-    for policy in (DDPG.load(tmp_path / "model").policy, YannPolicy.load(tmp_path / "policy")):
-        assert th.equal(policy.critic(theta, policy.actor(theta))[0], expected)
-
-
-def test_value_scale_is_that_of_the_critic_s_network() -> None:
-    assert build(policy_kwargs={"critic": {"value_scale": 7.0}}).critic.qf0.scale == 7

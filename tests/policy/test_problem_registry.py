@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
@@ -29,12 +26,6 @@ def test_a_problem_may_be_an_object_a_name_or_a_reference(reference) -> None:
     problem = problems.cstr() if reference is None else reference
     model = DDPG(YannPolicy, plant, policy_kwargs={"problem": problem})
     assert model.policy.problem == problems.cstr()
-
-
-def test_the_given_problem_goes_before_the_one_in_the_space() -> None:
-    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
-    model = DDPG(YannPolicy, "ClippedPendulum-v0", policy_kwargs={"problem": mpc})
-    assert model.policy.problem is mpc
 
 
 def test_a_policy_without_a_problem_says_how_to_give_one() -> None:
@@ -71,8 +62,3 @@ def test_a_name_registered_again_means_the_new_problem() -> None:
 def test_only_problems_can_be_registered() -> None:
     with pytest.raises(TypeError, match="problem = 3"):
         sb3_yann.register_problem("three", 3)
-
-
-def test_a_name_for_a_problem_must_be_a_name() -> None:
-    with pytest.raises(ValueError, match="'a:b'"):
-        sb3_yann.register_problem("a:b", problems.cstr)

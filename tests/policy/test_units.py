@@ -80,8 +80,8 @@ def trained(cost: float = 1.0, x: tuple[float, ...] = (1, 1, 1, 1), u: float = 1
 
 @pytest.mark.parametrize(
     "units",
-    [{"cost": 1e-3}, {"cost": 1e3}, {"x": (1e3, 1e-2, 7.0, 0.1)}, {"u": 100.0}],
-    ids=["cost / 1000", "cost * 1000", "states", "inputs"],
+    [{"cost": 1e-3}, {"x": (1e3, 1e-2, 7.0, 0.1)}, {"u": 100.0}],
+    ids=["cost / 1000", "states", "inputs"],
 )
 def test_other_units_give_the_same_actions_through_five_training_episodes(units) -> None:
     expected, model = trained()

@@ -118,22 +118,3 @@ def mpc_costs(seeds) -> list[float]:
 def test_a_vec_normalize_that_cannot_be_undone_is_refused(make, message) -> None:
     with pytest.raises(ValueError, match=message):
         AffineObservation.from_vec_normalize(make())
-
-
-@pytest.mark.parametrize(
-    ("make", "observation", "message"),
-    [
-        (lambda: normalize(frozen=False), ABSOLUTE, "still moves its statistics"),
-        (lambda: normalize(norm_reward=True), ABSOLUTE, "normalizes rewards"),
-        (normalize, None, r"AffineObservation\.from_vec_normalize\(venv\)"),
-        (
-            lambda: VecFrameStack(normalize(), 2),
-            AffineObservation.newest_frame(3, 2),
-            "Make VecNormalize the last wrapper",
-        ),
-        (lambda: normalize(clip_obs=3.0), ABSOLUTE, r"clips at clip_obs = 3.*numpy\.inf"),
-    ],
-)
-def test_a_policy_refuses_it_as_well(make, observation, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        build(make(), observation)

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.wrappers import NormalizeReward, TimeLimit
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
@@ -25,7 +25,6 @@ from sb3_yann import (
     AffineObservation,
     ControlDiagnostics,
     CostAudit,
-    CostMismatchWarning,
     ImprovementGuard,
     LinearModel,
     LinearMPC,
@@ -40,10 +39,6 @@ STEPS = 6
 
 def plant(start: float = 1.0) -> gym.Env:
     return TimeLimit(LinearPlant(MPC, start), STEPS)
-
-
-def wrong_plant() -> gym.Env:
-    return NormalizeReward(plant())
 
 
 def build(env, algorithm=DDPG, policy=None, **kwargs):
@@ -67,7 +62,7 @@ def assert_every_action_is_the_law_s(model) -> None:
 # One start method after the other: each starts two processes that import PyTorch.
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 on, if threads run
-@pytest.mark.parametrize("start_method", ["fork", "forkserver", "spawn"])
+@pytest.mark.parametrize("start_method", ["fork", "spawn"])
 def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
     env = SubprocVecEnv([plant, plant], start_method=start_method)
     try:
@@ -85,16 +80,6 @@ def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
         starts = transitions(model, "observations")[::STEPS]
         assert len(np.unique(starts, axis=0)) == 5
         assert np.all(starts[:, 0] != starts[:, 1])  # each env has a seed of its own
-    finally:
-        env.close()
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_wrapper_in_another_process_is_found() -> None:
-    env = SubprocVecEnv([wrong_plant] * 2, start_method="fork")
-    try:
-        with pytest.warns(CostMismatchWarning, match="NormalizeReward"):
-            build(env, gradient_steps=0).learn(60, callback=[NoActionNoise(), CostAudit(40)])
     finally:
         env.close()
 
@@ -138,22 +123,6 @@ def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm
     assert [each.episode for each in guard.decisions] == tried
     pairs = zip(before.parameters(), learnt[0].values(), strict=True)
     assert any(not th.equal(a, b) for a, b in pairs)
-
-
-def test_the_diagnostics_follow_each_env_for_itself() -> None:
-    model = build(DummyVecEnv([plant, lambda: TimeLimit(LinearPlant(MPC), 4)]), gradient_steps=0)
-    diagnostics, lengths = ControlDiagnostics(), []
-    record = diagnostics._record_critic_error
-    diagnostics._record_critic_error = lambda episode, info: (  # type: ignore[method-assign]
-        lengths.append(len(episode)),
-        record(episode, info),
-    )[-1]
-    model.learn(24, callback=[NoActionNoise(), diagnostics], log_interval=1000)
-    assert lengths == [4, 6, 4, 6, 4]  # at steps 4, 6, 8 and both at 12
-    # Small starts stay in the region where the critic is exact; the limit is bootstrapped there.
-    model = build(DummyVecEnv([lambda: plant(0.05)] * 2), gradient_steps=0)
-    model.learn(12, callback=[NoActionNoise(), ControlDiagnostics()], log_interval=1000)
-    assert model.logger.name_to_value["yann/critic_error"] < 1e-5
 
 
 # --- time limits ----------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import wrappers
 from stable_baselines3 import DDPG
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import AffineObservation, ImprovementGuard, NoActionNoise, headroom
@@ -107,19 +107,6 @@ def test_an_env_that_is_set_later_is_looked_at_before_the_policy_acts_on_it() ->
     model.set_env(other)
     with pytest.raises(ValueError, match="Welford scales"):
         model.learn(5, callback=NoActionNoise())
-
-
-def test_worker_processes_are_asked_as_well() -> None:
-    venv = SubprocVecEnv([make_welford], start_method="fork")
-    try:
-        with pytest.raises(ValueError, match=r"in the processes of SubprocVecEnv scales"):
-            require_state_shown(venv, observation_given=True)
-    finally:
-        venv.close()
-
-
-def make_welford() -> gym.Env:
-    return wrappers.TimeLimit(Welford(LinearPlant(MPC, 2.0)), 20)
 
 
 def boxed() -> gym.Env:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import random
 
 import gymnasium as gym
@@ -57,17 +56,6 @@ def test_the_global_generators_are_left_alone() -> None:
     assert before == (np.random.normal(), random.random())  # noqa: NPY002
 
 
-@pytest.mark.parametrize("drawn", [1, 2])
-def test_the_second_normal_number_of_a_pair_is_left_alone(drawn: int) -> None:
-    env = SeededGlobals(Walk())
-    np.random.seed(3)  # noqa: NPY002 (what is to be left alone)
-    expected = np.random.normal(size=9)[drawn:]  # noqa: NPY002
-    np.random.seed(3)  # noqa: NPY002
-    np.random.normal(size=drawn)  # noqa: NPY002
-    walk(env, 7)
-    assert np.array_equal(np.random.normal(size=9 - drawn), expected)  # noqa: NPY002
-
-
 def test_a_step_that_fails_leaves_the_global_generators_alone() -> None:
     env = SeededGlobals(Walk())
     env.reset(seed=0)
@@ -76,14 +64,6 @@ def test_a_step_that_fails_leaves_the_global_generators_alone() -> None:
     with pytest.raises(AttributeError, match="steps"):
         env.step(np.zeros(1))
     assert random.getstate() == before and get_bit_generator() is generator
-
-
-def test_a_copy_goes_on_in_the_same_stream() -> None:
-    env = SeededGlobals(Walk())
-    env.reset(seed=0)
-    other = copy.deepcopy(env)
-    seen = [[each.step(np.zeros(1))[0][0] for _ in range(3)] for each in (env, other)]
-    assert seen[0] == seen[1]
 
 
 def ends(env: gym.Env) -> list[tuple[bool, bool]]:

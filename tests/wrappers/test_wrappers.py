@@ -101,12 +101,6 @@ def test_a_schedule_says_which_reference_the_next_action_follows() -> None:
     assert [env.step(np.zeros(1))[0][2] for _ in range(3)] == [1, 2, 3]
 
 
-def test_a_measured_disturbance_comes_from_info() -> None:
-    env = MeasuredDisturbance(Counter(), [0], [1])
-    assert env.reset()[0].tolist() == [0, 0, 0]
-    assert env.step(np.zeros(1))[0][2] == np.float32(0.1)
-
-
 def test_the_estimate_takes_the_place_of_the_measurement() -> None:
     model = LinearModel(np.diag([0.9, 0.8, 0.7]), np.ones((3, 1)), 1.0, E=[[1], [0], [0]])
     observer = DisturbanceObserver(model, [0, 2])
@@ -250,12 +244,6 @@ def test_inputs_on_their_way_are_shown_newest_first() -> None:
     assert env.step(np.float32([-1]))[0][4:].tolist() == [-1, 1, 0.5]
     assert env.reset(seed=0)[0][4:].tolist() == [0.5, 0.5, 0.5]
     assert env.observation_space.shape == (7,)
-
-
-@pytest.mark.parametrize("delays", [[1, 2], [-1], [0.5]])
-def test_delays_that_do_not_fit_are_named(delays: list[int]) -> None:
-    with pytest.raises(ValueError, match=r"delays = .* must"):
-        PastInputs(gym.make("CSTR-v0"), delays)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
