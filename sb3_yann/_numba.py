@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -62,4 +64,16 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
     for signature in signatures:
         dispatcher.compile(signature)
     dispatcher.disable_compile()
+    if not keep or dispatcher.stats.cache_misses:
+        _say(keep)
     return dispatcher
+
+
+@cache
+def _say(keep: bool) -> None:
+    """Say once what takes the time."""
+    how_often = (
+        "once after an installation" if keep else "at each start, for its folder takes no file"
+    )
+    words = f"sb3-yann compiles its inner loops ({how_often}): half a minute in all."
+    print(words, file=sys.stderr, flush=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 
 import sb3_yann
-from sb3_yann._numba import compiled, compiled_sources
+from sb3_yann._numba import _say, compiled, compiled_sources
 
 PACKAGE = Path(sb3_yann.__file__).parent
 
@@ -33,9 +33,17 @@ def test_nothing_else_compiles_in_the_package() -> None:
     assert plain == [PACKAGE / "_numba.py"]
 
 
-def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(monkeypatch) -> None:
+def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(monkeypatch, capsys) -> None:
     def no_folder(self) -> None:
         raise RuntimeError("cannot cache function: no locator available")
 
     monkeypatch.setattr(Dispatcher, "enable_caching", no_folder)
-    assert compiled("float64(float64)")(lambda x: x + 1.0)(1.0) == 2.0
+    _say.cache_clear()
+    for _ in range(2):
+        assert compiled("float64(float64)")(lambda x: x + 1.0)(1.0) == 2.0
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "sb3-yann compiles its inner loops (at each start, for its folder takes no file): half a "
+        "minute in all."
+    ]
+    _say.cache_clear()
