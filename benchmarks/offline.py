@@ -13,7 +13,7 @@ from benchmarks.timing import Array, Task
 from sb3_yann.control import ParametricQP
 
 SECTION = "offline solution"
-OURS = "ours, with its check and search tree"
+OURS = "ours, with its check"
 EACH = "ours, for each region"
 SMALL = 300
 """Regions up to which ppopt takes seconds."""

@@ -7,13 +7,12 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from fresh_process import run_python
-from sb3_yann.control import search_tree
 from sb3_yann.control._kernels import law, online, polyhedra
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
 from sb3_yann.twin._kernels import step
 from sb3_yann_envs import cstr
 
-LAWS = law, online, polyhedra, search_tree
+LAWS = law, online, polyhedra
 MODULES = (*LAWS, yann_layer, afterstate_value, step, cstr)
 CALLED = {
     f"{module.__name__}.{name}": function
@@ -40,7 +39,6 @@ def test_all_that_is_known_to_be_called_is_looked_at() -> None:
         "law_of_batch",
         "locate_batch",
         "bounded_region",
-        "_sides",
         "forward",
     }
     assert names >= {

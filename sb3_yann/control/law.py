@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from typing_extensions import Self
 
-    from sb3_yann.control.search_tree import SearchTree
-
 T = TypeVar("T")
 INFEASIBLE = ("nearest_region", "zero_input")
 
@@ -134,7 +132,7 @@ class PlantLaw(ReadOnlyArrays):
     def save(self, path: str | PathLike[str]) -> None:
         """Write the law to ``path`` as an ``.npz`` file of plain arrays.
 
-        Its plant goes along, and a search tree if there is one.
+        Its plant goes along.
         """
         write_arrays(path, self._arrays())
 
@@ -161,7 +159,6 @@ class PlantLaw(ReadOnlyArrays):
         """Return the law of such arrays; what is missing or damaged raises some error."""
         values = {each.name: data[each.name] for each in fields(cls)}  # type: ignore[arg-type]
         law = cls(**{name: each if each.ndim else each.item() for name, each in values.items()})
-        law._restore(data)
         if not any(name == "theta_ss" or name.startswith("model_") for name in data):
             return law
         own = [each.name for each in fields(LinearModel) if each.name != "C" or "model_C" in data]
@@ -172,9 +169,6 @@ class PlantLaw(ReadOnlyArrays):
         if model.n_inputs != law.n_inputs or model.n_states > law.n_theta:
             raise ValueError(f"its model has {model.n_states} states and {model.n_inputs} inputs")
         return law.on_plant(model, check_array("theta_ss", data["theta_ss"], (law.n_theta,)))
-
-    def _restore(self, data: dict[str, Any]) -> None:
-        """Take over the search tree of a file; most laws have none."""
 
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""
@@ -214,7 +208,7 @@ class PiecewiseAffine(PlantLaw):
         first region that holds theta.
     neighbors : ndarray of int, shape (q,), optional
         The region beyond each half-space, -1 where none is known. Disjoint regions that are many
-        are then found by a walk along a line, without a tree. Empty where there is no region known.
+        are then found by a walk along a line. Empty where there is no region known.
 
     Examples
     --------
@@ -329,36 +323,11 @@ class PiecewiseAffine(PlantLaw):
         locate_batch(*self.packed, rows, region, inside)
         return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
 
-    @cached_property
-    def tree(self) -> SearchTree | None:
-        """The tree that finds a region; None for so few that a scan is as fast, or for a walk."""
-        return self.grow_tree()
-
-    def grow_tree(self, advance: Callable[[int], None] = lambda count: None) -> SearchTree | None:
-        """Build the tree now, so that no call does, and return it.
-
-        ``advance`` gets 1 for each region and 0 for each node; what it raises ends the work.
-        """
-        bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
-        tree = None
-        # With more than ten parameters regions have too many vertices.
-        if self.n_regions > 4 and self.n_theta <= 10 and bounded and not self.walks:
-            from sb3_yann.control.search_tree import build_tree
-
-            box = self.theta_min, self.theta_max
-            tree = build_tree(self.A, self.b, self.starts, *box, advance)
-            if not len(tree.levels):  # no hyperplane parts these regions
-                tree = None
-        vars(self)["tree"] = tree
-        return tree
-
     @property
     def walks(self) -> bool:
-        """Whether a region is found by a walk from region to region.
-
-        With more than three parameters a tree takes longer to build than the law to solve.
-        """
-        return self.n_regions > 4 and self.n_theta > 3 and self.disjoint and self.neighbors.size > 0
+        """Whether a region is found by a walk from region to region; others by a scan of all."""
+        bounded = bool(np.all(np.isfinite([self.theta_min, self.theta_max])))
+        return self.n_regions > 4 and self.disjoint and self.neighbors.size > 0 and bounded
 
     @cached_property
     def packed(self) -> tuple[Array, NDArray[np.int64]]:
@@ -373,7 +342,6 @@ class PiecewiseAffine(PlantLaw):
             np.stack([self.u_min, self.u_max]),
             (self.tolerance, self.tie_tolerance),
             (self.infeasible == "zero_input", self.disjoint),
-            tuple(vars(self.tree).values()) if self.tree else (),
             (self.neighbors, *self.start_of_walk()) if self.walks else None,
         )
 
@@ -392,17 +360,6 @@ class PiecewiseAffine(PlantLaw):
 
         return partial(law_at, *self.packed)
 
-    def _arrays(self) -> dict[str, Any]:
-        tree = {} if self.tree is None else vars(self.tree)
-        return {**super()._arrays(), **{f"tree_{name}": each for name, each in tree.items()}}
-
-    def _restore(self, data: dict[str, Any]) -> None:
-        tree = {name[5:]: each for name, each in data.items() if name.startswith("tree_")}
-        if tree:
-            from sb3_yann.control.search_tree import SearchTree
-
-            vars(self)["tree"] = SearchTree(**tree).checked(self.n_theta, self.n_regions)
-
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
         return hash((self.gains.tobytes(), self.b.tobytes(), self.infeasible))
@@ -413,8 +370,7 @@ class PiecewiseAffine(PlantLaw):
         return f"PiecewiseAffine({law}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was compiled for this process; the tree goes along, as in :meth:`save`."""
-        _ = self.tree
+        """Leave out what was compiled for this process."""
         return {name: each for name, each in vars(self).items() if name not in ("packed", "_at")}
 
 

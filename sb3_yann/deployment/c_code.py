@@ -76,7 +76,6 @@ def _definitions(data: Arrays, precision: str) -> str:
         "N_REGIONS": len(data["gains"]),
         "FABS(x)": f"fabs{suffix}(x)",
         "SEARCH_BY_WALK": int(walks),
-        "SEARCH_BY_TREE": int("tree_levels" in data),
         "DISJOINT": int(data["disjoint"]),
         "ZERO_INPUT": int(data["zero_input"]),
         "RATE": int(len(data["change"]) > 0),

@@ -57,10 +57,10 @@ def search_tolerances(data: Arrays, precision: str) -> dict[str, float]:
     """
     found: tuple[float, ...]
     if precision == "float":
-        found = (1e-5, 2e-6, 1e-5, 1e-4, 1e-5)
+        found = (1e-5, 2e-6, 1e-5, 1e-5)
     else:
-        found = (*map(float, data["tolerances"]), 1e-9, 1e-6, 1e-9)
-    return dict(zip(("tolerance", "tie", "surely_inside", "clear", "back"), found, strict=True))
+        found = (*map(float, data["tolerances"]), 1e-9, 1e-9)
+    return dict(zip(("tolerance", "tie", "surely_inside", "back"), found, strict=True))
 
 
 # ---- Tables ----
@@ -97,14 +97,10 @@ def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
 
 
 def search_tables(data: Arrays) -> tuple[Tables, Tables]:
-    """Return the tables of a walk or of a search tree; none where all regions are asked."""
-    if data["neighbors"].size:
-        return {"walk_slack": data["walk_slack"]}, {"neighbors": data["neighbors"]}
-    if "tree_levels" not in data:
+    """Return the tables of a walk; none where all regions are asked."""
+    if not data["neighbors"].size:
         return {}, {}
-    numbers = {f"tree_{key}": data[f"tree_{key}"] for key in ("normals", "levels")}
-    keys = "children", "leaf_starts", "leaf_regions"
-    return numbers, {f"tree_{key}": data[f"tree_{key}"] for key in keys}
+    return {"walk_slack": data["walk_slack"]}, {"neighbors": data["neighbors"]}
 
 
 def index_bytes(indices: Tables) -> int:
@@ -145,8 +141,7 @@ class Cost:
         search_numbers, search_indices = search_tables(data)
         (_, m, n), q, n_obs = data["gains"].shape, len(data["b"]), data["obs_matrix"].shape[1]
         widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]
-        tree = len(data["tree_levels"]) if "tree_levels" in data else 0
-        search = 2 * q * n + (q * n if data["neighbors"].size else 0) + tree * n
+        search = 2 * q * n + (q * n if data["neighbors"].size else 0)
         products = sum(a * b for a, b in zip([n, *widths], widths, strict=False))
         hidden = sum(widths[:-1])
         program = 0

@@ -237,8 +237,6 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
         region, point = law.start_of_walk()
         arrays |= {"neighbors": law.neighbors, "walk_from": np.int64(region)}
         arrays["walk_slack"] = law.b - law.A @ point
-    elif law.tree is not None:
-        arrays |= {f"tree_{key}": each for key, each in vars(law.tree).items()}
     return arrays
 
 

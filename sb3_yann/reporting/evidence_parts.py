@@ -188,7 +188,7 @@ def cost_part(subject: Subject) -> Part:
         "the actor's weights and constants": sum(t.numel() * t.element_size() for t in tensors)
     }
     if isinstance(law, PiecewiseAffine):
-        sizes["the law, with its search tree"] = sum(each.nbytes for each in law.packed)
+        sizes["the law, with what finds its regions"] = sum(each.nbytes for each in law.packed)
     if sys.platform != "win32":
         import resource
 

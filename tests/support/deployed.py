@@ -70,7 +70,7 @@ def replaced(mpc: LinearMPC, **changes: Any) -> LinearMPC:
 CASES: dict[str, Callable[[], YannPolicy]] = {
     "reactor": lambda: disturbed(sample_laws.solved("reactor"), max_correction=0.2),
     "reactor, shared": lambda: disturbed(sample_laws.solved("reactor"), networks="shared"),
-    "pendulum, by a tree": lambda: disturbed(sample_laws.solved("pendulum")),
+    "pendulum, by a walk": lambda: disturbed(sample_laws.solved("pendulum")),
     "asymmetric bounds, one layer": lambda: disturbed(
         sample_laws.solved("asymmetric bounds"), net_arch=[7], activation_fn=th.nn.ReLU
     ),

@@ -5,20 +5,18 @@ A law goes in as two arrays (see :func:`pack`): each that numba unpacks costs 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
 
-HEADER = 9
-"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint, and 1 +
-the region that a walk begins in, 0 where there is none."""
+HEADER = 7
+"""Whole numbers before the packed arrays: n, m, p, q, zero input, disjoint, and 1 + the region that
+a walk begins in, 0 where there is none."""
 
 ROWS = 2  # floats before the packed arrays: how far outside counts as inside, which slacks tie
 SURELY_INSIDE = 1e-9
-"""With this slack, no region that the tree left out, and of disjoint ones no other, is as good."""
+"""With this slack, no other one of disjoint regions is as good."""
 
 
 def pack(
@@ -29,28 +27,25 @@ def pack(
     bounds: Array,
     tolerances: tuple[float, float],
     flags: tuple[bool, bool],
-    tree: Sequence[Array | Integers] = (),
     walk: tuple[Integers, int, Array] | None = None,
 ) -> tuple[Array, Integers]:
     """Return a law as one array of floats and one of whole numbers, for the functions below.
 
     ``rows`` are [A b] (q, n + 1) of all regions, ``bounds`` u_min and u_max (2, m). ``tolerances``
     tell how far outside counts as inside and which slacks tie, ``flags`` whether the input is zero
-    outside and whether no regions overlap. Without a ``tree`` the regions are scanned, or a
-    ``walk`` goes from region to region: the one beyond each row, where it begins, and at which
-    point (n,).
+    outside and whether no regions overlap. The regions are scanned, or a ``walk`` goes from region
+    to region: the one beyond each row, where it begins, and at which point (n,).
     """
     (p, m, n), q = gains.shape, len(rows)
-    normals, levels, *numbers = tree or (np.empty(0), np.empty(0))
-    leaves = len(numbers[1]) - 1 if numbers else 0
-    header = [n, m, p, q, len(levels), leaves, *flags, 0]
-    if walk is not None:  # in place of a tree: slacks at the start, and neighbors
+    header = [n, m, p, q, *flags, 0]
+    neighbors: Integers = np.empty(0, np.int64)
+    at_start: Array = np.empty(0)
+    if walk is not None:
         neighbors, first, inside = walk
         header[-1] = 1 + first
-        normals = rows[:, -1] - rows[:, :-1] @ inside
-        numbers = [neighbors]
-    floats = (np.array(tolerances), rows, gains, offsets, bounds, normals, levels)
-    whole = (header, starts, [q], *numbers)
+        at_start = rows[:, -1] - rows[:, :-1] @ inside
+    floats = (np.array(tolerances), rows, gains, offsets, bounds, at_start)
+    whole = (header, starts, [q], neighbors)
     packed = np.hstack([np.ravel(each) for each in whole]).astype(np.int64)
     return np.hstack([np.ravel(each) for each in floats]), packed
 
@@ -87,25 +82,20 @@ def _best(
     whole: Integers,
     theta: Array,
     at: int,
-    first: int,
-    last: int,
-    listed: bool,
     known: float,
 ) -> tuple[int, float]:
     """Return the first region whose smallest slack ties with the largest, and the largest.
 
-    The regions are those from ``first`` to ``last``, or where they are ``listed``, those which
-    stand there in ``whole``. With the slack of some region that is ``known``, most of the others
-    are soon passed over. Of disjoint ones the first that surely holds theta ends the search.
+    With the slack of some region that is ``known``, most of the others are soon passed over. Of
+    disjoint ones the first that surely holds theta ends the search.
     """
     n = whole[0]
-    disjoint = whole[7] == 1
-    best = -1 if listed else 0
+    disjoint = whole[5] == 1
+    best = 0
     largest = -np.inf
     low = known - floats[1] * (1 + abs(known))
     tied = False
-    for each in range(first, last):
-        i = whole[each] if listed else each
+    for i in range(whole[2]):
         smallest = np.inf
         for k in range(whole[HEADER + i], whole[HEADER + i + 1]):
             row = ROWS + k * (n + 1)
@@ -129,35 +119,10 @@ def _best(
     if not tied:
         return best, largest
     nearly = largest - floats[1] * (1 + abs(largest))
-    for each in range(first, last):
-        i = whole[each] if listed else each
-        if i < best and _slack(floats, whole, i, theta, at, nearly) >= nearly:
-            best = i
+    for i in range(best):
+        if _slack(floats, whole, i, theta, at, nearly) >= nearly:
+            return i, largest
     return best, largest
-
-
-@compiled()
-def _leaf(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, int, float]:
-    """Return where the regions of the leaf that theta falls into begin and end in ``whole``.
-
-    With them comes the smallest distance from the hyperplanes on the way.
-    """
-    n = whole[0]
-    nodes = whole[4]
-    normals = _places(whole)[3]
-    levels = normals + nodes * n
-    children = HEADER + whole[2] + 1
-    node = 0
-    room = np.inf
-    while node >= 0:
-        side = -floats[levels + node]
-        for j in range(n):
-            side += floats[normals + node * n + j] * theta[at, j]
-        room = min(room, abs(side))
-        node = whole[children + 2 * node + (1 if side > 0 else 0)]
-    starts = children + 2 * nodes
-    regions = starts + whole[5] + 1
-    return regions + whole[starts - node - 1], regions + whole[starts - node], room
 
 
 @compiled()
@@ -166,7 +131,7 @@ def walk_to(floats: Array, whole: Integers, theta: Array, at: int) -> int:
     n = whole[0]
     at_start = _places(whole)[3]
     neighbors = HEADER + whole[2] + 1
-    region: int = whole[8] - 1
+    region: int = whole[6] - 1
     reached = 0.0
     for _ in range(10_000):
         leaves = np.inf
@@ -200,23 +165,17 @@ def _choose(
     for j in range(whole[0]):
         if not np.isfinite(theta[at, j]):
             return -1, np.nan
-    if near >= 0 and whole[7] == 1:
+    if near >= 0 and whole[5] == 1:
         inside = _slack(floats, whole, near, theta, at, SURELY_INSIDE)
         if inside >= SURELY_INSIDE:
             return near, inside
     known = -np.inf
-    if whole[8] > 0:
+    if whole[6] > 0:
         region = walk_to(floats, whole, theta, at)
         known = _slack(floats, whole, region, theta, at, -np.inf)
         if known >= SURELY_INSIDE:
             return region, known
-    elif whole[4] > 0:
-        first, last, room = _leaf(floats, whole, theta, at)
-        best, known = _best(floats, whole, theta, at, first, last, True, -np.inf)
-        # So far from all hyperplanes on its way, what holds a point is in the leaf.
-        if known >= SURELY_INSIDE or (known >= -floats[1] and room > 1e-6):
-            return best, known
-    return _best(floats, whole, theta, at, 0, whole[2], False, known)
+    return _best(floats, whole, theta, at, known)
 
 
 @compiled()
@@ -234,7 +193,7 @@ def input_at(
     if region < 0:
         return -1
     gains, offsets, bounds, _ = _places(whole)
-    zero = whole[6] == 1 and inside < -floats[0]
+    zero = whole[4] == 1 and inside < -floats[0]
     for k in range(m):
         u = 0.0
         if not zero:

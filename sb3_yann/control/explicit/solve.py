@@ -76,13 +76,7 @@ def solve_explicit(
             f"({fault}). Bring states, inputs and weights to similar magnitudes, shorten the "
             "horizon, or use online(), which needs no regions."
         ) from None
-    law = units.law(regions, infeasible)
-    if not law.walks:
-        timer.stage("Search tree", "and checked", law.n_regions)
-        # Each region's vertices, and the nodes: by trial.
-        effort = 2e-4 * 2.0 ** max(0, law.n_theta - 4)
-        law.grow_tree(lambda count: timer.advance(count, count * effort))
-    return law
+    return units.law(regions, infeasible)
 
 
 def critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:
@@ -93,8 +87,8 @@ def critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> 
 
 def load_kernels() -> None:
     """Load what is compiled; on a new machine this compiles, for longer than many a time limit."""
-    for kernels in ("_kernels.polyhedra", "_kernels.law", "search_tree"):
-        import_module(f"sb3_yann.control.{kernels}")
+    for kernels in ("polyhedra", "law"):
+        import_module(f"sb3_yann.control._kernels.{kernels}")
 
 
 class ProgramUnits:

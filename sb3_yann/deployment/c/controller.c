@@ -108,43 +108,6 @@ static int walk(const real theta[N_THETA])
 }
 #endif
 
-#if SEARCH_BY_TREE
-/* The best region of the leaf that theta falls into; `room` is the way to the nearest hyperplane. */
-static int best_of_leaf(const real theta[N_THETA], real *inside, real *room)
-{
-    int node = 0, best = -1;
-    real largest = -INFINITY, low = -INFINITY;
-    *room = INFINITY;
-    while (node >= 0) {
-        real side = -tree_levels[node];
-        for (int j = 0; j < N_THETA; j++) {
-            side += tree_normals[node][j] * theta[j];
-        }
-        *room = FABS(side) < *room ? FABS(side) : *room;
-        node = tree_children[node][side > ZERO ? 1 : 0];
-    }
-    const int first = tree_leaf_starts[-node - 1], last = tree_leaf_starts[-node];
-    for (int k = first; k < last; k++) {
-        const int i = tree_leaf_regions[k];
-        const real slack = slack_of_region(i, theta, low);
-        if (slack > largest) {
-            largest = slack;
-            best = i;
-            low = nearly(slack);
-        }
-    }
-    low = nearly(largest);
-    for (int k = first; k < last; k++) {
-        const int i = tree_leaf_regions[k];
-        if (i < best && slack_of_region(i, theta, low) >= low) {
-            best = i;
-        }
-    }
-    *inside = largest;
-    return best;
-}
-#endif
-
 static int locate(const real theta[N_THETA], real *inside)
 {
     real known = -INFINITY;
@@ -152,13 +115,6 @@ static int locate(const real theta[N_THETA], real *inside)
     const int found = walk(theta);
     known = slack_of_region(found, theta, -INFINITY);
     if (known >= SURELY_INSIDE) {
-        *inside = known;
-        return found;
-    }
-#elif SEARCH_BY_TREE
-    real room;
-    const int found = best_of_leaf(theta, &known, &room);
-    if (known >= SURELY_INSIDE || (known >= -TOLERANCE && room > CLEAR)) {
         *inside = known;
         return found;
     }

@@ -11,7 +11,7 @@ import pytest
 
 from fresh_process import run_python
 from sample_problems import benchmark
-from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC, search_tree
+from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC
 from sb3_yann.control.explicit import budget, certificate, facet_walk, solve
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
@@ -63,7 +63,7 @@ def test_progress_goes_to_the_error_stream_and_only_if_asked_for(capfd: Any) -> 
     benchmark().explicit(progress=True)
     out, err = capfd.readouterr()
     assert out == ""
-    assert all(stage in err for stage in ("Critical regions", "Checked", "Search tree"))
+    assert all(stage in err for stage in ("Critical regions", "Checked"))
 
 
 def test_a_law_that_is_there_keeps_to_the_limit_of_regions() -> None:
@@ -74,36 +74,20 @@ def test_a_law_that_is_there_keeps_to_the_limit_of_regions() -> None:
     assert error.value.n_regions == 9
 
 
-@pytest.mark.parametrize(
-    ("stage", "message"),
-    [
-        ("Certificate.check", "and not all were checked"),
-        ("build_tree", "and checked"),
-    ],
-)
-def test_the_limit_of_time_holds_for_check_and_tree_too(stage, message, monkeypatch) -> None:
+def test_the_limit_of_time_holds_for_the_check_too(monkeypatch) -> None:
     clock = [0.0]
     monkeypatch.setattr("sb3_yann.control.explicit.budget.time.monotonic", lambda: clock[0])
-    module = certificate if stage.startswith("Certificate") else search_tree
-    owner, name = (module.Certificate, "check") if module is certificate else (module, stage)
-    original = getattr(owner, name)
+    original = certificate.Certificate.check
 
     def later(*args: Any, **options: Any) -> Any:
         clock[0] = 100.0
         return original(*args, **options)
 
-    monkeypatch.setattr(owner, name, later)
-    with pytest.raises(ExplicitLimitError, match=f"time_limit = 50 s: 9 regions .*{message}"):
+    monkeypatch.setattr(certificate.Certificate, "check", later)
+    with pytest.raises(ExplicitLimitError, match=r"50 s: 9 regions .*and not all were checked"):
         benchmark().explicit(time_limit=50)
-    monkeypatch.setattr(owner, name, original)
+    monkeypatch.setattr(certificate.Certificate, "check", original)
     assert benchmark().explicit(time_limit=1000).n_regions == 9
-
-
-def test_a_law_that_was_solved_builds_nothing_when_it_is_called(monkeypatch) -> None:
-    law = benchmark().explicit()
-    monkeypatch.setattr(search_tree, "build_tree", None)
-    assert law.tree is not None
-    law(np.zeros(law.n_theta))
 
 
 def test_nothing_is_compiled_while_the_clock_runs() -> None:

@@ -103,7 +103,7 @@ def test_saved_file_holds_plain_arrays(tmp_path: Path) -> None:
     law = law_of("pendulum")
     law.save(tmp_path / "law.npz")
     with np.load(tmp_path / "law.npz", allow_pickle=False) as data:
-        names = {name for name in data if not name.startswith(("tree_", "model_", "theta_ss"))}
+        names = {name for name in data if not name.startswith(("model_", "theta_ss"))}
         assert names == {field.name for field in dataclasses.fields(law)} | {"digest"}
         assert all(data[name].dtype != object for name in data)
 

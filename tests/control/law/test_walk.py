@@ -1,8 +1,11 @@
-"""A walk along a line finds the region that a scan of all regions finds; it needs no tree."""
+"""A walk along a line finds the region that a scan of all regions finds."""
 
 from __future__ import annotations
 
+import os
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -30,30 +33,44 @@ def chain(bounded: bool = False, infeasible: str = "nearest_region") -> Piecewis
     ).explicit()  # fmt: skip
 
 
+@cache
+def cart() -> PiecewiseAffine:
+    """The law of a cart with 125 regions, part of whose box has no solution."""
+    model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
+    return LinearMPC(
+        model, Q=np.eye(2), R=[[0.03]], horizon=6,
+        x_min=[-5, -2], x_max=[5, 2], u_min=-1, u_max=1,
+    ).explicit()  # fmt: skip
+
+
+LAWS = pytest.mark.parametrize("make", [chain, lambda: chain(bounded=True), cart])
+
+
 def scanned(law: PiecewiseAffine) -> PiecewiseAffine:
-    law = replace(law, neighbors=UNKNOWN)
-    law.__dict__["tree"] = None
-    return law
+    return replace(law, neighbors=UNKNOWN)
 
 
 def in_box(law: PiecewiseAffine, count: int, stretch: float = 1.0) -> np.ndarray:
-    return np.random.default_rng(0).uniform(-4 * stretch, 4 * stretch, (count, law.n_theta))
+    drawn = np.random.default_rng(0).uniform(-stretch, stretch, (count, law.n_theta))
+    return drawn * (law.theta_max - law.theta_min) / 2
 
 
-@pytest.mark.parametrize("bounded", [False, True])
+@LAWS
 @pytest.mark.parametrize("stretch", [1.0, 3.0])
-def test_it_finds_the_region_of_a_scan_inside_and_outside(bounded: bool, stretch: float) -> None:
-    law, points = chain(bounded), in_box(chain(), 5000, stretch)
-    assert law.tree is None and law.n_regions > 50
+def test_it_finds_the_region_of_a_scan_inside_and_outside(make, stretch: float) -> None:
+    law = make()
+    points = in_box(law, 5000, stretch)
+    assert law.walks and law.n_regions > 50
     for name in ("locate", "in_domain", "__call__"):
         found, expected = getattr(law, name)(points), getattr(scanned(law), name)(points)
         assert np.array_equal(found, expected)
     if stretch == 1:
-        assert law.in_domain(points).all() != bounded
+        assert law.in_domain(points).all() == (make is chain)
 
 
-def test_it_finds_the_region_of_a_scan_on_facets() -> None:
-    law = chain()
+@LAWS
+def test_it_finds_the_region_of_a_scan_on_facets(make) -> None:
+    law = make()
     points, _ = edges(law, seed=0)
     assert np.array_equal(law.locate(points), scanned(law).locate(points))
 
@@ -102,5 +119,82 @@ def test_they_are_saved_and_copied_and_a_law_may_have_none(tmp_path: Path) -> No
     none = np.empty(0, np.int64)
     replace(law, neighbors=none).save(tmp_path / "old.npz")
     old = PiecewiseAffine.load(tmp_path / "old.npz")
-    assert old == law and old.neighbors.size == 0 and old.tree is not None
+    assert old == law and not old.walks
     assert np.array_equal(old(points), law(points))
+
+
+def test_regions_that_overlap_go_by_the_largest_slack() -> None:
+    """Of twenty intervals that reach into their neighbors each holds what it has the middle of."""
+    middles = np.linspace(-0.95, 0.95, 20)
+    law = PiecewiseAffine(
+        np.zeros((20, 1, 1)), middles[:, None], np.tile([[1.0], [-1.0]], (20, 1)),
+        np.column_stack([middles + 0.1, 0.1 - middles]).ravel(), 2 * np.arange(20),
+        [-1], [1], [-1], [1],
+    )  # fmt: skip
+    assert not law.disjoint
+    points = np.random.default_rng(0).uniform(-1, 1, (2000, 1))
+    nearest = np.abs(points - middles).argmin(axis=1)
+    assert np.array_equal(law.locate(points), nearest)
+
+
+def test_of_regions_that_tie_the_first_one_counts() -> None:
+    law = cart()
+    ends = np.append(law.starts, law.n_halfspaces)
+    rows = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in range(125) for _ in range(2)])
+    counts = np.repeat(np.diff(ends), 2)
+    twice = PiecewiseAffine(
+        np.repeat(law.gains, 2, axis=0), np.repeat(law.offsets, 2, axis=0), law.A[rows],
+        law.b[rows], np.append(0, np.cumsum(counts)[:-1]), law.u_min, law.u_max,
+        law.theta_min, law.theta_max,
+    )  # fmt: skip
+    points = in_box(law, 2000)
+    assert np.array_equal(twice.locate(points), 2 * law.locate(points))
+
+
+def test_an_input_stays_within_its_bounds_where_numbers_overflow() -> None:
+    law = PiecewiseAffine(
+        [[[1e10, -1e10]]], [[0.0]], [[1.0, 0.0]], [1.0], [0], [-1], [1], [-1, -1], [1, 1]
+    )
+    assert law([1e300, 1e300]).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        [0.5, 0.1],
+        (0.5, 0.1),
+        np.array([0.5, 0.0, 0.1])[::2],
+        np.array([0, 0]),
+    ],
+)
+def test_theta_may_come_in_any_array_or_list(given) -> None:
+    law = cart()
+    expected = law(np.ascontiguousarray(given, dtype=float))
+    frozen = np.array(given, dtype=float)
+    frozen.setflags(write=False)
+    assert np.array_equal(law(given), expected)
+    assert np.array_equal(law(frozen), expected)
+    assert np.array_equal(law(np.array([given, given], dtype=float))[1], expected)
+
+
+@pytest.mark.parametrize("given", [[np.nan, 0.0], [0.0, np.inf], [0.0], [0.0] * 3, 0.0])
+def test_theta_that_is_none_is_refused_also_where_compiled_code_sees_it_first(given) -> None:
+    with pytest.raises(ValueError, match="theta"):
+        cart()(np.array(given))
+
+
+@pytest.mark.slow
+def test_without_a_compiler_the_law_is_the_same() -> None:
+    program = (
+        "from test_walk import *; law = cart(); points = in_box(law, 200, 1.5)\n"
+        "print(law(points).tobytes().hex(), law(points[0]).tobytes().hex())"
+    )
+    here = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", program], env={**here, "NUMBA_DISABLE_JIT": off},
+            capture_output=True, text=True, check=True, cwd=Path(__file__).parent,
+        ).stdout
+        for off in "01"
+    ]  # fmt: skip
+    assert outputs[0] == outputs[1]
