@@ -46,7 +46,7 @@ LOG_SEEDS = range(70_000, 70_005)
 """Episodes of the MPC from which its model is identified again."""
 GUARD_SEEDS = range(1_000_000, 1_000_200)
 """Starts on which a rival may choose its best policy: as many as the guard's, and new ones."""
-CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200)
+CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200, 300, 400, 500)
 """Training episodes after which the policy is tested."""
 
 
@@ -224,6 +224,9 @@ LEARNERS: dict[str, Callable[..., Learner]] = {
     "DDPG": _yardstick(yardsticks.sb3_ddpg),
     "DDPG, best kept": _yardstick(yardsticks.best_of_ddpg, seeds=GUARD_SEEDS),
     "TD3": _yardstick(yardsticks.sb3_td3),
+    "SAC": _yardstick(yardsticks.sb3_sac),
+    "TQC": _yardstick(yardsticks.sb3_tqc),
+    "PPO": _yardstick(yardsticks.sb3_ppo),
     "residual RL": _yardstick(yardsticks.residual_rl),
     "residual RL, no noise": _yardstick(yardsticks.residual_rl, noise=0.0),
     "cloned MPC, then DDPG": _yardstick(yardsticks.cloned),

@@ -11,6 +11,10 @@ safely than with every deviation divided by the largest of its starts. Batches o
 than SB3's 256 and were no worse. Inputs are scaled by SB3. Where SB3 starts from random networks it
 also plays its first 100 actions at random, its default; a learner that starts from the MPC never
 does.
+
+SAC and TQC have the learning rate that rl_zoo3 publishes for Pendulum-v1, the nearest to these
+plants of what it has tuned. PPO has SB3's defaults with its VecNormalize: rl_zoo3's settings for
+that pendulum, with and without it, were worse here on a seed that no table shows.
 """
 
 from __future__ import annotations
@@ -23,12 +27,15 @@ from typing import Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium.wrappers import TransformObservation
+from gymnasium.wrappers import RescaleAction, TransformObservation
 from numpy.typing import ArrayLike, NDArray
-from stable_baselines3 import DDPG, TD3
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 from sb3_yann import LinearMPC
@@ -57,6 +64,8 @@ _SETTINGS: dict[str, Any] = {
     "device": "cpu",
 }
 
+_TUNED: dict[str, Any] = {"learning_rate": 1e-3}
+
 
 @dataclass(frozen=True)
 class Learner:
@@ -64,7 +73,7 @@ class Learner:
 
     Parameters
     ----------
-    model : DDPG or TD3
+    model : BaseAlgorithm
         It learns on a wrapped environment; use `policy` to ask it for actions.
     policy : Controller
         Acts on the observations of the plain environment, in its units, also while training.
@@ -72,7 +81,7 @@ class Learner:
         To be passed to ``model.learn``.
     """
 
-    model: TD3
+    model: BaseAlgorithm
     policy: Controller
     callbacks: list[BaseCallback] = field(default_factory=list)
 
@@ -85,7 +94,7 @@ class Controller:
     plain observations and the model's actions to plain actions.
     """
 
-    model: TD3 | BasePolicy
+    model: BaseAlgorithm | BasePolicy
     features: Law
     combine: Callable[[ArrayLike, Array], Array] | None = None
 
@@ -178,6 +187,35 @@ def sb3_td3(make_env: MakeEnv, seed: int) -> Learner:
     return _plain(TD3, make_env, seed)
 
 
+def sb3_sac(make_env: MakeEnv, seed: int) -> Learner:
+    """Return SB3's SAC (Haarnoja et al., ICML 2018), from random networks."""
+    return _plain(SAC, make_env, seed, noise=0.0, **_TUNED)
+
+
+def sb3_tqc(make_env: MakeEnv, seed: int) -> Learner:
+    """Return sb3-contrib's TQC (Kuznetsov et al., ICML 2020), from random networks."""
+    from sb3_contrib import TQC
+
+    return _plain(TQC, make_env, seed, noise=0.0, **_TUNED)
+
+
+def sb3_ppo(make_env: MakeEnv, seed: int) -> Learner:
+    """Return SB3's PPO (Schulman et al., arXiv:1707.06347, 2017), from random networks."""
+    env = make_env()
+    seen, features = _featured(env)
+    # What PPO draws is not scaled by SB3.
+    normalized = VecNormalize(DummyVecEnv([lambda: Monitor(RescaleAction(seen, -1, 1))]))
+    model = PPO("MlpPolicy", normalized, seed=seed, device="cpu")
+
+    def combine(_: ArrayLike, action: Array) -> Array:
+        half = (env.action_space.high - env.action_space.low) / 2
+        return np.asarray(env.action_space.low + half * (action + 1), dtype=np.float32)
+
+    return Learner(
+        model, Controller(model, lambda each: normalized.normalize_obs(features(each)), combine)
+    )
+
+
 def residual_rl(make_env: MakeEnv, seed: int, noise: float = NOISE) -> Learner:
     """Return residual reinforcement learning: the linear MPC plus what DDPG adds to it.
 
@@ -258,22 +296,28 @@ def lqr(problem: LinearMPC) -> Law:
 
 
 def _plain(
-    algorithm: type[TD3], make_env: MakeEnv, seed: int, noise: float = NOISE, **settings: Any
+    algorithm: Any, make_env: MakeEnv, seed: int, noise: float = NOISE, **settings: Any
 ) -> Learner:
     """Return the algorithm on ``make_env()``, seen through the features."""
     env = make_env()
-    features = _circle if isinstance(env.unwrapped, ClippedPendulumEnv) else np.asarray
-    shape = features(env.observation_space.low).shape
-    space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+    seen, features = _featured(env)
     zero = np.zeros(env.action_space.shape)
     model = algorithm(
         "MlpPolicy",
-        TransformObservation(env, features, space),
+        seen,
         action_noise=NormalActionNoise(zero, zero + noise) if noise > 0 else None,
         seed=seed,
         **{**_SETTINGS, **settings},
     )
     return Learner(model, Controller(model, features))
+
+
+def _featured(env: Env) -> tuple[Env, Law]:
+    """Return an env that shows its features, and what makes them of its observations."""
+    features = _circle if isinstance(env.unwrapped, ClippedPendulumEnv) else np.asarray
+    shape = features(env.observation_space.low).shape
+    space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+    return TransformObservation(env, features, space), features
 
 
 def _circle(observation: ArrayLike) -> Array:

@@ -1,4 +1,4 @@
-"""The critic of a policy that was improved in a twin, so that DDPG and TD3 can go on from there."""
+"""The critic of a policy that was improved in a twin, so that learning goes on from there."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ def _fit(
         rows = th.as_tensor(rng.integers(len(returns), size=BATCH), device=device)
         optimizer.zero_grad()
         loss = sum(
-            th.nn.functional.mse_loss(each / unit, wanted[rows] / unit)
+            th.mean(((each - wanted[rows]) / unit) ** 2)  # each quantile where it has several
             for each in critic.values(points[rows])
         )
         loss.backward()  # type: ignore[union-attr]
         optimizer.step()
-    critic.optimizer.zero_grad()
+    optimizer.zero_grad()

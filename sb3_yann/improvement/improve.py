@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import DDPG
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._validation import check_bool, check_int
@@ -70,7 +70,7 @@ class Improvement:
         The arguments.
     policy : str
         Fingerprint of the policy's weights when it ended.
-    model : DDPG or TD3, optional
+    model : BaseAlgorithm, optional
         With the policy; not in the model's zip.
     note : str
         What ended the search before a final check; empty where nothing did.
@@ -141,7 +141,7 @@ class Improvement:
 
 
 def improve(
-    model: OffPolicyAlgorithm | LinearMPC,
+    model: BaseAlgorithm | LinearMPC,
     twin: PlantTwin | Source | VecEnv,
     *,
     max_steps: int | None = None,
@@ -179,8 +179,9 @@ def improve(
 
     Parameters
     ----------
-    model : DDPG, TD3 or LinearMPC
-        With a :class:`YannPolicy` of the twin's problem. An MPC gets a DDPG model of its own, with
+    model : DDPG, TD3, SAC, TQC, PPO or LinearMPC
+        With a YANN policy of the twin's problem; the most likely actions of the last three are
+        improved, and their spread stays. An MPC gets a DDPG model of its own, with
         one network for all regions, which the result holds: ``result.model``,
         ``result.export("controller.c")``.
     twin : PlantTwin, gymnasium.Env, str, callable or VecEnv
@@ -230,8 +231,8 @@ def improve(
     ``improve(mpc, "CSTR-v0")`` does it with the simulator.
     """
     given = dict(locals())
-    if not isinstance(model, OffPolicyAlgorithm | LinearMPC):
-        raise TypeError(f"model = {model!r} must be a DDPG or TD3 model, or a LinearMPC.")
+    if not isinstance(model, BaseAlgorithm | LinearMPC):
+        raise TypeError(f"model = {model!r} must be a model with a YannPolicy, or a LinearMPC.")
     if not (isinstance(twin, PlantTwin | str | gym.Env | VecEnv) or callable(twin)):
         raise TypeError(
             f"twin = {twin!r} must be a PlantTwin; or a simulator: a single gymnasium.Env, its id, "

@@ -9,6 +9,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_yann.policy.actor_critic import YannCritic
 from sb3_yann.policy.sb3_hooks import single_precision
 from sb3_yann.policy.spread import Explores, TruncatedNormal
 
@@ -99,12 +100,17 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         self._register_counters()
         self._attach_hooks()
 
+    @property
+    def critic_target(self) -> YannCritic:  # type: ignore[override]
+        """The critic: there is no other."""
+        return self.critic
+
     def _attach_hooks(self) -> None:
         self.optimizer.register_step_pre_hook(self._before_step)
         self.optimizer.register_step_post_hook(self._after_step)
 
     def _before_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
-        self._refuses("actor", optimizer)
+        self.critic_updates.add_(not self._refuses("actor", optimizer))
         for group in optimizer.param_groups:
             group["scheduled_lr"] = group["lr"]
             group["lr"] = group["multiple"] * group["lr"]
@@ -115,7 +121,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         for group in optimizer.param_groups:
             group["lr"] = group.pop("scheduled_lr")
 
-    def get_distribution(self, obs: Any) -> TruncatedNormal:
+    def get_distribution(self, obs: Any) -> TruncatedNormal:  # type: ignore[override]
         """Return the distribution of actions in [-1, 1]."""
         actor: Any = self.actor
         distribution: TruncatedNormal = actor.distribution(obs)
@@ -132,7 +138,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         if not deterministic:
             self.says_that_it_explores()
         distribution = self.get_distribution(obs)
-        actions = distribution.get_actions(deterministic=deterministic)
+        actions = distribution.mode() if deterministic else distribution.sample()
         return actions, self.predict_values(obs), distribution.log_prob(actions)
 
     def evaluate_actions(
@@ -144,7 +150,8 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        return self.get_distribution(observation).get_actions(deterministic=deterministic)
+        distribution = self.get_distribution(observation)
+        return distribution.mode() if deterministic else distribution.sample()
 
 
 PPO.policy_aliases["YannPolicy"] = YannPPOPolicy

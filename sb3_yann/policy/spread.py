@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_yann._validation import check_bool, check_range
@@ -23,7 +22,7 @@ EDGE = 1e-12
 HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 
 
-class TruncatedNormal(Distribution):
+class TruncatedNormal:
     """Independent normal distributions, truncated to actions in [-1, 1].
 
     The most likely action is the center itself, at the bounds too, and the density is finite
@@ -45,7 +44,6 @@ class TruncatedNormal(Distribution):
     """
 
     def __init__(self, center: th.Tensor, log_std: th.Tensor) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
         self.center = center
         # Float64: the tails of float32 end at five standard deviations.
         self.m = center.double()
@@ -79,23 +77,6 @@ class TruncatedNormal(Distribution):
         each = HALF_LOG_TAU + 0.5 + self.std.log() + self.mass.log() + edges
         total: th.Tensor = each.sum(1).to(self.center.dtype)
         return total
-
-    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
-        """Return nothing: the law's layer gives the center."""
-        raise NotImplementedError
-
-    def proba_distribution(self, *args: Any, **kwargs: Any) -> TruncatedNormal:
-        """Return itself."""
-        return self
-
-    def actions_from_params(self, *args: Any, **kwargs: Any) -> th.Tensor:
-        """Return drawn actions."""
-        return self.sample()
-
-    def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
-        """Return drawn actions and the logarithm of their density."""
-        actions = self.sample()
-        return actions, self.log_prob(actions)
 
 
 class SpreadActor(YannActor):
@@ -132,7 +113,9 @@ class SpreadActor(YannActor):
 
     def action_log_prob(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return drawn actions (batch, m) and the logarithm of their density, (batch,)."""
-        return self.distribution(obs).log_prob_from_params()
+        distribution = self.distribution(obs)
+        actions = distribution.sample()
+        return actions, distribution.log_prob(actions)
 
 
 class Explores(StartsAsMPC):

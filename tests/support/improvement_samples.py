@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import LinearModel, LinearMPC, YannPolicy
+from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.improvement import critic, imitation, model
 from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann_envs import ProblemBox
@@ -113,7 +113,7 @@ class Counted(Spring):
 
 def model_of(make: Any = Spring, kind: Any = DDPG, **policy_kwargs: Any) -> Any:
     """Return an untrained model of a plant."""
-    return kind(YannPolicy, make(), device="cpu", seed=0, policy_kwargs=policy_kwargs)
+    return kind("YannPolicy", make(), device="cpu", seed=0, policy_kwargs=policy_kwargs)
 
 
 def bits(owner: Any) -> dict[str, bytes]:
