@@ -73,7 +73,7 @@ def main() -> None:
     runs["trained"] = evaluate(model, "CSTR-v0", STARTS)
     draw_law()
     draw_training(mpc, fresh, model)
-    save(plots.decisions_figure(model.guard_state.decisions), "decisions")
+    save(plots.plot_decisions(model.guard_state.decisions).figure, "decisions")
     save(plots.loops_figure(mpc, runs, quantities=["C_B", "T", 4]), "loops")
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, ParamSpec
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-P = ParamSpec("P")
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 """Okabe and Ito's, told apart with any color vision (*Color Universal Design*, 2008)."""
@@ -50,27 +47,3 @@ def legend_beside(axes: Axes, title: str | None = None) -> None:
         axes.legend(
             title=title, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0, frameon=False
         )
-
-
-def legend_above(axes: Axes, columns: int = 3) -> None:
-    """Put the legend above the data; none where nothing has a label."""
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(
-            loc="lower left",
-            bbox_to_anchor=(0, 1.01),
-            borderaxespad=0,
-            frameon=False,
-            ncols=columns,
-        )
-
-
-def as_figure(draw: Callable[P, Axes]) -> Callable[P, Figure]:
-    """Return a function that draws into a new figure and returns that."""
-
-    def figure(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        found: Figure = draw(*args, **kwargs).figure  # type: ignore[assignment]
-        return found
-
-    figure.__doc__ = f"Return a figure of :func:`{draw.__name__}`, with its arguments."
-    figure.__name__ = draw.__name__.removeprefix("plot_") + "_figure"
-    return figure

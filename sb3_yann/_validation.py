@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from functools import wraps
 from typing import Any, TypeVar
 from unicodedata import category
 
@@ -15,30 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Options = TypeVar("Options")
 Kind = TypeVar("Kind")
-Function = TypeVar("Function", bound=Callable[..., Any])
 LARGEST_BOUND = 1e100
 """Squares and sums of larger ones overflow."""
 
 
 class NonFiniteWarning(RuntimeWarning):
     """An observation, a reward, an action or a gradient is not a finite number."""
-
-
-def former_names(**names: str) -> Callable[[Function], Function]:
-    """Let a function take keywords by their former names (old=new), with a DeprecationWarning."""
-
-    def decorate(function: Function) -> Function:
-        @wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            for old in names.keys() & kwargs.keys():
-                new = names[old]
-                warnings.warn(f"{old}= is called {new}= now.", DeprecationWarning, stacklevel=2)
-                kwargs.setdefault(new, kwargs.pop(old))
-            return function(*args, **kwargs)
-
-        return call  # type: ignore[return-value]
-
-    return decorate
 
 
 def check_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
@@ -248,11 +228,10 @@ def check_options(name: str, value: Any, kind: type[Options]) -> Options:
     if isinstance(value, kind):
         return value
     known = [each.name for each in fields(kind)]  # type: ignore[arg-type]
-    former = getattr(kind, "former", {})
     if not isinstance(value, Mapping):
         wanted = f"of the class {kind.__name__}: {name}={kind.__name__}(...), or a mapping"
         raise TypeError(f"{name} = {_short(value)} must be {wanted}.")
-    if unknown := [each for each in value if each not in known and each not in former]:
+    if unknown := [each for each in value if each not in known]:
         unknown_names = ", ".join(map(repr, unknown))
         raise TypeError(f"{name} has no {unknown_names}. Its options are {', '.join(known)}.")
     return kind(**value)

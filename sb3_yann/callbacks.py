@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import check_int, check_type
 from sb3_yann.policy.observations import require_frozen, require_same_statistics
 from sb3_yann.policy.policies import StartsAsMPC, require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.policy.spread import Explores
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    pass
 
 
 class NoActionNoise(BaseCallback):
@@ -85,41 +81,14 @@ class ControlDiagnostics(BaseCallback):
       that of ``|G|``. G is the discounted return that followed; where the episode was cut off, the
       critic's value of its last state is added.
 
-    Parameters
-    ----------
-    figures : mapping of str to callable, optional
-        Pictures for tensorboard, by name: functions without arguments that return Axes or a Figure,
-        such as ``guard.plot``. They are drawn every ``figure_freq`` steps and when `learn` ends.
-    figure_freq : int, default 10_000
-        Steps between two pictures.
-
     Examples
     --------
     >>> from stable_baselines3 import DDPG
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> pictures = {"law/regions": model.policy.problem.explicit().plot}
-    >>> _ = model.learn(10, callback=[NoActionNoise(), ControlDiagnostics(pictures)])
+    >>> _ = model.learn(10, callback=[NoActionNoise(), ControlDiagnostics()])
     """
 
     model: OffPolicyAlgorithm
-
-    def __init__(
-        self,
-        figures: Mapping[str, Callable[[], Axes | Figure]] | None = None,
-        figure_freq: int = 10_000,
-    ) -> None:
-        super().__init__()
-        wanted = "a mapping of names to functions that draw, such as {'guard': guard.plot}"
-        self.figures = dict(
-            check_type("figures", {} if figures is None else figures, Mapping, wanted)
-        )
-        for name, draw in self.figures.items():
-            if not callable(draw):
-                raise TypeError(
-                    f"figures[{name!r}] = {draw!r} must be a function that draws, such as "
-                    "guard.plot, without parentheses."
-                )
-        self.figure_freq = check_int("figure_freq", figure_freq)
 
     def _init_callback(self) -> None:
         self.policy = require_yann_policy(self.model.policy, "ControlDiagnostics")
@@ -129,25 +98,7 @@ class ControlDiagnostics(BaseCallback):
         n_envs = self.training_env.num_envs
         self._episodes: list[list[tuple[Any, ...]]] = [[] for _ in range(n_envs)]
 
-    def _on_training_start(self) -> None:
-        self._last_figures = self.num_timesteps
-
-    def _on_training_end(self) -> None:
-        self._draw()
-
-    def _draw(self) -> None:
-        self._last_figures = self.num_timesteps
-        for name, draw in self.figures.items():
-            drawn: Any = draw()
-            figure = getattr(drawn, "figure", None) or drawn  # of Axes, else itself
-            picture = LoggedFigure(figure, close=False)
-            self.logger.record(name, picture, exclude=("stdout", "log", "json", "csv"))
-        if self.figures:
-            self.logger.dump(self.num_timesteps)
-
     def _on_step(self) -> bool:
-        if self.num_timesteps - self._last_figures >= self.figure_freq:
-            self._draw()
         if "yann/violations" not in self.logger.name_to_value and self._recorded:
             self._forget()  # the logger was dumped
         observations = np.asarray(self.model._last_obs)  # still s_t: SB3 advances it later

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from sb3_yann._validation import Array, check_bool, check_range, former_names
+from sb3_yann._validation import Array, check_bool, check_range
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames
 
 UNSAFE = (
@@ -92,11 +92,6 @@ class AcceptanceRule:
     least_gain: float = 0.001
     max_input_step: float | None = None
     excess_room: float = EXCESS_ROOM
-    former: ClassVar[dict[str, str]] = {
-        "tail": "cvar_alpha",
-        "retreat": "backtrack",
-        "largest_step": "max_input_step",
-    }
 
     def __post_init__(self) -> None:
         check_range("margin", self.margin, 0, np.inf)
@@ -123,9 +118,6 @@ class AcceptanceRule:
     def standard_errors(self) -> float:
         """How many standard errors a mean cost must be below the MPC's in the final trial."""
         return float(special.ndtri(1 - self.significance)) if self.cvar_alpha else 0.0
-
-
-AcceptanceRule.__init__ = former_names(**AcceptanceRule.former)(AcceptanceRule.__init__)  # type: ignore[method-assign]
 
 
 class Verdict(NamedTuple):

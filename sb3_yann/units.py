@@ -6,7 +6,6 @@ is in its own coordinates. Deviations are what laws, observers and networks comp
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -179,14 +178,3 @@ def same_bounds(
     either = np.isfinite(found) & np.isfinite(bounds)
     apart = np.abs(np.where(either, found, 0) - np.where(either, bounds, 0))
     return bool(np.all(np.where(either, apart <= room, found == bounds)))
-
-
-def warn_of_absolute(absolute: bool | None) -> None:
-    """Warn where ``absolute=`` is given, which says nothing any more."""
-    if absolute is not None:
-        warnings.warn(
-            "absolute= does nothing: a problem whose model has an operating point is in plant "
-            "units, one whose model has none is in its own. Leave it out.",
-            DeprecationWarning,
-            stacklevel=3,
-        )

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_yann import AcceptanceRule, ImprovementGuard
 from sb3_yann._validation import (
     check_bool,
     check_choice,
@@ -84,14 +83,3 @@ def test_a_tensor_with_a_gradient_is_refused_with_the_word_detach(as_list: bool)
 def test_a_whole_number_that_no_float_holds_is_named(check: Any, digits: int) -> None:
     with pytest.raises((TypeError, ValueError), match=r"^x = .* (must be|is not) "):
         check("x", 10**digits)
-
-
-def test_former_names_of_the_guard_and_its_rule_still_work_and_say_the_new_ones() -> None:
-    with pytest.warns(DeprecationWarning, match="n_starts= is called n_eval_episodes= now"):
-        guard = ImprovementGuard("CSTR-v0", n_starts=7)
-    assert len(guard.settings.seeds) == 7
-    with pytest.warns(DeprecationWarning, match="tail= is called cvar_alpha= now"):
-        guard = ImprovementGuard("CSTR-v0", rule={"tail": 0})
-    assert guard.settings.rule == AcceptanceRule(cvar_alpha=0)
-    with pytest.warns(DeprecationWarning, match="largest_step= is called max_input_step= now"):
-        assert AcceptanceRule(largest_step=2).max_input_step == 2

@@ -9,23 +9,17 @@ from stable_baselines3 import DDPG
 from policy_samples import scalar_mpc
 from sample_plants import LinearPlant
 from sb3_yann import (
-    ControlDiagnostics,
-    DisturbanceObserver,
     ImprovementGuard,
-    LinearModel,
     NoActionNoise,
     SimulatedEpisodes,
     export,
     restore_accepted,
 )
 from sb3_yann.evaluation import comparison_table, evaluate, summary_table
-from sb3_yann.evaluation.plots import plot_loop
+from sb3_yann.evaluation.plots import loops_figure
 from sb3_yann.wrappers import (
-    MeasuredDisturbance,
-    ObserveDisturbance,
     PastInputs,
     PreviousInput,
-    SetPoint,
     StageCost,
 )
 
@@ -39,12 +33,8 @@ def played(*seeds: int):
     return evaluate(lambda _: [0.0], "CSTR-v0", seeds)
 
 
-def observer() -> DisturbanceObserver:
-    return DisturbanceObserver(LinearModel([[0.5]], [[1.0]], 1, E=[[1.0]]))
-
-
 def drawn(runs):
-    return plot_loop(scalar_mpc(), runs, 0)
+    return loops_figure(scalar_mpc(), runs)
 
 
 ENV = r"env = None must be a gymnasium\.Env: gymnasium\.make\(id\)"
@@ -53,18 +43,10 @@ WRONG_KINDS = {
     "StageCost without a problem": (lambda: StageCost(plant(), None), "problem = None must be a L"),
     "StageCost without an env": (lambda: StageCost(None, scalar_mpc()), ENV),
     "PreviousInput without an env": (lambda: PreviousInput(None), ENV),
-    "PastInputs without an env": (lambda: PastInputs(None, [2]), ENV),
-    "SetPoint without an env": (lambda: SetPoint(None, 0, 1), ENV),
-    "MeasuredDisturbance without an env": (lambda: MeasuredDisturbance(None, 0, 1), ENV),
-    "ObserveDisturbance without an env": (lambda: ObserveDisturbance(None, observer(), 0, 1), ENV),
     "PastInputs without delays": (lambda: PastInputs(plant(), None), "delays = None must be a li"),
     "PreviousInput from a word": (
         lambda: PreviousInput(plant(), initial="none"),
         "initial = 'none' is not an array of real numbers",
-    ),
-    "figures that are none": (
-        lambda: ControlDiagnostics(3),
-        "figures = 3 must be a mapping of names",
     ),
     "restoring no model": (lambda: restore_accepted(None), "model = None must be a DDPG or TD3"),
     "a simulator that is none": (lambda: SimulatedEpisodes(None), "env = None must be the id of"),

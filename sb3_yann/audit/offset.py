@@ -87,7 +87,7 @@ def remaining_offset(
     problem: LinearMPC,
     runs: Sequence[Array],
     observed: Sequence[Array] | None,
-    dearer: float = 0.0,
+    cost_increase: float = 0.0,
 ) -> str:
     """Return in words the offset that an MPC leaves though an observer gains nothing, and why.
 
@@ -97,7 +97,7 @@ def remaining_offset(
         Whose stage cost says so.
     runs, observed : sequence of ndarray, shapes (T + 1, n_theta)
         Episodes of the MPC, and of the MPC with an observer; None where that was not tried.
-    dearer : float, default 0
+    cost_increase : float, default 0
         By how much the latter cost more, relative to the former.
     """
     found = rests_beside(problem, *_joined(runs))
@@ -120,8 +120,9 @@ def remaining_offset(
             f"{said}An observer leaves {left:.3g}: look whether an input is at its bound, and "
             f"whether the {wanted} can be held, mpc.is_reachable(r)."
         )
-    if dearer > WORSE:
-        return f"{said}An observer removes that, but costs {100 * dearer:.3g} % more: leave it out."
+    if cost_increase > WORSE:
+        more = f"costs {100 * cost_increase:.3g} % more"
+        return f"{said}An observer removes that, but {more}: leave it out."
     return (
         f"{said}An observer removes that, and gains next to nothing by the MPC's stage cost: R "
         f"punishes an input away from where the model has it at the {wanted}. If the offset "

@@ -19,7 +19,6 @@ from sb3_yann.deployment.describe import Exportable, describe
 from sb3_yann.deployment.fmu import fmu_file
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
-from sb3_yann.units import warn_of_absolute
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,6 @@ def export(
     format: str | None = None,
     name: str | None = None,
     precision: str = "double",
-    absolute: bool | None = None,
     checks: Checks | None = None,
     observer: str = "none",
 ) -> Exported:
@@ -94,8 +92,6 @@ def export(
         Prefix of all names in code; the file's by default.
     precision : {"double", "float"}, default "double"
         Of the numbers in code and graphs.
-    absolute : bool, optional
-        Does nothing, and is deprecated: the model's operating point tells.
     checks : Checks, optional
         Limits of the readings and how to fall back. By default only what is not finite is a fault,
         and late steps where the time is told.
@@ -120,7 +116,6 @@ def export(
     >>> [path.name for path in written.paths]
     ['reactor.c', 'reactor.h', 'reactor_selftest.c']
     """
-    warn_of_absolute(absolute)
     target = Path(path)
     kind = format or target.suffix.lstrip(".")
     check_choice("format", kind, ("npz", "c", "onnx", "st", "xml", "fmu"))

@@ -1,69 +1,365 @@
-"""Pictures of closed loops, decisions, headroom and twins; those of laws are imported.
+"""Pictures of laws, policies, closed loops, decisions, headroom and twins.
 
-Each takes matplotlib's Axes, or makes a new figure, and returns the Axes; a ``..._figure`` returns
-the figure.
+A ``plot_...`` takes matplotlib's Axes, or makes a new figure, and returns the Axes; a
+``..._figure`` has several panels and returns the figure.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._drawing import (
-    COLORS,
-    LIMIT,
-    SET_POINT,
-    as_figure,
-    axes_or_new,
-    legend_above,
-    legend_beside,
-    new_figure,
-)
-from sb3_yann._validation import Array, check_type, to_float
-from sb3_yann.control import LinearMPC
-from sb3_yann.control.model.labels import with_units
-from sb3_yann.evaluation.law_plots import (
-    Quantity,
-    RegionUse,
-    entry_of,
-    plot_changes,
-    plot_regions,
-    plot_surface,
-    plot_visits,
-    regions_figure,
-    surfaces_figure,
-    use_figure,
-)
+from sb3_yann._drawing import COLORS, LIMIT, SET_POINT, axes_or_new, legend_beside, new_figure
+from sb3_yann._validation import Array, check_array, check_choice, check_type
+from sb3_yann.control import LinearMPC, PiecewiseAffine
+from sb3_yann.control.explicit.solve import ProgramUnits
+from sb3_yann.control.law_plot import plot_law
+from sb3_yann.control.model.labels import labels_of, with_units
+from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.rollout import Trajectories, as_played
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "RegionUse",
-    "decisions_figure",
-    "headroom_figure",
-    "loops_figure",
-    "plot_changes",
-    "plot_costs",
-    "plot_decisions",
-    "plot_free_runs",
-    "plot_headroom",
-    "plot_loop",
-    "plot_regions",
-    "plot_surface",
-    "plot_visits",
-    "regions_figure",
-    "surfaces_figure",
-    "twin_figure",
-    "use_figure",
-]
 Runs = Mapping[str, Trajectories]
+Quantity = int | str
+Frame = tuple[ArrayLike, ArrayLike]
 MAX_LINES = 6  # so many episodes are drawn one by one; of more, the median and bands
+MAX_REGIONS = 30  # in a picture of visits: those visited most
+
+
+def _entry_of(problem: LinearMPC, quantity: Quantity, inputs: bool = False) -> int:
+    """Return the entry of theta that a name or an index stands for; ValueError for none.
+
+    With ``inputs`` it is an entry of ``[theta, u]``.
+    """
+    names = [*problem.labels(), *(labels_of(problem.model)[1] if inputs else ())]
+    if isinstance(quantity, str) and quantity in names:
+        return names.index(quantity)
+    if isinstance(quantity, int | np.integer) and 0 <= quantity < len(names):
+        return int(quantity)
+    raise ValueError(f"{quantity!r} is no entry: expected one of {names}, or its index.")
+
+
+def inputs_of(problem: LinearMPC, policy: Any, theta: Array) -> Array:
+    """Return the inputs (batch, m), in deviations, at theta (batch, n_theta), in deviations.
+
+    ``policy`` is a law, which takes theta, or a model or YannPolicy, whose actor's layer does.
+    """
+    actor = getattr(getattr(policy, "policy", policy), "actor", None)
+    if actor is None:
+        return np.asarray(policy(theta), np.float64).reshape(len(theta), -1)
+    import torch as th
+
+    device, bounds = next(actor.mu.buffers()).device, problem.deviations
+    with th.no_grad():
+        scaled = actor.mu(th.as_tensor(theta, device=device)).double().cpu().numpy()
+    return np.asarray((bounds.u_max + bounds.u_min) / 2 + problem.u_half * scaled)
+
+
+# ---- Regions ----
+
+
+class ActiveConstraints:
+    """Names the constraints that are active in the optimal plan at a theta."""
+
+    def __init__(self, problem: LinearMPC) -> None:
+        program, self.names = condense(problem)
+        self.units = ProgramUnits(program, problem.deviations.u_min, problem.deviations.u_max)
+
+    def at(self, theta: Array) -> list[str] | None:
+        """Return the active constraints at theta (n_theta,), None where no plan is feasible."""
+        scaled, z = self.units.scaled, (theta - self.units.center) / self.units.half
+        U = scaled.solve(z)
+        if U is None:
+            return None
+        slack = scaled.w + scaled.S @ z - scaled.G @ U  # of unit rows, in half-widths
+        return [*dict.fromkeys(self.names[i] for i in np.flatnonzero(slack < 1e-7))]
+
+    def __call__(self, region: int, theta: Array) -> str:
+        """Return them as one text."""
+        return ", ".join(self.at(theta) or ()) or "no constraint acts"
+
+
+def plot_regions(
+    problem: LinearMPC,
+    axes: Axes | None = None,
+    *,
+    entries: Sequence[Quantity] = (0, 1),
+    at: ArrayLike | None = None,
+    by: str = "law",
+) -> Axes:
+    """Draw the regions of the explicit law in the plane of two entries of theta.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        The one that has the law.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure's by default.
+    entries : pair of int or str, default (0, 1)
+        The coordinates to the right and up: indices, or names as in ``problem.labels()``.
+    at : array_like, shape (n_theta,), optional
+        The other entries, in plant units; the operating point by default.
+    by : {"law", "constraint"}, default "law"
+        What a color stands for: which inputs are constant in the region, or which constraints are
+        active in its optimal plan.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> axes = plot_regions(problems.cstr(), entries=("C_B", "T"), by="constraint")
+    >>> axes.get_xlabel()
+    'C_B (mol/L)'
+    """
+    check_choice("by", by, ("law", "constraint"))
+    chosen = [_entry_of(problem, each) for each in entries]
+    name = ActiveConstraints(problem) if by == "constraint" else None
+    labels = problem.labels(units=True)
+    return plot_law(problem.explicit(), axes, entries=chosen, at=at, labels=labels, name=name)
+
+
+# ---- Surfaces ----
+
+
+class _Surface:
+    """An input over a grid of two entries of theta, in plant units, to be drawn.
+
+    Parameters are those of :func:`plot_surface`.
+    """
+
+    def __init__(
+        self,
+        problem: LinearMPC,
+        entries: Sequence[Quantity],
+        at: ArrayLike | None,
+        output: int,
+        frame: Frame | None,
+    ) -> None:
+        chosen = [_entry_of(problem, each) for each in entries]
+        if len(chosen) != 2 or chosen[0] == chosen[1]:
+            raise ValueError(f"entries = {[*entries]} must be two different entries of theta.")
+        if not 0 <= output < problem.model.n_inputs:
+            raise ValueError(
+                f"output = {output} must be an input, from 0 to {problem.model.n_inputs - 1}."
+            )
+        low, high = problem.theta_min[chosen], problem.theta_max[chosen]
+        if frame is not None:
+            low, high = (check_array("frame", each, (2,)) for each in frame)
+        if not np.all(np.isfinite([low, high])) or np.any(low >= high):
+            names = [problem.labels()[i] for i in chosen]
+            raise ValueError(
+                f"There is no frame to draw {names} in: the box goes from {low.tolist()} to "
+                f"{high.tolist()}. Pass frame=(lower left, upper right)."
+            )
+        fixed = problem.theta_ss if at is None else check_array("at", at, (problem.n_theta,))
+        law = problem.law()
+        points = 121 if isinstance(law, PiecewiseAffine) else 41  # a program for each of them
+        self.grid = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+        shown = np.tile(fixed, (points**2, 1))
+        shown[:, chosen] = np.stack(np.meshgrid(*self.grid), axis=-1).reshape(-1, 2)
+        self.theta = problem.units.to_deviations(shown)
+        self.inside = law.in_domain(self.theta).astype(float).reshape(points, points)
+        self.labels = [problem.labels(units=True)[i] for i in chosen]
+        self.problem, self.output = problem, output
+        self.name = with_units(problem.model)[1][output]
+
+    def values(self, policy: Any) -> Array:
+        """Return the input of a policy on the grid."""
+        u = self.problem.units.input_to_plant(inputs_of(self.problem, policy, self.theta))
+        return np.reshape(u[:, self.output], self.inside.shape)
+
+    def draw(self, axes: Axes, u: Array, scale: tuple[float, float]) -> Any:
+        """Draw values in colors of a scale, and the border of where the MPC has a solution."""
+        low, high = scale
+        mesh = axes.pcolormesh(*self.grid, u, cmap="cividis", vmin=low, vmax=high, rasterized=True)
+        if not self.inside.all():
+            axes.contour(*self.grid, self.inside, levels=[0.5], colors="black", linewidths=1.0)
+        axes.set(xlabel=self.labels[0], ylabel=self.labels[1])
+        return mesh
+
+    def draw_change(self, axes: Axes, change: Array) -> None:
+        """Draw a difference in colors that are symmetric about zero; rounding is pale."""
+        rounding = 1e-4 * float(self.problem.u_half[self.output])
+        size = max(float(np.abs(change).max()), rounding)
+        mesh = self.draw(axes, change, (-size, size))
+        mesh.set_cmap("PuOr")
+        axes.figure.colorbar(mesh, ax=axes, label=f"change of {self.name}")
+
+
+def plot_surface(
+    problem: LinearMPC,
+    policy: Any,
+    axes: Axes | None = None,
+    *,
+    entries: Sequence[Quantity] = (0, 1),
+    at: ArrayLike | None = None,
+    output: int = 0,
+    frame: Frame | None = None,
+) -> Axes:
+    """Draw an input, in plant units, over two entries of theta.
+
+    A line surrounds where the MPC has a solution, if that is not everywhere.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        With the box of theta, names and units.
+    policy : callable, model or YannPolicy
+        A law takes theta (batch, n_theta) in deviations.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure's by default.
+    entries : pair of int or str, default (0, 1)
+        The coordinates to the right and up: indices, or names as in ``problem.labels()``.
+    at : array_like, shape (n_theta,), optional
+        The other entries, in plant units; the operating point by default.
+    output : int, default 0
+        Which input.
+    frame : pair of array_like, shape (2,), optional
+        The lower left and the upper right corner, in plant units; by default the box of theta.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> mpc = problems.clipped_pendulum()
+    >>> axes = plot_surface(mpc, mpc.explicit())
+    >>> float(abs(axes.collections[0].get_array()).max())
+    2.0
+    """
+    surface = _Surface(problem, entries, at, output, frame)
+    u, axes = surface.values(policy), axes_or_new(axes, 5.4, 4.2)
+    mesh = surface.draw(axes, u, (u.min(), u.max()))
+    axes.figure.colorbar(mesh, ax=axes, label=surface.name)
+    return axes
+
+
+def surfaces_figure(
+    problem: LinearMPC,
+    before: Any,
+    after: Any,
+    *,
+    entries: Sequence[Quantity] = (0, 1),
+    at: ArrayLike | None = None,
+    output: int = 0,
+    frame: Frame | None = None,
+) -> Figure:
+    """Return a figure of the control surface before, after, and of their difference.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        With the box of theta, names and units.
+    before, after : callable, model or YannPolicy
+        As of :func:`plot_surface`; the first two panels share their colors.
+    entries, at, output, frame
+        As there.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> mpc = problems.clipped_pendulum()
+    >>> figure = surfaces_figure(mpc, mpc.explicit(), lambda theta: 0 * theta[:, :1])
+    >>> [panel.get_title() for panel in figure.axes[:3]]
+    ['before', 'after', 'after - before']
+    """
+    figure = new_figure(10.2, 3.2)
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    surface = _Surface(problem, entries, at, output, frame)
+    first, second = surface.values(before), surface.values(after)
+    scale = min(first.min(), second.min()), max(first.max(), second.max())
+    surface.draw(panels[0], first, scale)
+    mesh = surface.draw(panels[1], second, scale)
+    figure.colorbar(mesh, ax=[*panels[:2]], label=surface.name)
+    surface.draw_change(panels[2], second - first)
+    for panel, title in zip(panels, ("before", "after", "after - before"), strict=True):
+        panel.set_title(title)
+        panel.label_outer()
+    return figure
+
+
+# ---- Which regions are used ----
+
+
+class RegionUse(NamedTuple):
+    """The regions (k,) that episodes visit, those visited most first.
+
+    ``share`` is that of all steps; ``mean`` and ``largest`` are distances of the policy's input
+    from the MPC's, in half-widths of the input range, of the input that is farthest.
+    """
+
+    regions: NDArray[np.int64]
+    share: Array
+    mean: Array
+    largest: Array
+
+
+def region_use(problem: LinearMPC, policy: Any, episodes: Trajectories) -> RegionUse:
+    """Return which regions a law, model or policy uses; observations are theta."""
+    law = problem.explicit()
+    theta = np.concatenate([each[:-1] for each in episodes.observations])
+    theta = problem.units.to_deviations(theta[np.isfinite(theta).all(axis=1)])
+    apart = np.abs(inputs_of(problem, policy, theta) - law(theta)) / problem.u_half
+    distance, region = apart.max(axis=1), law.locate(theta)
+    found, where, visits = np.unique(region, return_inverse=True, return_counts=True)
+    largest = np.zeros(len(found))
+    np.maximum.at(largest, where, distance)
+    mean = np.bincount(where, weights=distance) / visits
+    order = np.argsort(-visits, kind="stable")
+    return RegionUse(found[order], visits[order] / len(theta), mean[order], largest[order])
+
+
+def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figure:
+    """Return a figure of the share of steps in each region, and of the distance from the MPC there.
+
+    Regions are those visited most. The distance is the mean and the largest one, of the input that
+    is farthest.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        With an explicit law.
+    policy : callable, model or YannPolicy
+        As of :func:`plot_surface`.
+    episodes : Trajectories
+        Their observations are theta, in plant units.
+
+    Examples
+    --------
+    >>> from sb3_yann.evaluation import evaluate
+    >>> from sb3_yann_envs import problems
+    >>> mpc = problems.cstr()
+    >>> played = evaluate(mpc.explicit(), "CSTR-v0", [0])
+    >>> len(use_figure(mpc, mpc.explicit(), played).axes)
+    2
+    """
+    use = region_use(problem, policy, episodes)
+    share, mean, largest = (100 * each[:MAX_REGIONS] for each in (use.share, use.mean, use.largest))
+    figure = new_figure(6.8, 4.8)
+    above, below = figure.subplots(2, 1, sharex=True)
+    places = range(len(share))
+    above.bar(places, share, color=COLORS[5])
+    above.set(ylabel="steps there (%)")
+    below.bar(places, mean, color=COLORS[0], label="mean")
+    below.plot(places, largest, "v", color=COLORS[1], markersize=5, label="largest")
+    below.set(ylabel="distance from the MPC\n(% of half the range)")
+    below.set_ylim(0, max(below.get_ylim()[1], 0.01))  # rounding is not drawn large
+    below.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
+    below.set_xticks(places, [str(each) for each in use.regions[:MAX_REGIONS]])
+    below.tick_params(axis="x", rotation=90 if len(places) > 15 else 0)
+    left_out = len(use.regions) - len(places)
+    more = f" ({left_out} more, visited less, are left out)" if left_out else ""
+    below.set_xlabel(f"region{more}")
+    for panel in (above, below):
+        panel.grid(axis="y", alpha=0.3)
+        panel.set_axisbelow(True)
+    return figure
+
+
+# ---- Closed loops ----
 
 
 def _check_runs(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
@@ -83,63 +379,17 @@ def _check_runs(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
     return found
 
 
-# ---- Closed loops ----
-
-
-def plot_loop(
-    problem: LinearMPC,
-    runs: Runs,
-    quantity: Quantity,
-    axes: Axes | None = None,
-) -> Axes:
-    """Draw one quantity over time, in plant units, with its limits and its set-point.
-
-    Up to six episodes are lines. Of more, a line is their median, a dark band holds 80 % of them,
-    and a light one all; of several controllers dashed lines are the edges of the dark one. Where
-    some episodes have ended, the others count.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        With the operating point, limits, names and units.
-    runs : mapping of str to Trajectories
-        By controller; their observations are theta, their actions inputs.
-    quantity : int or str
-        An entry of ``[theta, u]``: its index, or a name as in ``problem.labels()``, or an input's.
-    axes : matplotlib Axes, optional
-        Where to draw; a new figure's by default.
-
-    Raises
-    ------
-    ValueError
-        If there are no episodes, or these are not of the problem's theta and inputs.
-
-    Examples
-    --------
-    >>> from sb3_yann.evaluation import evaluate
-    >>> from sb3_yann_envs import problems
-    >>> mpc = problems.cstr()
-    >>> axes = plot_loop(mpc, {"MPC": evaluate(mpc.explicit(), "CSTR-v0", range(2))}, "U")
-    >>> axes.get_ylabel()
-    'U (kJ/(h m² K))'
-    """
-    entry = entry_of(problem, quantity, inputs=True)
-    runs = _check_runs(problem, runs)
-    axes = axes_or_new(axes, 6.4, 3.0)
-    _draw_loops([axes], problem, [runs], entry)
-    legend_above(axes, columns=1 if len(runs) > 2 else 2)
-    return axes
-
-
 def loops_figure(
     problem: LinearMPC,
     runs: Runs,
     *,
     quantities: Sequence[Quantity] | None = None,
 ) -> Figure:
-    """Return a figure of several quantities.
+    """Return a figure of quantities over time, in plant units, with limits and set-points.
 
-    Controllers share a panel; of more than six episodes each has its own, one below the other.
+    Up to six episodes are lines, and controllers share a panel. Of more, each controller has its
+    own, one below the other: a line is the median, a dark band holds 80 % of the episodes, and a
+    light one all. Where some episodes have ended, the others count.
 
     Parameters
     ----------
@@ -148,7 +398,13 @@ def loops_figure(
     runs : mapping of str to Trajectories
         By controller, the first one uppermost; their observations are theta.
     quantities : sequence of int or str, optional
-        As of :func:`plot_loop`; all states and inputs by default.
+        Entries of ``[theta, u]``: indices, or names as in ``problem.labels()``, or an input's; all
+        states and inputs by default.
+
+    Raises
+    ------
+    ValueError
+        If there are no episodes, or these are not of the problem's theta and inputs.
 
     Examples
     --------
@@ -163,7 +419,7 @@ def loops_figure(
     if quantities is None:
         n = problem.n_theta
         quantities = [*range(problem.model.n_states), *range(n, n + problem.model.n_inputs)]
-    entries = [entry_of(problem, each, inputs=True) for each in quantities]
+    entries = [_entry_of(problem, each, inputs=True) for each in quantities]
     many = max(len(each.costs) for each in runs.values()) > MAX_LINES
     groups: list[Runs] = [{name: runs[name]} for name in runs] if many else [runs]
     columns = min(3, len(entries))
@@ -215,7 +471,7 @@ def _draw_loops(
                 "drawstyle": "steps-post" if entry >= n else "default",
             }
             rows = _rows(episodes, entry, n)
-            _draw_rows(panel, rows, problem.model.dt, style, name, len(group) == 1)
+            _draw_rows(panel, rows, problem.model.dt, style, name)
             number += 1
         if reference != entry:  # the last set-point belongs to a step that is not taken
             rows = np.unique(_rows(next(iter(group.values())), reference, n)[:, :-1], axis=0)
@@ -244,10 +500,8 @@ def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:
     return found
 
 
-def _draw_rows(
-    axes: Axes, rows: Array, dt: float, style: dict[str, Any], name: str, alone: bool
-) -> None:
-    """Draw lines of a few episodes; of many the median, and bands, or their edges beside others."""
+def _draw_rows(axes: Axes, rows: Array, dt: float, style: dict[str, Any], name: str) -> None:
+    """Draw lines of a few episodes; of many the median, and bands."""
     time = dt * np.arange(rows.shape[1])
     if len(rows) <= MAX_LINES:
         for k, row in enumerate(rows):
@@ -255,16 +509,12 @@ def _draw_rows(
             axes.plot(time, row, linewidth=1.1, alpha=0.85, label=label, **style)
         return
     low, dark, middle, light, high = np.nanpercentile(rows, [0, 10, 50, 90, 100], axis=0)
-    if alone:
-        step = "post" if style["drawstyle"] == "steps-post" else None
-        band: dict[str, Any] = {"color": style["color"], "linewidth": 0, "step": step}
-        axes.fill_between(time, low, high, alpha=0.18, **band)
-        axes.fill_between(time, dark, light, alpha=0.35, **band)
-    else:
-        for edge in (dark, light):
-            axes.plot(time, edge, linewidth=0.9, linestyle="--", **style)
-    what = "dark: 80 %, light: all" if alone else "dashed: 80 %"
-    axes.plot(time, middle, linewidth=1.7, label=f"{name}, median of {len(rows)} ({what})", **style)
+    step = "post" if style["drawstyle"] == "steps-post" else None
+    band: dict[str, Any] = {"color": style["color"], "linewidth": 0, "step": step}
+    axes.fill_between(time, low, high, alpha=0.18, **band)
+    axes.fill_between(time, dark, light, alpha=0.35, **band)
+    label = f"{name}, median of {len(rows)} (dark: 80 %, light: all)"
+    axes.plot(time, middle, linewidth=1.7, label=label, **style)
 
 
 def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: float) -> None:
@@ -297,9 +547,7 @@ def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: f
 # ---- Decisions of a guard ----
 
 
-def plot_decisions(
-    decisions: Sequence[Any], axes: Axes | None = None, *, training_costs: ArrayLike | None = None
-) -> Axes:
+def plot_decisions(decisions: Sequence[Any], axes: Axes | None = None) -> Axes:
     """Draw each candidate's mean cost by the verdict on it, the accepted policy's and the MPC's.
 
     A candidate far beyond the accepted policies, or without a cost, is drawn at the edge.
@@ -310,8 +558,6 @@ def plot_decisions(
         As in ``guard.decisions``; of none a note says so.
     axes : matplotlib Axes, optional
         Where to draw; a new figure's by default.
-    training_costs : array_like, shape (episodes,), optional
-        Costs of the training episodes themselves, drawn behind.
 
     Examples
     --------
@@ -332,9 +578,6 @@ def plot_decisions(
         for name in ("candidate_cost", "accepted_cost", "mpc_cost")
     )
     bottom, top = _range_of_costs(costs, accepted, mpc)
-    if training_costs is not None:
-        played = to_float("training_costs", training_costs)
-        axes.plot(1 + np.arange(len(played)), played, ".", color="0.7", label="training episode")
     axes.step(episodes, accepted, where="post", color=COLORS[0], label="accepted policy")
     axes.plot(episodes, mpc, color="black", linestyle="--", linewidth=1.2, label="MPC")
     kinds = np.array(
@@ -377,9 +620,6 @@ def _range_of_costs(costs: Array, accepted: Array, mpc: Array) -> tuple[float, f
     return low - room, high + room
 
 
-decisions_figure = as_figure(plot_decisions)
-
-
 # ---- Headroom, and what a twin is worth ----
 
 
@@ -420,16 +660,25 @@ def plot_headroom(found: Any, axes: Axes | None = None) -> Axes:
     return axes
 
 
-headroom_figure = as_figure(plot_headroom)
-
-
-def plot_costs(trust: Any, axes: Axes | None = None) -> Axes:
-    """Draw the actual cost of each held-out episode over the predicted one.
+def plot_twin(trust: Any, axes: Sequence[Axes] | None = None) -> tuple[Axes, Axes]:
+    """Draw held-out costs over predicted ones, and errors of free runs by steps ahead.
 
     ``trust`` is ``twin.trust``. A trusted twin's costs lie between the dashed lines, on root mean
     square.
     """
-    axes = axes_or_new(axes, 4.6, 4.2)
+    if axes is None:
+        axes = new_figure(9.2, 3.8).subplots(1, 2)
+    costs, runs = axes
+    _draw_costs(trust, costs)
+    _draw_free_runs(trust, runs)
+    for panel in (costs, runs):
+        panel.grid(alpha=0.3)
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(loc="lower left", bbox_to_anchor=(0, 1.01), frameon=False, ncols=3)
+    return costs, runs
+
+
+def _draw_costs(trust: Any, axes: Axes) -> None:
     if len(trust.actual):
         both = np.concatenate([trust.predicted, trust.actual])
         both = both[np.abs(both) <= 3 * np.abs(trust.actual).max()]  # a run that diverged is not
@@ -443,16 +692,12 @@ def plot_costs(trust: Any, axes: Axes | None = None) -> Axes:
         axes.plot(trust.predicted, trust.actual, "o", **style)
         axes.set(xlim=ends, ylim=ends)
     axes.set(xlabel="predicted cost", ylabel="actual cost")
-    axes.grid(alpha=0.3)
-    legend_above(axes, columns=2)
-    return axes
 
 
-def plot_free_runs(trust: Any, axes: Axes | None = None) -> Axes:
-    """Draw the error of free runs over held-out episodes by how many steps they look ahead."""
+def _draw_free_runs(trust: Any, axes: Axes) -> None:
     from matplotlib.ticker import LogLocator
 
-    axes, runs = axes_or_new(axes, 5.2, 4.2), trust.runs
+    runs = trust.runs
     axes.set(xlabel="steps ahead", ylabel="error (standard deviations of the states)")
     if len(trust.actual):
         for name, errors, color, style in (
@@ -467,15 +712,3 @@ def plot_free_runs(trust: Any, axes: Axes | None = None) -> Axes:
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")  # no powers of ten
         axes.yaxis.set_minor_formatter("")
-    axes.grid(alpha=0.3)
-    legend_above(axes)
-    return axes
-
-
-def twin_figure(trust: Any) -> Figure:
-    """Return a figure of :func:`plot_costs` and :func:`plot_free_runs`."""
-    figure = new_figure(9.2, 3.8)
-    costs, runs = figure.subplots(1, 2)
-    plot_costs(trust, costs)
-    plot_free_runs(trust, runs)
-    return figure

@@ -61,8 +61,8 @@ def summary_table(title: str, before: Trajectories, after: Trajectories) -> Tabl
     violations = before.violations.sum(), after.violations.sum()
     table.add_row("violations", *map(str, violations), f"{violations[1] - violations[0]:+d}")
     table.add_section()
-    for name, count in (("cheaper", change < -same), ("dearer", change > same)):
-        table.add_row(f"{name} episodes", "", f"{count.sum()} of {len(change)}", "")
+    for name, count in (("less", change < -same), ("more", change > same)):
+        table.add_row(f"episodes that cost {name}", "", f"{count.sum()} of {len(change)}", "")
     table.add_row("largest increase", "", "", _change(max(change.max(), 0.0)))
     return table
 

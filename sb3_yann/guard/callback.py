@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
-from sb3_yann._validation import check_bool, check_int, check_options, check_range, former_names
+from sb3_yann._validation import check_bool, check_int, check_options, check_range
 from sb3_yann.audit.callback import CostAudit
 from sb3_yann.compare import AcceptanceRule
 from sb3_yann.evaluation.plots import plot_decisions
@@ -175,7 +175,6 @@ class ImprovementGuard(BaseCallback):
     _audit: CostAudit | None = None
     _steps: Any = 0  # of each env's present episode, in this learn
 
-    @former_names(n_starts="n_eval_episodes", eval_every="eval_freq")
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
         env: Source | PlantTwin,

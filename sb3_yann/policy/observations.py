@@ -20,7 +20,6 @@ from torch import nn
 
 from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int
 from sb3_yann.control import LinearMPC
-from sb3_yann.units import warn_of_absolute
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +185,7 @@ ObservationSpec = AffineObservation | Mapping[str, ArrayLike]
 """What may be said of an observation, see :func:`as_observation`."""
 
 
-def as_observation(
-    given: ObservationSpec | str | None, problem: LinearMPC
-) -> AffineObservation | None:
+def as_observation(given: ObservationSpec | None, problem: LinearMPC) -> AffineObservation | None:
     """Return the map from what an env shows to theta in plant units, None for the identity.
 
     Parameters
@@ -211,9 +208,6 @@ def as_observation(
             raise ValueError(f"observation = {dict(given)} must have a 'center' and a 'scale'.")
         center = check_array("observation['center']", given["center"], (problem.n_theta,))
         return AffineObservation.normalized(center, given["scale"])
-    if isinstance(given, str) and given == "absolute":
-        warn_of_absolute(True)
-        return None
     raise TypeError(
         f"observation = {given!r} must be an AffineObservation, a mapping with 'center' and "
         "'scale', or None: an env shows plant units."

@@ -16,7 +16,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_yann.control import PiecewiseAffine
-from sb3_yann.evaluation.plots import decisions_figure, headroom_figure, twin_figure
+from sb3_yann.evaluation.plots import plot_decisions, plot_headroom, plot_twin
 from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of
 from sb3_yann.improvement.improve import fingerprint
@@ -67,7 +67,7 @@ def guard_part(subject: Subject) -> Part:
             "Mean cost of each candidate by the verdict on it, of the accepted policy and of the "
             f"MPC, over the guard's {len(state.settings['seeds'])} starts."
         )
-        parts += [picture(partial(decisions_figure, state.decisions), caption)]
+        parts += [picture(partial(plot_decisions, state.decisions), caption)]
         parts += _decisions(state.decisions)
     return Part(title, join(parts), (make_finding(passed, text),))
 
@@ -140,7 +140,7 @@ def twin_part(subject: Subject) -> Part:
         "Left: costs of held-out episodes. Right: how the error of free runs grows with the steps "
         "that they look ahead."
     )
-    shown = picture(partial(twin_figure, twin.trust), caption)
+    shown = picture(lambda: plot_twin(twin.trust)[0], caption)
     content = join([paragraph(text), lines(twin.report()), shown])
     return Part(title, content, (make_finding(twin.trusted, text),))
 
@@ -152,7 +152,7 @@ def headroom_part(subject: Subject) -> Part:
         why = "No headroom was given: pass report(model, headroom=headroom(mpc, env)) to show it."
         return left_out(title, why)
     caption = "The gain over the MPC part by part; the bar of the total has its standard error."
-    shown = picture(partial(headroom_figure, found), caption)
+    shown = picture(partial(plot_headroom, found), caption)
     text = f"Headroom: {100 * found.total:.2f} % below the MPC's mean cost"
     finding = Finding("note", f"{text}; the verdict is to {found.verdict}.")
     return Part(title, join([lines(found.report()), shown]), (finding,))

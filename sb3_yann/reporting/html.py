@@ -15,6 +15,7 @@ import numpy as np
 from sb3_yann._validation import is_text
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 STYLE = """
@@ -141,7 +142,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Html:
     return tag("div", whole, class_="wide")
 
 
-def picture(draw: Callable[[], Figure], caption: str) -> Html:
+def picture(draw: Callable[[], Axes | Figure], caption: str) -> Html:
     """Return a picture with its caption; a name with a dollar sign is no formula.
 
     Letters that the font lacks become boxes, without a warning. A large SVG becomes a PNG.
@@ -151,7 +152,9 @@ def picture(draw: Callable[[], Figure], caption: str) -> Html:
     options: Any = {"text.parse_math": False, "svg.hashsalt": "sb3-yann"}
     with matplotlib.rc_context(options), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
-        figure, kind, buffer = draw(), "svg+xml", BytesIO()
+        drawn: Any = draw()
+        figure = getattr(drawn, "figure", None) or drawn  # of Axes, else itself
+        kind, buffer = "svg+xml", BytesIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
         if len(buffer.getvalue()) > 120_000:
             kind, buffer = "png", BytesIO()

@@ -11,8 +11,7 @@ from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_in_words
 from sb3_yann.compare import INPUT_STEP, less_safe
 from sb3_yann.control.model.labels import with_units
-from sb3_yann.evaluation.law_plots import inputs_of, surfaces_figure, use_figure
-from sb3_yann.evaluation.plots import loops_figure
+from sb3_yann.evaluation.plots import inputs_of, loops_figure, surfaces_figure, use_figure
 from sb3_yann.reporting.html import Html, join, number, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject, left_out, make_finding
 

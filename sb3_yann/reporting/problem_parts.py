@@ -15,7 +15,7 @@ from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of, missing_observer, with_units
 from sb3_yann.control.mpc.bound_excess import BoundNames
-from sb3_yann.evaluation.law_plots import ActiveConstraints, regions_figure
+from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
 from sb3_yann.reporting.html import Html, join, lines, number, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject, make_finding
 from sb3_yann.rollout import Trajectories
@@ -250,7 +250,7 @@ def _regions(subject: Subject) -> Html:
         f"Regions of the law over {names}; the other parameters are at the operating point. "
         "A number is a region, a color tells which constraints act in the optimal plan."
     )
-    return picture(partial(regions_figure, problem, entries=plane, by="constraint"), caption)
+    return picture(partial(plot_regions, problem, entries=plane, by="constraint"), caption)
 
 
 def _error_of_law(subject: Subject) -> tuple[int, float, int]:

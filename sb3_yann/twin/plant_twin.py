@@ -46,7 +46,6 @@ from sb3_yann.twin.trust import (
     relative_error,
 )
 from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
-from sb3_yann.units import warn_of_absolute
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,7 +130,6 @@ class PlantTwin:
         residuals: Sequence[str | Callable[[], Any]] = KINDS,
         n_members: int = 5,
         seed: int = 0,
-        absolute: bool | None = None,
         units_confirmed: bool = False,
     ) -> PlantTwin:
         """Return the twin of a plant that was logged.
@@ -162,8 +160,6 @@ class PlantTwin:
             The first is fitted to all episodes, the others to as many drawn from them.
         seed : int, default 0
             Of the draws of episodes, and of the weights that networks start from.
-        absolute : bool, optional
-            Does nothing, and is deprecated: the model's operating point tells.
         units_confirmed : bool, default False
             Whether somebody has checked the log's units. A plant whose gain is below 0.6 or above
             1.7 times the model's looks like an input in other units, and a controller that is a
@@ -179,7 +175,6 @@ class PlantTwin:
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         check_int("n_members", n_members)
         check_int("seed", seed, 0)
-        warn_of_absolute(absolute)
         check_bool("units_confirmed", units_confirmed)
         row, given = RowLayout(problem, observer), (references, disturbances, previous)
         observed = observer is not None
@@ -267,11 +262,7 @@ class PlantTwin:
         """Draw costs of held-out episodes, and errors of free runs; return both axes."""
         from sb3_yann.evaluation import plots
 
-        costs, runs = plots.twin_figure(self.trust).axes if axes is None else axes
-        if axes is not None:
-            plots.plot_costs(self.trust, costs)
-            plots.plot_free_runs(self.trust, runs)
-        return costs, runs
+        return plots.plot_twin(self.trust, axes)
 
     def reidentified(self) -> LinearMPC:
         """Return the MPC of the same costs, bounds and horizon with a model of the log.

@@ -82,11 +82,12 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(**kwargs)
-        shape, told = np.shape(observation), self.observation_space.shape
-        if shape != told:
+        shape = np.shape(observation)
+        declared = self.observation_space.shape
+        if shape != declared:
             raise ValueError(
                 f"The env's reset returned an observation of shape {shape}, and its "
-                f"observation_space has {told}: return a vector, such as np.ravel(observation)."
+                f"observation_space has {declared}: return a vector, such as np.ravel(observation)."
             )
         self.theta = self.problem.units.to_deviations(self.seen(observation))
         return observation, info

@@ -28,7 +28,7 @@ def test_it_is_named_in_units_of_the_plant_beside_what_an_observer_leaves() -> N
     runs, near, far = [run(79)] * 3, [run(0.5)] * 3, [run(60)] * 3
     named = "With the MPC, speed (rpm) came to rest 79 beside its set-point, 3 times. "
     assert remaining_offset(motor(), runs, near).startswith(f"{named}An observer removes that")
-    dear = remaining_offset(motor(), runs, near, dearer=0.12)
+    dear = remaining_offset(motor(), runs, near, cost_increase=0.12)
     assert dear == f"{named}An observer removes that, but costs 12 % more: leave it out."
     left = remaining_offset(motor(), runs, far)
     assert left.startswith(f"{named}An observer leaves 60: look whether an input is at its bound")

@@ -9,14 +9,10 @@ from sample_laws import reactor_in_plant_units
 from sb3_yann import LinearModel, LinearMPC, SoftBounds, Tracking
 from sb3_yann.evaluation import Trajectories, comparison_table, evaluate
 from sb3_yann.evaluation.plots import (
-    RegionUse,
     loops_figure,
-    plot_changes,
-    plot_loop,
     plot_regions,
     plot_surface,
-    plot_visits,
-    regions_figure,
+    region_use,
     surfaces_figure,
     use_figure,
 )
@@ -38,6 +34,10 @@ def episodes(count: int, size: int = 1, steps: int = 5) -> Trajectories:
     u = [np.full((steps, 1), 40 - k / count) for k in range(count)]
     none = np.zeros(count, int)
     return Trajectories(np.ones(count), none, tuple(x), tuple(u), none.astype(bool))
+
+
+def plot_loop(mpc, runs, quantity, **options):
+    return loops_figure(mpc, runs, quantities=[quantity], **options).axes[0]
 
 
 def test_the_table_shows_losses_as_well_as_gains() -> None:
@@ -64,14 +64,6 @@ def test_of_many_episodes_the_median_and_the_bands_are_drawn() -> None:
     spans = [np.ptp(each.get_paths()[0].vertices[:, 1]) for each in axes.collections]
     low, high = np.percentile(values, [10, 90])
     np.testing.assert_allclose(sorted(spans), [high - low, np.ptp(values)])
-
-
-def test_bands_of_several_controllers_are_lines_that_hide_nothing() -> None:
-    axes = plot_loop(tank(), {"before": episodes(50), "after": episodes(20)}, "level")
-    assert len(axes.collections) == 0
-    drawn = sorted(line.get_ydata()[0] for line in axes.lines if len(line.get_ydata()) == 6)
-    found = [np.percentile(12 + np.arange(k) / k, [10, 50, 90]) for k in (50, 20)]
-    np.testing.assert_allclose(drawn, sorted(np.concatenate(found)))
 
 
 def test_episodes_that_have_ended_count_no_more() -> None:
@@ -154,15 +146,6 @@ def test_a_surface_is_drawn_in_the_frame_that_is_given() -> None:
         plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"), frame=([1, 470], [1, 480]))
 
 
-def test_a_difference_is_that_of_two_laws_and_its_colors_are_symmetric() -> None:
-    mpc = problems.clipped_pendulum()
-    law = mpc.explicit()
-    axes = plot_surface(mpc, lambda theta: law(theta) + 0.5, minus=law)
-    mesh = axes.collections[0]
-    np.testing.assert_allclose(mesh.get_array(), 0.5)
-    assert mesh.get_clim() == pytest.approx((-0.5, 0.5))
-
-
 def test_before_and_after_share_their_colors() -> None:
     mpc = problems.clipped_pendulum()
     figure = surfaces_figure(mpc, mpc.explicit(), lambda theta: np.full((len(theta), 1), 3.0))
@@ -181,19 +164,17 @@ def test_use_counts_steps_and_distances_by_region() -> None:
     mpc = problems.cstr()
     law, played = mpc.explicit(), evaluate(mpc.explicit(), "CSTR-v0", range(2))
     moved = lambda theta: np.clip(law(theta) + 5.5, -55, 55)  # noqa: E731
-    use = RegionUse.of(mpc, moved, played)
+    use = region_use(mpc, moved, played)
     theta = np.concatenate([x[:-1] for x in played.observations])
     regions, counts = np.unique(law.locate(theta), return_counts=True)
     order = np.argsort(-counts, kind="stable")
     assert use.regions.tolist() == regions[order].tolist()
     np.testing.assert_allclose(use.share, counts[order] / len(theta))
     assert use.largest.max() == pytest.approx(0.1)  # of half the range
-    heights = [bar.get_height() for bar in plot_visits(use).patches]
-    np.testing.assert_allclose(heights, 100 * use.share)
-    axes = plot_changes(use)
-    np.testing.assert_allclose(axes.lines[0].get_ydata(), 100 * use.largest)
-    np.testing.assert_allclose([bar.get_height() for bar in axes.patches], 100 * use.mean)
-    assert len(use_figure(mpc, moved, played).axes) == 2
+    above, below = use_figure(mpc, moved, played).axes
+    np.testing.assert_allclose([bar.get_height() for bar in above.patches], 100 * use.share)
+    np.testing.assert_allclose(below.lines[0].get_ydata(), 100 * use.largest)
+    np.testing.assert_allclose([bar.get_height() for bar in below.patches], 100 * use.mean)
 
 
 def test_a_color_stands_for_the_constraints_that_act() -> None:
@@ -201,6 +182,5 @@ def test_a_color_stands_for_the_constraints_that_act() -> None:
     axes = plot_regions(mpc, entries=("C_A", "T"), by="constraint")
     labels = axes.get_legend_handles_labels()[1]
     assert {"U at its lower bound", "U at its upper bound", "no constraint acts"} <= {*labels}
-    assert regions_figure(mpc).axes[0].get_xlabel() == "C_A (mol/L)"
     with pytest.raises(ValueError, match="by"):
         plot_regions(mpc, by="color")

@@ -23,16 +23,16 @@ PRINTED = {
         "The reward is the cost of the problem in all of",
         "50 unseen set-point sequences",
         "violations",
-        "dearer episodes",
+        "episodes that cost more",
     ],
     "built_in": [
         "sampled every 0.05",
         "Unstable: 1 of 2 poles grow",
         "The reward is the cost of the problem in all of 100 steps",
         "50 unseen starts",
-        "dearer episodes",
+        "episodes that cost more",
     ],
-    "quadrotor": ["OnlineLaw(constraints=241", "100 unseen starts", "dearer episodes"],
+    "quadrotor": ["OnlineLaw(constraints=241", "100 unseen starts", "episodes that cost more"],
 }
 
 

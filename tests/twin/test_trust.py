@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from general_problems import solved
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
-from sb3_yann.evaluation.plots import twin_figure
+from sb3_yann.evaluation.plots import plot_twin
 from sb3_yann.twin import trust as trusts
 from sb3_yann.twin.log import Episode, as_episodes, records
 from sb3_yann.twin.report import report
@@ -296,7 +296,7 @@ def lines(axes: Axes) -> dict[str, np.ndarray]:
 def test_the_picture_of_costs_has_a_band_of_a_quarter_of_the_mean() -> None:
     predicted, actual = np.array([8.0, 18.0, 1e6]), np.array([10.0, 20.0, 30.0])
     given = dataclasses.replace(twin().trust, predicted=predicted, actual=actual)
-    costs, runs = twin_figure(given).axes
+    costs, runs = plot_twin(given)
     drawn = lines(costs)
     ends = np.array([8 - 0.08 * 22, 30 + 0.08 * 22])  # without the run that blew up
     np.testing.assert_allclose(drawn["as predicted"], [ends, ends])
@@ -312,6 +312,6 @@ def test_the_picture_of_costs_has_a_band_of_a_quarter_of_the_mean() -> None:
 
 def test_without_a_second_episode_the_pictures_are_empty() -> None:
     none = dataclasses.replace(twin().trust, predicted=np.zeros(0), actual=np.zeros(0))
-    costs, runs = twin_figure(none).axes
+    costs, runs = plot_twin(none)
     assert not costs.lines and not runs.lines and runs.get_xscale() == "linear"
     assert (costs.get_xlabel(), runs.get_xlabel()) == ("predicted cost", "steps ahead")

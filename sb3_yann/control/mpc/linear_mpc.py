@@ -45,7 +45,6 @@ from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import hard_rows, invariant_set
 from sb3_yann.control.mpc.value import Value
 from sb3_yann.control.online import OnlineLaw
-from sb3_yann.units import warn_of_absolute
 
 if TYPE_CHECKING:
     from sb3_yann.control.linearization.simulator import Maker
@@ -124,8 +123,6 @@ class LinearMPC(MPCProblem):
     control_horizon : int or sequence of int, optional
         The number of samples in which the inputs move, before they stay; or for how many samples
         each move is held, which sum up to the horizon. The default is each sample.
-    absolute : bool, optional
-        Does nothing, and is deprecated: the model's operating point tells.
 
     Raises
     ------
@@ -166,13 +163,11 @@ class LinearMPC(MPCProblem):
         price: LinearCost | None = None,
         parametric_bounds: ParametricBounds | Sequence[str] = (),
         control_horizon: int | Sequence[int] | None = None,
-        absolute: bool | None = None,
     ) -> None:
         if isinstance(model, Identified):
             model = model.model
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        warn_of_absolute(absolute)
         n, m = model.n_states, model.n_inputs
         horizon, gamma = arguments.as_horizon(horizon), check.check_discount(gamma)
         infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE)

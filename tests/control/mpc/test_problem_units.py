@@ -182,14 +182,6 @@ def test_a_problem_shows_its_bounds_as_they_were_given() -> None:
     assert "du_max=[0.5]" in text and "y_max=[382]" in text
 
 
-@pytest.mark.parametrize("absolute", [True, False])
-def test_absolute_does_nothing_and_warns(absolute: bool) -> None:
-    given: dict[str, Any] = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 8, "u_max": 15}
-    with pytest.warns(DeprecationWarning, match="absolute= does nothing"):
-        found = LinearMPC(MODEL, **given, absolute=absolute)
-    assert found == LinearMPC(MODEL, **given)
-
-
 def test_an_input_that_cannot_rest_is_told() -> None:
     tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
     box = {"theta_min": 0, "theta_max": 20, "u_min": 4, "u_max": 10}
