@@ -70,13 +70,20 @@ def check_bounds(
 
     A scalar is for all entries; None and infinity are no bound. A finite one has at most 1e100.
     """
-    low = _bound(f"{name}_min", lower, size, -np.inf)
-    high = _bound(f"{name}_max", upper, size, np.inf)
+    below, above = sides_of(name)
+    low, high = _bound(below, lower, size, -np.inf), _bound(above, upper, size, np.inf)
     if np.any(low >= high):
         i = int(np.argmax(low >= high))
-        given = f"{name}_min = {low[i]:g} and {name}_max = {high[i]:g}"
-        raise ValueError(f"{name}_min must lie below {name}_max, but entry {i} has {given}.")
+        given = f"{below} = {low[i]:g} and {above} = {high[i]:g}"
+        raise ValueError(f"{below} must lie below {above}, but entry {i} has {given}.")
     return low, high
+
+
+def sides_of(name: str) -> tuple[str, str]:
+    """Return what two bounds are called: x_min and x_max, or those of a group by its name."""
+    if name == "MixedBounds":
+        return "MixedBounds.low", "MixedBounds.high"
+    return f"{name}_min", f"{name}_max"
 
 
 def check_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -> Array:

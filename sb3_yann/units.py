@@ -101,9 +101,6 @@ def fields_in_deviations(problem: Any) -> dict[str, Any]:
         ),
         "mixed": replace(mixed, low=mixed.low - mixed_ss, high=mixed.high - mixed_ss),
         "price": replace(price, constant=price.constant + spent),
-        "parametric_bounds": replace(
-            problem.parametric_bounds, rest=np.zeros(len(problem.parametric_bounds.names))
-        ),
     }
 
 

@@ -16,7 +16,14 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, check_array, check_choice, check_int, half_widths
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, SteepQP, as_bits, solvable
+from sb3_yann.control.explicit.parametric_qp import (
+    MILD,
+    ParametricQP,
+    SteepQP,
+    as_bits,
+    slack_costs,
+    solvable,
+)
 from sb3_yann.control.law import INFEASIBLE, PlantLaw, as_points, bounds_of
 
 if TYPE_CHECKING:
@@ -236,7 +243,7 @@ class OnlineLaw(PlantLaw):
         elif len(outside):
             again = np.ascontiguousarray(rows[outside])
             softened = self.dual.solve(again, soft=True)
-            u[outside] = self.dual.soft_inputs(again, softened)
+            u[outside] = self.dual.inputs(again, softened)
         u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
         return np.clip(u, self.u_min, self.u_max), feasible, found, softened
 
@@ -421,30 +428,6 @@ class DualProgram:
         inputs_of_batch(theta, self.K, self.k0, self.E, *solution, self.bounds, u)
         return u
 
-    def soft_inputs(self, theta: Array, found: Answers) -> Array:
-        """Return the inputs (batch, m) of softened programs: saturated where none is solved.
-
-        Far from the box multipliers are so large that the certificate's tolerances are their
-        rounding. There the conditions must hold to 1e-6 of the largest distance.
-        """
-        from sb3_yann.control._kernels.online import SOLVED
-
-        u = self.inputs(theta, found)
-        for i in np.flatnonzero(found.status != SOLVED):
-            active = found.active[i, : found.sizes[i]]
-            lam = np.zeros(len(self.d0))
-            lam[active] = found.multipliers[i, : found.sizes[i]]
-            with np.errstate(over="ignore", invalid="ignore"):
-                d = self.d0 + theta[i] @ self.D
-                slack = d + self.gram @ lam + self.softness * lam
-                tolerance = 1e-6 * (1 + np.abs(d).max())
-                held = slack.min() >= -tolerance
-                held &= np.abs(slack[active]).max(initial=0.0) <= tolerance
-                law = self.k0 + self.K @ theta[i]
-            if not held:
-                u[i] = np.clip(np.nan_to_num(law, nan=0.0), *self.bounds)
-        return u
-
     def meets_fixed(self, theta: Array) -> NDArray[np.bool_]:
         """Tell of each row whether it keeps what no input can change."""
         S, w = self.fixed
@@ -508,10 +491,21 @@ class KnownPoints:
 
 def _scaled(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[ParametricQP, Array]:
     """Return the program in units of the input range and theta's box, and those of U (v,)."""
+    in_units, reach = _in_units(program, u_min, u_max)
+    return solvable(in_units), reach
+
+
+def _in_units(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[ParametricQP, Array]:
     steps = (len(program.c) - program.n_slacks) // len(u_min)
     reach = np.append(np.tile(half_widths(u_min, u_max), steps), np.ones(program.n_slacks))
     half = half_widths(program.theta_min, program.theta_max)
-    return solvable(program.scaled(np.zeros(len(half)), half, reach)), reach
+    return program.scaled(np.zeros(len(half)), half, reach), reach
+
+
+def steepness(program: ParametricQP, u_min: Array, u_max: Array) -> float:
+    """Return how many times half of what a dual method takes the slacks of a program cost."""
+    ratio, _ = slack_costs(_in_units(program, u_min, u_max)[0])
+    return 2 * float(ratio.max()) / MILD
 
 
 def _never_softened(program: ParametricQP) -> NDArray[np.bool_]:

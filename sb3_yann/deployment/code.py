@@ -23,6 +23,11 @@ def room_of(data: Arrays, precision: str) -> float:
     return 1e-9 if "qp_gram" in data else ROOM[precision]
 
 
+def room_outside(data: Arrays, precision: str) -> float:
+    """Return the same where the MPC has no solution: constraints that give way cost digits."""
+    return 1e-6 if "qp_gram" in data else ROOM[precision]
+
+
 def scale_within(
     scale: Array, shift: Array, low: Array, high: Array, real: Any = np.float64
 ) -> NDArray[Any]:
@@ -261,14 +266,17 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     scale = np.abs(obs).max(0)
     actions, kept = controller.evaluate(obs), np.ones(len(obs), bool)
     half = _input_ranges(controller, actions) / 2
+    rooms = room_outside(controller.data, precision), room_of(controller.data, precision)
+    inside = controller.in_domain(obs)
+    room = np.where(inside, rooms[1], rooms[0])[:, None]
     is_online = "qp_gram" in controller.data  # and continuous: all readings move at once
     for sign in (-1, 1):
         for j in [slice(None)] if is_online else range(obs.shape[1]):
             moved = obs.copy()
             moved[:, j] += sign * 2 * size * scale[j]
             change = np.abs(controller.evaluate(moved) - actions) / half
-            kept &= (change < room_of(controller.data, precision)).all(1)
-            kept &= controller.in_domain(moved) == controller.in_domain(obs)
+            kept &= (change < room).all(1)
+            kept &= controller.in_domain(moved) == inside
     return np.asarray(obs[kept])
 
 
@@ -325,5 +333,6 @@ def known_answers(data: Arrays, precision: str) -> dict[str, str]:
         "VECTORS": "\n".join(texts),
         "POINTS": str(len(obs)),
         "STEPS": str(n_steps),
-        "ROOM": f"{room_of(data, precision):g}",
+        "ROOM_INSIDE": f"{room_of(data, precision):g}",
+        "ROOM_OUTSIDE": f"{room_outside(data, precision):g}",
     }

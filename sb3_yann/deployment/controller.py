@@ -521,18 +521,22 @@ def _solve(
 def _certified(
     data: Mapping[str, Any], d: Array, extra: Array, gram: Array, active: list[int]
 ) -> tuple[list[int], Array] | None:
-    """Return the active set in order with its multipliers, None where a condition fails."""
+    """Return the active set in order with its multipliers, None where a condition fails.
+
+    Where constraints give way multipliers are a million times as large as d, and sums round.
+    """
     active = sorted(active)
+    tolerance, size = (1e-6, np.abs(d).max()) if np.any(extra) else (1e-9, np.abs(d))
     try:
         lam = np.linalg.solve(gram[np.ix_(active, active)], -d[active])
     except np.linalg.LinAlgError:
         return None
-    if np.any(lam < -1e-9 * (1 + np.abs(lam).max(initial=0.0))):
+    if np.any(lam < -tolerance * (1 + np.abs(lam).max(initial=0.0))):
         return None
     lam = np.maximum(lam, 0.0)
     slack = d + lam @ data["qp_gram"][active]
     rest = slack[active] + extra[active] * lam
     slack[active] = 0.0
-    room = 1e-9 * (1 + np.abs(d))
+    room = np.broadcast_to(tolerance * (1 + size), d.shape)
     holds = np.all(np.abs(rest) <= room[active]) and np.all(slack >= -room)
     return (active, lam) if holds else None

@@ -82,8 +82,9 @@ def describe(
         state_names, input_names = labels_of(law.model)
     states[: len(state_names)] = True
     labels = [*state_names, *(f"theta[{i}]" for i in range(len(state_names), n))]
+    rest: Array = np.zeros(n)
     if problem is not None:
-        labels = _with_sources(problem)
+        labels, rest = _with_sources(problem), problem.theta_rest
 
     matrix, offset, scale, shift = _signal_maps(policy, law)
     watched = states
@@ -104,7 +105,7 @@ def describe(
         "dt": np.float64(0.0 if law.model is None else law.model.dt),
         "obs_matrix": matrix,
         "obs_offset": offset,
-        "obs_rest": np.linalg.lstsq(matrix, -offset, rcond=None)[0],  # at theta = 0
+        "obs_rest": np.linalg.lstsq(matrix, rest - offset, rcond=None)[0],
         "action_scale": scale,
         "action_shift": shift,
         "obs_names": np.array(labels),

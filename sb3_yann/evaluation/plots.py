@@ -156,7 +156,8 @@ class _Surface:
                 f"There is no frame to draw {names} in: the box goes from {low.tolist()} to "
                 f"{high.tolist()}. Pass frame=(lower left, upper right)."
             )
-        fixed = problem.theta_ss if at is None else check_array("at", at, (problem.n_theta,))
+        rest = problem.units.to_plant(problem.theta_rest)
+        fixed = rest if at is None else check_array("at", at, (problem.n_theta,))
         law = problem.law()
         points = 121 if isinstance(law, PiecewiseAffine) else 41  # a program for each of them
         self.grid = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]

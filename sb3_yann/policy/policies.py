@@ -145,8 +145,9 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         self.critic_warmup = check_int("critic_warmup", critic_warmup, 0, "It counts updates.")
         self.max_correction = _as_correction(max_correction)
         if pin_equilibrium is None:
+            layout = self.problem.layout
             priced = self.problem.price.counts  # it does not rest at the operating point
-            pin_equilibrium = not (self.problem.layout.has_constants or priced)
+            pin_equilibrium = not (layout.has_constants or layout.bounds or priced)
         self.pin_equilibrium = check_bool("pin_equilibrium", pin_equilibrium)
         self.law, self.networks = check_choice("law", law, LAWS), networks
         shared = layer_for(self.problem.law(law), networks) is SharedYannLayer
@@ -457,7 +458,8 @@ class YannPolicy(StartsAsMPC, TD3Policy):
         whatever is learnt. The default is none.
     pin_equilibrium : bool, optional
         Whether actor and critic keep their value at ``theta = 0`` for good: not where the model's
-        steady-state input is wrong. False for problems with references or disturbances, else True.
+        steady-state input is wrong. False for problems with references, disturbances, prices or
+        bounds that change at run time, else True.
     observation : AffineObservation or mapping, optional
         The map from what the env shows to theta. A mapping has a ``center`` and a ``scale`` of
         ``(theta - center) / scale``. By default the env shows theta, in plant units where the

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_yann._validation import Array, check_type
+from sb3_yann._validation import check_type
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
@@ -73,11 +73,7 @@ def retarget(model: Model, mpc: LinearMPC, env: Any = None) -> Model:
     elif not isinstance(layer, SharedYannLayer) or not isinstance(kept, SharedYannLayer):
         lost.insert(0, "the networks of single regions, which the new law does not have")
     else:
-        shift = mpc.theta_ss - old.theta_ss
-        if np.any(shift) and np.any(kept.network.pinned_array):
-            lost.insert(0, "the correction, which is pinned to another bound at run time")
-        else:
-            _hand_over(layer, kept, shift)
+        _hand_over(layer, kept)
     _hand_over_spread(model, policy.actor, found, actor)
     target: Any = found.policy.actor_target
     target.load_state_dict(actor.state_dict())
@@ -126,23 +122,18 @@ def _hand_over_spread(old: Any, old_actor: Any, new: Any, new_actor: Any) -> Non
 
 
 @th.no_grad()
-def _hand_over(old: LawLayer, new: LawLayer, shift: Array) -> None:
+def _hand_over(old: LawLayer, new: LawLayer) -> None:
     """Give a layer the correction of another one, as a function of theta, in units of the inputs.
 
-    Networks take theta in half-widths of its box, and put out half-ranges of the inputs. ``shift``
-    (n_theta,) is how far the zero of the new theta lies from that of the old one.
+    Networks take theta in half-widths of its box, and put out half-ranges of the inputs.
     """
-    half = old.theta_half.double()
-    ratio = new.theta_half.double() / half
+    ratio = new.theta_half.double() / old.theta_half.double()
     first, *rest = (each.detach().clone() for each in old.network.weights())
     nodes = first.double()
-    nodes[..., -1] += nodes[..., :-1] @ (th.as_tensor(shift) / half)
     nodes[..., :-1] *= ratio
     ranges = [each.base_law.u_max - each.base_law.u_min for each in (old, new)]
     rest[-1] *= th.as_tensor(ranges[0] / ranges[1])[:, None].to(rest[-1])
     for weight, value in zip(new.network.weights(), (nodes, *rest), strict=True):
         weight.copy_(value)
-    low_high = old.confines.clone()
-    low_high[0] -= th.as_tensor(shift) * (low_high[1] > 0)
-    new.confines.copy_(low_high)
+    new.confines.copy_(old.confines)
     new._keep_constants()

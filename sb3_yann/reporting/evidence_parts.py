@@ -164,7 +164,7 @@ def headroom_part(subject: Subject) -> Part:
 def cost_part(subject: Subject) -> Part:
     """Return how long a call takes on this machine, and how large things are."""
     policy, law, calls = subject.policy, subject.law, 200
-    space, theta = policy.observation_space, np.zeros(subject.problem.n_theta)
+    space, theta = policy.observation_space, subject.problem.theta_rest
     observation = np.zeros(space.shape or (1,), space.dtype)
 
     def times(call: Callable[[], Any]) -> tuple[str, str]:

@@ -214,7 +214,7 @@ def _farthest(subject: Subject) -> Html:
     far = problem.units.to_plant(theta[int(np.argmax(apart))])
     named = zip(problem.labels(units=True), far, strict=True)
     point = ", ".join(f"{name} = {value:.4g}" for name, value in named)
-    rest = float(_distance(subject, np.zeros((1, problem.n_theta))).max())
+    rest = float(_distance(subject, problem.theta_rest[None]).max())
     return paragraph(
         f"Of the random points it is farthest from the MPC at {point}.",
         f"At the operating point it differs by {rest:.2g}.",

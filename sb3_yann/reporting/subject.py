@@ -180,7 +180,7 @@ class Subject:
     def steepest_plane(self) -> tuple[int, int]:
         """The two entries of theta that move the inputs most at the operating point."""
         problem = self.problem
-        gain = self.law.gain(np.zeros((1, problem.n_theta)))[0]
+        gain = self.law.gain(problem.theta_rest)
         size = np.abs(gain * problem.theta_half / problem.u_half[:, None]).max(axis=0)
         first, second = np.sort(np.argsort(-size, kind="stable")[:2])
         return int(first), int(second)

@@ -33,7 +33,18 @@ CASES: dict[str, dict[str, Any]] = {
         "m": 2, "x_max": 6, "mixed": MixedBounds(G=[[1, 1]], high=0.8), "infeasible": "zero_input",
     },
     "bounds that change": {"parametric_bounds": ["u_max"], "terminal": Terminal(set="invariant")},
+    "soft and hard bounds in theta": {
+        "x_min": -6, "x_max": 6, "parametric_bounds": ["u_max", "x_max[0]"],
+        "mixed": MixedBounds(F=[[1, 1, 0]], G=[[1]], low=-4, high=4, soft=0.5),
+    },
 }  # fmt: skip
+
+
+def said_by_self_test(folder: Path) -> str:
+    parts = [str(folder / each) for each in ("plant.c", "plant_selftest.c")]
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-fsanitize=address,undefined"]
+    subprocess.run(["gcc", *flags, *parts, "-lm", "-o", str(folder / "test")], check=True)
+    return subprocess.run([folder / "test"], capture_output=True, text=True).stdout
 
 
 @needs_compiler
@@ -49,7 +60,8 @@ def test_code_and_controller_are_the_law(name: str, tmp_path: Path) -> None:
     actions, found = built.at(theta)
     assert inside.sum() > 20
     off = np.abs(actions - law.plant_input(theta)) / mpc.u_half
-    assert off[inside].max() < 1e-9
+    assert off[inside].max() < 1e-9 and off.max() < 1e-6
+    assert "passed" in said_by_self_test(tmp_path)
     np.testing.assert_array_equal((found & Status.OUTSIDE) == 0, inside)
     by_numpy = built.controller.evaluate(theta[:300])
     assert (np.abs(actions[:300] - by_numpy) / mpc.u_half).max() < 1e-6
@@ -61,11 +73,7 @@ def test_the_self_test_passes_under_sanitizers_and_nothing_is_allocated(tmp_path
     mpc = problem(x_min=-6, x_max=6)
     policy = disturbed(mpc, law="online", max_correction=0.2)
     export(policy, tmp_path / "plant.c")
-    parts = [str(tmp_path / each) for each in ("plant.c", "plant_selftest.c")]
-    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-fsanitize=address,undefined"]
-    subprocess.run(["gcc", *flags, *parts, "-lm", "-o", str(tmp_path / "test")], check=True)
-    said = subprocess.run([tmp_path / "test"], capture_output=True, text=True, check=True).stdout
-    assert "passed" in said
+    assert "passed" in said_by_self_test(tmp_path)
     text = (tmp_path / "plant.c").read_text()
     assert "malloc" not in text and "alloca(" not in text
 

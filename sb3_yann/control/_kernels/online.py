@@ -25,10 +25,13 @@ UNKNOWN = 2
 
 ENTERING_TOL = 1e-10
 """Relative to 1 + |d|: a constraint that is violated by more enters the active set."""
-SLACK_TOL = 1e-9
-"""The same, for an answer."""
-MULTIPLIER_TOL = 1e-9
-"""Relative to 1 + the largest multiplier."""
+ANSWER_TOL = 1e-9
+"""Of an answer: the same, and of multipliers relative to 1 + the largest."""
+SOFT_TOL = 1e-6
+"""The same where constraints give way, relative to 1 + the largest |d|.
+
+Multipliers are violations over softness, a million times as large as d: sums of them round.
+"""
 DEPENDENCE_TOL = 1e-11
 """A constraint whose part beyond the span of others is smaller depends on them."""
 PROBES = 8
@@ -169,10 +172,13 @@ def _certified(
     size: int,
     factor: Array,
     slack: Array,
+    tolerance: float,
+    least: float,
 ) -> bool:
     """Solve anew for an active set in ascending order, and tell whether it is optimal.
 
-    What is written then depends on the set alone, not on the way there.
+    What is written then depends on the set alone, not on the way there. Slacks may be off by
+    ``tolerance (1 + |d|)``, with ``least`` for |d| where that is above zero.
     """
     for i in range(1, size):
         own = active[i]
@@ -191,7 +197,7 @@ def _certified(
     for i in range(size):
         largest = max(largest, abs(lam[i]))
     for i in range(size):
-        if not lam[i] >= -MULTIPLIER_TOL * (1 + largest):
+        if not lam[i] >= -tolerance * (1 + largest):
             return False
         lam[i] = max(lam[i], 0.0)
     for i in range(size):  # near the border of the domain a factor may be all rounding
@@ -199,11 +205,11 @@ def _certified(
         rest = d[row] + extra[row] * lam[i]
         for k in range(size):
             rest += gram[row, active[k]] * lam[k]
-        if not abs(rest) <= SLACK_TOL * (1 + abs(d[row])):
+        if not abs(rest) <= tolerance * (1 + (least if least > 0 else abs(d[row]))):
             return False
     _slacks(d, gram, active, lam, size, slack)
     for j in range(len(d)):
-        if not slack[j] >= -SLACK_TOL * (1 + abs(d[j])):
+        if not slack[j] >= -tolerance * (1 + (least if least > 0 else abs(d[j]))):
             return False
     return True
 
@@ -228,9 +234,11 @@ def solve_batch(
 
     ``d = d0 + theta D`` with D (n, rows), gram (rows, rows); ``extra`` (rows,) softens constraints.
     Written are multipliers and active sets (batch, most), which hold ``most`` constraints at most,
-    their sizes and the status (batch,).
+    their sizes and the status (batch,). Where that is not SOLVED, softened programs have none.
     """
     rows = len(d0)
+    soft = bool(np.any(extra > 0))
+    tolerance = SOFT_TOL if soft else ANSWER_TOL
     factor = np.empty((most, most))
     step = np.empty(most)
     column = np.empty(most)
@@ -245,6 +253,7 @@ def solve_batch(
                 d[j] += own * D[i, j]
         for j in range(rows):
             slack[j] = d[j]
+        least = np.abs(d).max() if soft else 0.0
         size = 0
         status[at] = UNKNOWN
         own_set = active[at]
@@ -252,7 +261,7 @@ def solve_batch(
         for _ in range(10 * (rows + 10)):
             entering = _most_violated(d, slack)
             if entering < 0:
-                if _certified(d, gram, extra, own_set, lam, size, factor, slack):
+                if _certified(d, gram, extra, own_set, lam, size, factor, slack, tolerance, least):
                     status[at] = SOLVED
                 break
             found = _add(
@@ -263,7 +272,7 @@ def solve_batch(
                 break
             size = found
             _slacks(d, gram, own_set, lam, size, slack)
-        sizes[at] = size
+        sizes[at] = size if status[at] == SOLVED or not soft else 0
 
 
 @compiled(

@@ -36,8 +36,8 @@ class Bounds:
         Where theta has the states.
     used : ndarray of bool, shape (n + q,)
         Which states and outputs these are.
-    moves : pair of ndarray, shape (k, n_theta)
-        How low and high change with theta, where they do at run time.
+    moving : tuple of ndarray
+        Bounds that change at run time, as of `MPCProblem.limit_rows`.
     """
 
     C: Array
@@ -48,7 +48,7 @@ class Bounds:
     of_states: NDArray[np.bool_]
     states: slice
     used: NDArray[np.bool_]
-    moves: tuple[Array, Array]
+    moving: tuple[Array, ...]
 
     @classmethod
     def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
@@ -65,9 +65,8 @@ class Bounds:
         highest = np.concatenate([np.minimum(problem.x_max, high), outputs.y_max])
         half = np.concatenate([size, np.abs(outputs.C) @ size])
         softness = np.concatenate([problem.soft.x, problem.soft.y])
-        of_x, of_y = problem.moved_by("x"), problem.moved_by("y")
-        moves = [np.vstack(each) for each in zip(of_x, of_y, strict=True)]
         used = np.isfinite(lowest) | np.isfinite(highest)
+        moving = zip(problem.limit_rows("x"), problem.limit_rows("y"), strict=True)
         return cls(
             C=C[used],
             low=lowest[used],
@@ -77,7 +76,7 @@ class Bounds:
             of_states=(np.arange(len(used)) < n)[used],
             states=problem.layout.state,
             used=used,
-            moves=(moves[0][used], moves[1][used]),
+            moving=tuple(np.concatenate(both)[used] for both in moving),
         )
 
     def beyond(self, thetas: Array, room: float = 0.0) -> Array:
@@ -87,9 +86,10 @@ class Bounds:
         """
         y = thetas[..., self.states] @ self.C.T
         low, high = self.low, self.high
-        if any(map(np.any, self.moves)):
-            low = low + thetas @ self.moves[0].T
-            high = high + thetas @ self.moves[1].T
+        own_low, own_high, L, H = self.moving
+        if np.any(L) or np.any(H):
+            low = np.maximum(low, own_low + thetas @ L.T)
+            high = np.minimum(high, own_high + thetas @ H.T)
         above = np.maximum((y - high) / self.half - room, 0)
         return np.asarray(above - np.maximum((low - y) / self.half - room, 0))
 

@@ -291,9 +291,7 @@ def _constraints(
     N, blocks = problem.horizon, len(problem.blocks)
     rows = _Rows(slacks)
     called, inputs = labels_of(problem.model)
-    limits: dict[str, Limits] = {
-        kind: (*each, *problem.moved_by(kind)) for kind, each in problem.limits.items()
-    }
+    limits = {kind: problem.limit_rows(kind) for kind in problem.limits}
     first = zip(*(prediction.inputs[k] for k in prediction.starts), strict=True)
     moved, free = (np.vstack(each) for each in first)
     low, high, low_moves, high_moves = limits["u"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -25,8 +26,9 @@ HalfSpaces = tuple[ArrayLike, ArrayLike]
 
 def _loose(name: str, lower: Given, upper: Given) -> Bounds:
     """Return bounds that fit each other, of a size that is still open."""
-    low = _as_side(f"{name}_min", -np.inf if lower is None else lower)
-    high = _as_side(f"{name}_max", np.inf if upper is None else upper)
+    below, above = check.sides_of(name)
+    low = _as_side(below, -np.inf if lower is None else lower)
+    high = _as_side(above, np.inf if upper is None else upper)
     check_bounds(name, low, high, max(low.size, high.size))
     return low, high
 
@@ -40,7 +42,9 @@ def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> B
     """Return bounds of shape (size,); they must be infinite of what the problem does not have."""
     low, high = _loose(name, lower, upper)
     if size == 0 and np.any(np.isfinite(np.append(low, high))):
-        raise ValueError(f"{name}_min or {name}_max is given, but there is no {missing}.")
+        raise ValueError(
+            f"{' or '.join(check.sides_of(name))} is given, but there is no {missing}."
+        )
     return check_bounds(name, low, high, size)
 
 
@@ -211,8 +215,8 @@ class SoftBounds(ReadOnlyArrays):
     penalty : float, optional
         The cost of one unit of violation. Above the largest sum of multipliers of the hard problem,
         the soft one breaks no bound without need. By default the problem chooses 100 times what it
-        costs to come back from the bounds, and stores that number: far above the multipliers, save
-        next to where the hard problem has no solution.
+        costs to come back from the bounds, or less where solvers would lose digits, and stores that
+        number: far above the multipliers, save next to where the hard problem has no solution.
 
     Examples
     --------
@@ -315,6 +319,8 @@ class MixedBounds(ReadOnlyArrays):
         low, high = _bounds("MixedBounds", self.low, self.high, count, "row in F or G")
         for k in np.flatnonzero(~np.any(np.hstack([F, G]), axis=1)):
             raise ValueError(f"Row {k} of MixedBounds is zero in F and G: it bounds nothing.")
+        for k in np.flatnonzero(np.isinf(low) & np.isinf(high)):
+            raise ValueError(f"Row {k} of MixedBounds has no bound: pass low or high, or both.")
         units = as_softness("MixedBounds.soft", self.soft, (low, high)) if count else self.soft
         return MixedBounds(F, G, low, high, np.ravel(units)[:count])
 
@@ -368,76 +374,67 @@ class LinearCost(ReadOnlyArrays):
         return LinearCost(x, u, self.constant)
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class ParametricBounds(ReadOnlyArrays):
-    """Bounds that change at run time and are entries of theta.
+def parametric_names(names: Sequence[str], limits: Mapping[str, Bounds]) -> tuple[str, ...]:
+    """Return a name such as "u_max[0]" for each bound that changes at run time.
 
     Parameters
     ----------
     names : sequence of str
         "u_max" for all entries that are bounded, or "u_max[0]" for one; likewise x, y, du and
         "_min". Those of MixedBounds are "mixed_min" and "mixed_max".
-    rest : array_like, shape (b,), optional
-        Their values in the problem, which are their widest.
-
-    Examples
-    --------
-    >>> ParametricBounds(["u_max"]).sized({"u": (np.zeros(2), np.ones(2))}).names
-    ('u_max[0]', 'u_max[1]')
+    limits : dict of str to pair of ndarray
+        The bounds of a problem by "x", "u", ...
     """
+    if isinstance(names, str) or not all(isinstance(each, str) for each in names):
+        raise TypeError(f"parametric_bounds = {names!r} must be a list such as ['u_max'].")
+    found: dict[str, None] = {}  # each once
+    for given in names:
+        parts = re.fullmatch(r"(\w+)_(min|max)(?:\[(\d+)\])?", given)
+        if parts is None or parts[1] not in limits:
+            known = ", ".join(f"{each}_min, {each}_max" for each in limits)
+            raise ValueError(
+                f"parametric_bounds has {given!r}; known are {known}, and single entries such as "
+                "'u_max[0]'."
+            )
+        values = limits[parts[1]][parts[2] == "max"]
+        bounded = np.flatnonzero(np.isfinite(values)).tolist()
+        chosen = bounded if parts[3] is None else [int(parts[3])]
+        if any(i >= len(values) for i in chosen):
+            raise ValueError(
+                f"parametric_bounds has {given!r}, but the entries of {parts[1]} are "
+                f"{[*range(len(values))]}."
+            )
+        if not chosen or not set(chosen) <= set(bounded):
+            raise ValueError(
+                f"parametric_bounds has {given!r}, but {parts[1]}_{parts[2]} = {values.tolist()} "
+                "is no bound there: give it its widest value."
+            )
+        found |= {f"{parts[1]}_{parts[2]}[{i}]": None for i in chosen}
+    return tuple(found)
 
-    names: tuple[str, ...]
-    rest: Array
 
-    def __init__(self, names: Sequence[str] = (), rest: Given = None) -> None:
-        if isinstance(names, str) or not all(isinstance(each, str) for each in names):
-            raise TypeError(f"parametric_bounds = {names!r} must be a list such as ['u_max'].")
-        self._store(
-            names=tuple(names), rest=np.zeros(0) if rest is None else to_float("rest", rest)
-        )
+def bound_entry(name: str) -> tuple[str, int, bool]:
+    """Return the kind, the index, and whether it is an upper bound, of such as "u_max[0]"."""
+    side, _, index = name[:-1].partition("[")
+    kind, _, which = side.rpartition("_")
+    return kind, int(index), which == "max"
 
-    def sized(self, limits: Mapping[str, Bounds]) -> ParametricBounds:
-        """Return one entry for each bound, from the bounds of a problem by "x", "u", ..."""
-        found: dict[str, float] = {}
-        for given in self.names:
-            name, _, index = given.partition("[")
-            kind, _, side = name.rpartition("_")
-            if kind not in limits or side not in ("min", "max"):
-                known = ", ".join(f"{each}_min, {each}_max" for each in limits)
-                raise ValueError(f"parametric_bounds has {given!r}; known are {known}.")
-            values = limits[kind][side == "max"]
-            bounded = [f"{i}]" for i in np.flatnonzero(np.isfinite(values))]
-            chosen = [index] if index else bounded
-            if not chosen or not set(chosen) <= set(bounded):
-                raise ValueError(
-                    f"parametric_bounds has {given!r}, but {name} = {values.tolist()} is no bound "
-                    "there: give it its widest value."
-                )
-            found |= {f"{name}[{i}": float(values[int(i[:-1])]) for i in chosen}
-        return ParametricBounds([*found], [*found.values()])
 
-    def box(self, limits: Mapping[str, Bounds]) -> Bounds:
-        """Return how far each may move in: to the other side, a rate's to zero."""
-        sides = []
-        for name, rest in zip(self.names, self.rest, strict=True):
-            kind, i, upper = self.entry(name)
-            other = 0.0 if kind == "du" else float(limits[kind][not upper][i])
-            if not np.isfinite(other):
-                raise ValueError(
-                    f"parametric_bounds has {name!r}, but nothing says how far it moves in: give "
-                    f"{name.replace('max', 'min') if upper else name.replace('min', 'max')} a "
-                    "finite value."
-                )
-            sides.append(sorted((other, float(rest))))
-        low, high = np.array(sides, dtype=np.float64).reshape(-1, 2).T
-        return low, high
-
-    @staticmethod
-    def entry(name: str) -> tuple[str, int, bool]:
-        """Return the kind, the index, and whether it is an upper bound, of such as "u_max[0]"."""
-        side, _, index = name[:-1].partition("[")
-        kind, _, which = side.rpartition("_")
-        return kind, int(index), which == "max"
+def parametric_box(names: Sequence[str], limits: Mapping[str, Bounds]) -> Bounds:
+    """Return how far each bound may move in: to the other side, a rate's to zero."""
+    sides = []
+    for name in names:
+        kind, i, upper = bound_entry(name)
+        other = 0.0 if kind == "du" else float(limits[kind][not upper][i])
+        if not np.isfinite(other):
+            wanted = check.sides_of("MixedBounds" if kind == "mixed" else kind)[not upper]
+            raise ValueError(
+                f"parametric_bounds has {name!r}, but nothing says how far it moves in: give "
+                f"{wanted} a finite entry {i}."
+            )
+        sides.append(sorted((other, float(limits[kind][upper][i]))))
+    low, high = np.array(sides, dtype=np.float64).reshape(-1, 2).T
+    return low, high
 
 
 @dataclass(frozen=True, eq=False, init=False)

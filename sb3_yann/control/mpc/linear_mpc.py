@@ -32,11 +32,12 @@ from sb3_yann.control.mpc.groups import (
     LinearCost,
     MixedBounds,
     OutputBounds,
-    ParametricBounds,
     RateLimits,
     SoftBounds,
     Terminal,
     Tracking,
+    parametric_box,
+    parametric_names,
 )
 from sb3_yann.control.mpc.kept_set import KeptSet, kept_set
 from sb3_yann.control.mpc.misread_bounds import Range, warn_of_misread_bounds
@@ -44,7 +45,7 @@ from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import hard_rows, invariant_set
 from sb3_yann.control.mpc.value import Value
-from sb3_yann.control.online import OnlineLaw
+from sb3_yann.control.online import OnlineLaw, steepness
 
 if TYPE_CHECKING:
     from sb3_yann.control.linearization.simulator import Maker
@@ -117,9 +118,8 @@ class LinearMPC(MPCProblem):
     price : LinearCost, optional
         Linear terms p and q of the stage cost.
     parametric_bounds : list of str, optional
-        Bounds that change at run time, such as ["u_max"]: they join theta. The problem's own are
-        the widest, and each may move in to the other side. A law counts them from the widest:
-        ask :meth:`PiecewiseAffine.plant_input`, also where the model has no operating point.
+        Bounds that change at run time, such as ["u_max"] or ["u_max[0]", "mixed_min"]: they join
+        theta. The problem's own are the widest, and each may move in to the other side.
     control_horizon : int or sequence of int, optional
         The number of samples in which the inputs move, before they stay; or for how many samples
         each move is held, which sum up to the horizon. The default is each sample.
@@ -161,7 +161,7 @@ class LinearMPC(MPCProblem):
         terminal: Terminal | None = None,
         mixed: MixedBounds | None = None,
         price: LinearCost | None = None,
-        parametric_bounds: ParametricBounds | Sequence[str] = (),
+        parametric_bounds: Sequence[str] = (),
         control_horizon: int | Sequence[int] | None = None,
     ) -> None:
         if isinstance(model, Identified):
@@ -182,10 +182,8 @@ class LinearMPC(MPCProblem):
         soft = _as_group("soft", soft, SoftBounds).sized(x, y, mixed.soft)
         price = _as_group("price", price, LinearCost).sized(n, m)
         terminal = _as_group("terminal", terminal, Terminal)
-        if not isinstance(parametric_bounds, ParametricBounds):
-            parametric_bounds = ParametricBounds(parametric_bounds)
         limits = {"x": x, "u": u, "y": y, "du": du, "mixed": (mixed.low, mixed.high)}
-        parametric_bounds = parametric_bounds.sized(limits)
+        parametric_bounds = parametric_names(parametric_bounds, limits)
         extra: dict[str, Any] = {
             "mixed": mixed,
             "price": price,
@@ -193,9 +191,9 @@ class LinearMPC(MPCProblem):
             "control_horizon": arguments.as_control_horizon(control_horizon, horizon),
         }
         arguments.require_preview_within(model, horizon, tracking.preview, d.preview)
-        layout = layout_of(model, tracking, rate, d.preview, parametric_bounds.names)
+        layout = layout_of(model, tracking, rate, d.preview, parametric_bounds)
         rest = arguments.constant_box(layout, (tracking.r_min, tracking.r_max), (d.d_min, d.d_max))
-        rest += [parametric_bounds.box(limits)]
+        rest += [parametric_box(parametric_bounds, limits)]
         rest += [u] if layout.n_previous else []
         fallback = arguments.softened_box(x, soft.x)
         theta = arguments.theta_box(layout, (theta_min, theta_max), fallback, rest)
@@ -215,8 +213,7 @@ class LinearMPC(MPCProblem):
         )  # fmt: skip
         completed = _completed(MPCProblem(*checked, terminal, **extra))
         if soft.penalty is None:
-            unfinished = MPCProblem(*checked, completed, **extra)
-            soft._store(penalty=_default_penalty(unfinished.deviations))
+            _choose_penalty(MPCProblem(*checked, completed, **extra).deviations)
         super().__init__(*checked, completed, **extra)
         if not np.any(model.B):
             raise ValueError(
@@ -507,8 +504,21 @@ def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> 
     )
 
 
-def _default_penalty(problem: MPCProblem) -> float:
-    """Return 100 times the cost of coming back from the bounds, at most, with inputs at theirs.
+def _choose_penalty(problem: MPCProblem) -> None:
+    """Store 100 times the cost of coming back from the bounds, or less, down to that cost.
+
+    Less where a slack would cost so much more than inputs that solvers lose digits.
+    """
+    soft = problem.soft
+    cost = _cost_of_coming_back(problem)
+    soft._store(penalty=100 * cost)
+    with contextlib.suppress(ValueError):  # the laws say so
+        steep = steepness(condense(problem)[0], problem.u_min, problem.u_max)
+        soft._store(penalty=cost * max(1.0, 100 / max(steep, 1.0)))
+
+
+def _cost_of_coming_back(problem: MPCProblem) -> float:
+    """Return the cost of coming back from the bounds, at most, with inputs at theirs.
 
     A unit of violation that is larger than a bound counts as so many times more.
     """
@@ -532,4 +542,4 @@ def _default_penalty(problem: MPCProblem) -> float:
             "neither states nor inputs have a bound that costs anything. Pass the cost of one unit "
             "of violation."
         )
-    return float(100 * total * wide)
+    return float(total * wide)

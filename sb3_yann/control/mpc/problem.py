@@ -17,11 +17,11 @@ from sb3_yann.control.mpc.groups import (
     LinearCost,
     MixedBounds,
     OutputBounds,
-    ParametricBounds,
     RateLimits,
     SoftBounds,
     Terminal,
     Tracking,
+    bound_entry,
 )
 from sb3_yann.control.mpc.steady_state import SteadyStates, steady_states
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
@@ -45,8 +45,10 @@ class MPCProblem(ReadOnlyArrays):
     horizon, gamma, infeasible : int, float and str
     x_min, x_max, u_min, u_max, theta_min, theta_max : ndarray, shapes (n,), (m,) and (n_theta,)
         Infinite where there is no bound.
-    tracking, disturbances, rate, outputs, soft, terminal, mixed, price, parametric_bounds
+    tracking, disturbances, rate, outputs, soft, terminal, mixed, price
         Groups such as `Tracking`, never None, and in the sizes of the model.
+    parametric_bounds : tuple of str
+        Such as "u_max[0]".
     control_horizon : int, tuple of int or None
 
     All of it is in plant units where the model has an operating point, and in the model's own
@@ -73,7 +75,7 @@ class MPCProblem(ReadOnlyArrays):
     terminal: Terminal
     mixed: MixedBounds = field(default_factory=MixedBounds)
     price: LinearCost = field(default_factory=LinearCost)
-    parametric_bounds: ParametricBounds = field(default_factory=ParametricBounds)
+    parametric_bounds: tuple[str, ...] = ()
     control_horizon: int | tuple[int, ...] | None = None
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -83,7 +85,7 @@ class MPCProblem(ReadOnlyArrays):
             state = {
                 "mixed": MixedBounds().sized(model.n_states, model.n_inputs),
                 "price": LinearCost().sized(model.n_states, model.n_inputs),
-                "parametric_bounds": ParametricBounds(),
+                "parametric_bounds": (),
                 **{name: value for name, value in state.items() if name != "layout"},
             }
         if "absolute" in state:
@@ -118,8 +120,8 @@ class MPCProblem(ReadOnlyArrays):
     @cached_property
     def layout(self) -> ThetaLayout:
         """What theta holds."""
-        ahead, bounds = self.disturbances.preview, self.parametric_bounds.names
-        return layout_of(self.model, self.tracking, self.rate, ahead, bounds)
+        ahead = self.disturbances.preview
+        return layout_of(self.model, self.tracking, self.rate, ahead, self.parametric_bounds)
 
     @cached_property
     def blocks(self) -> tuple[int, ...]:
@@ -152,7 +154,7 @@ class MPCProblem(ReadOnlyArrays):
 
     @cached_property
     def limits(self) -> dict[str, tuple[Array, Array]]:
-        """The bounds of x, u, y, du, and of mixed rows."""
+        """The bounds of x, u, y, du, and of mixed rows; the widest of those that change."""
         return {
             "x": (self.x_min, self.x_max),
             "u": (self.u_min, self.u_max),
@@ -161,27 +163,26 @@ class MPCProblem(ReadOnlyArrays):
             "mixed": (self.mixed.low, self.mixed.high),
         }
 
-    def moved_by(self, kind: str) -> tuple[Array, Array]:
-        """Return how lower and upper bounds of a kind change with theta, (k, n_theta) each.
+    def limit_rows(self, kind: str) -> tuple[Array, Array, Array, Array]:
+        """Return low, high (k,) and L, H (k, n_theta) of ``low + L theta`` and ``high + H theta``.
 
-        They are those of `limits` where theta has them at rest.
+        A bound that changes at run time is its entry of theta.
         """
-        low, high = (np.zeros((len(side), self.n_theta)) for side in self.limits[kind])
-        first = self.layout.limits.start
-        for at, name in enumerate(self.parametric_bounds.names, start=first):
-            of, i, upper = ParametricBounds.entry(name)
+        low, high = (np.array(side) for side in self.limits[kind])
+        L, H = (np.zeros((len(side), self.n_theta)) for side in (low, high))
+        for at, name in enumerate(self.parametric_bounds, start=self.layout.limits.start):
+            of, i, upper = bound_entry(name)
             if of == kind:
-                (high if upper else low)[i, at] = 1.0
-        return low, high
+                (high if upper else low)[i] = 0.0
+                (H if upper else L)[i, at] = 1.0
+        return low, high, L, H
 
     def limits_at(self, kind: str, thetas: Array) -> tuple[Array, Array]:
         """Return lower and upper bounds of a kind, such as "u", at thetas (..., n_theta)."""
-        low, high = self.limits[kind]
-        if not any(ParametricBounds.entry(name)[0] == kind for name in self.layout.bounds):
-            return low, high
-        moved = thetas - self.theta_ss
-        low_moves, high_moves = self.moved_by(kind)
-        return low + moved @ low_moves.T, high + moved @ high_moves.T
+        if not any(bound_entry(name)[0] == kind for name in self.parametric_bounds):
+            return self.limits[kind]
+        low, high, L, H = self.limit_rows(kind)
+        return low + thetas @ L.T, high + thetas @ H.T
 
     @property
     def n_theta(self) -> int:
@@ -192,12 +193,23 @@ class MPCProblem(ReadOnlyArrays):
     def theta_ss(self) -> Array:
         """Theta at the operating point in plant units (n_theta,): x_ss, C x_ss, d_ss, u_ss.
 
-        Bounds that change at run time are their widest there.
+        Bounds that change at run time count from what they bound: those of u from u_ss.
         """
-        model = self.model
-        parts = model.x_ss, self.tracking.C @ model.x_ss, model.d_ss
-        rest = self.parametric_bounds.rest, model.u_ss[: self.layout.n_previous]
-        return np.asarray(self.layout.lift @ np.concatenate([*parts, *rest]))
+        x, u = self.model.x_ss, self.model.u_ss
+        y, mixed = self.outputs.C @ x, self.mixed.F @ x + self.mixed.G @ u
+        bounded = {"x": x, "u": u, "y": y, "du": np.zeros_like(u), "mixed": mixed}
+        entries = map(bound_entry, self.parametric_bounds)
+        bounds = np.array([bounded[kind][i] for kind, i, _ in entries])
+        parts = x, self.tracking.C @ x, self.model.d_ss, bounds, u[: self.layout.n_previous]
+        return np.asarray(self.layout.lift @ np.concatenate(parts))
+
+    @cached_property
+    def theta_rest(self) -> Array:
+        """Theta at rest in deviations (n_theta,): zero, and the widest of bounds that change."""
+        rest, limits = np.zeros(self.n_theta), self.deviations.limits
+        entries = map(bound_entry, self.parametric_bounds)
+        rest[self.layout.limits] = [limits[kind][upper][i] for kind, i, upper in entries]
+        return rest
 
     @property
     def set_points(self) -> dict[int, int]:
@@ -218,7 +230,7 @@ class MPCProblem(ReadOnlyArrays):
             p = self.layout.n_references
             for state, at in self.set_points.items():
                 for k in range(self.layout.previews[0] + 1):
-                    later = f", {k} samples ahead" if k else ""
+                    later = f", {k} sample{'s' * (k > 1)} ahead" if k else ""
                     found[at + k * p] = f"set-point of {states[state]}{later}"
         if model.input_names or (units and model.units):
             previous = inputs[: self.layout.n_previous]

@@ -49,7 +49,7 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
         "d": "disturbance, constant over the horizon",
         "u_prev": "input of the step before",
     }
-    points, rests = problem.theta_ss, problem.units.shifted
+    points, rests = problem.units.to_plant(problem.theta_rest), problem.units.shifted
     how = "in plant units; the operating point is in brackets" if rests else "in theta"
     yield f"Parameters of the law, {problem.n_theta}, {how}:"
     labels, names = problem.labels(units=True), problem.layout.names
@@ -61,7 +61,7 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
         kind, index = name[:-1].split("[")
         kind, _, ahead = (kind, "", "") if kind in meanings else kind.partition("_")
         what = meanings.get(kind if ahead.isdigit() or not ahead else "", BOUND)
-        later = f", {ahead} samples ahead" if ahead.isdigit() else ""
+        later = f", {ahead} sample{'s' * (ahead != '1')} ahead" if ahead.isdigit() else ""
         meaning = f"{shown[i]:<{room}}{what} {index}{later}"
         if kind == "d" and int(index) in problem.model.estimated:
             meaning += ", which an observer estimates"
@@ -153,7 +153,7 @@ def _values(problem: MPCProblem, law: Law, feasible: Array) -> Iterator[str]:
     units = problem.units
     # In parentheses: rich would take names in brackets for its markup.
     yield f"The law at a few parameters ({', '.join(problem.labels())}):"
-    for theta in np.vstack([np.zeros((1, problem.n_theta)), feasible[:3]]):
+    for theta in np.vstack([problem.theta_rest, feasible[:3]]):
         where = "" if law.in_domain(theta) else " (not feasible)"
         shown, taken = _numbers(units.to_plant(theta)), _numbers(units.input_to_plant(law(theta)))
         yield f"  {shown} -> {u} = {taken}{where}"

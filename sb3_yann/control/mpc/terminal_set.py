@@ -43,13 +43,15 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     gain, half = errors.to_input - K @ errors.to_error, problem.theta_half
     rows, bounds = hard_rows(problem)
     rows = rows @ np.vstack([np.eye(problem.n_theta), gain])
+    rest = problem.theta_rest  # which the law keeps: all of it counts from there
+    bounds = bounds - rows @ rest
     A, B = problem.prediction
     rows, closed = rows * half, (A + B @ gain) * half / half[:, None]
     steady = rows @ _steady_projection(problem, half)
     if np.any(bounds <= 0):
         raise ValueError(
             "Terminal(set='invariant') needs an operating point with room to every bound, but "
-            "theta = 0 lies on or beyond a hard one. Move the bounds or the operating point."
+            "it lies on or beyond a hard one. Move the bounds or the operating point."
         )
     granted = _granted(problem, half)
     found = _remove_redundant((rows, bounds), granted)
@@ -59,7 +61,7 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
         found = np.vstack([found[0], inside[0]]), np.concatenate([found[1], inside[1]])
     found = _until_nothing_new((rows, bounds), closed, found, granted)
     F, g = _remove_redundant(found, granted)
-    return F / half, g
+    return F / half, g + F @ (rest / half)
 
 
 def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -> Rows:
@@ -100,9 +102,8 @@ def hard_rows(problem: MPCProblem, kinds: tuple[str, ...] = ("u", "x", "y", "du"
         if kind in values:
             value = values[kind]
             hard = softness.get(kind, np.zeros(len(value))) == 0
-            low_moves, high_moves = (each @ theta for each in problem.moved_by(kind))
-            low, high = problem.limits[kind]
-            rows += [(value - high_moves)[hard], (low_moves - value)[hard]]
+            low, high, L, H = problem.limit_rows(kind)
+            rows += [(value - H @ theta)[hard], (L @ theta - value)[hard]]
             ends += [high[hard], -low[hard]]
     found, bounds = np.concatenate(rows), np.concatenate(ends)
     bounded = np.isfinite(bounds)
@@ -123,7 +124,8 @@ def _granted(problem: MPCProblem, half: Array) -> Rows:
     """Return the half-spaces that every predicted theta satisfies anyway."""
     first = problem.layout.constant.start
     rows = np.vstack([np.eye(problem.n_theta)[first:], -np.eye(problem.n_theta)[first:]])
-    bounds = np.concatenate([problem.theta_max[first:], -problem.theta_min[first:]])
+    rest = problem.theta_rest[first:]
+    bounds = np.concatenate([problem.theta_max[first:] - rest, rest - problem.theta_min[first:]])
     bounds = bounds / np.tile(half[first:], 2)
     bounded = np.isfinite(bounds)
     return rows[bounded], bounds[bounded]

@@ -66,7 +66,7 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
             "discount. Pass a gamma below 1."
         )
     A, B = problem.prediction
-    theta: Array = np.zeros(problem.n_theta)
+    theta = problem.theta_rest
     for _ in range(REST_STEPS):
         u = law(theta)
         before, theta = theta, A @ theta + B @ u
@@ -94,21 +94,21 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
 
 
 def gain_at_rest(problem: MPCProblem, law: Law) -> Array:
-    """Return K (m, n_z) with ``v = -K z`` near the origin.
+    """Return K (m, n_z) with ``v = -K z`` near rest.
 
     Raises
     ------
     ValueError
-        If the law does not rest at the origin, or, near it, at the steady states of r and d.
+        If the law does not rest there, or, near it, at the steady states of r and d.
     """
     errors = problem.error_system
-    origin, unit = np.zeros(problem.n_theta), 2 * problem.u_half
-    if not law.in_domain(origin) or np.any(np.abs(law(origin)) > 1e-9 * unit):
+    rest, unit = problem.theta_rest, 2 * problem.u_half
+    if not law.in_domain(rest) or np.any(np.abs(law(rest)) > 1e-9 * unit):
         raise ValueError(
             "The law does not rest at the origin: theta = 0 must be feasible with u = 0. "
             "Choose an operating point inside the bounds, and boxes of parameters that hold 0."
         )
-    gains = law.gain(origin)
+    gains = law.gain(rest)
     K = -gains @ errors.to_theta
     box = np.maximum(np.abs(problem.theta_min), np.abs(problem.theta_max))
     if np.any(np.abs(gains - (errors.to_input - K @ errors.to_error)) @ box > 1e-6 * unit):

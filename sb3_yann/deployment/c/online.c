@@ -118,10 +118,17 @@ static int qp_add(int entering, real violation, int size, int most, int soft)
     }
 }
 
-/* Solve anew for the active set in ascending order; return whether all conditions hold. */
+/*
+ * Solve anew for the active set in ascending order; return whether all conditions hold. Where
+ * constraints give way multipliers are a million times as large as d, and sums of them round.
+ */
 static int qp_is_optimal(int size, int soft)
 {
-    real largest = ZERO;
+    const real tolerance = soft ? 1e-6 : 1e-9;
+    real largest = ZERO, least = ZERO;
+    for (int j = 0; soft && j < QP_ROWS; j++) {
+        least = FABS(qp_d[j]) > least ? FABS(qp_d[j]) : least;
+    }
     for (int i = 1; i < size; i++) {
         const int own = qp_active[i];
         int k = i;
@@ -142,7 +149,7 @@ static int qp_is_optimal(int size, int soft)
         largest = FABS(qp_lam[i]) > largest ? FABS(qp_lam[i]) : largest;
     }
     for (int i = 0; i < size; i++) {
-        if (!(qp_lam[i] >= -1e-9 * (ONE + largest))) {
+        if (!(qp_lam[i] >= -tolerance * (ONE + largest))) {
             return 0;
         }
         qp_lam[i] = qp_lam[i] > ZERO ? qp_lam[i] : ZERO;
@@ -153,13 +160,13 @@ static int qp_is_optimal(int size, int soft)
         for (int k = 0; k < size; k++) {
             rest += qp_gram[row][qp_active[k]] * qp_lam[k];
         }
-        if (!(FABS(rest) <= 1e-9 * (ONE + FABS(qp_d[row])))) {
+        if (!(FABS(rest) <= tolerance * (ONE + (soft ? least : FABS(qp_d[row]))))) {
             return 0;
         }
     }
     qp_slacks(size);
     for (int j = 0; j < QP_ROWS; j++) {
-        if (!(qp_slack[j] >= -1e-9 * (ONE + FABS(qp_d[j])))) {
+        if (!(qp_slack[j] >= -tolerance * (ONE + (soft ? least : FABS(qp_d[j]))))) {
             return 0;
         }
     }

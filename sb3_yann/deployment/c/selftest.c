@@ -29,21 +29,28 @@ static double worst(const yann_real found[], const yann_real wanted[])
     return largest;
 }
 
+/* Where the MPC has no solution constraints give way, which costs digits. */
+static double room_at(unsigned status)
+{
+    return status & YANN_OUTSIDE ? @ROOM_OUTSIDE@ : @ROOM_INSIDE@;
+}
+
 int main(void)
 {
     static yann_state state;
     yann_real action[YANN_N_INPUTS];
-    double by_policy = 0.0, by_law = 0.0, by_step = 0.0;
+    double by_policy = 0.0, by_law = 0.0, by_step = 0.0, room = 0.0;
     int wrong = 0;
     for (int k = 0; k < N_POINTS; k++) {
-        (void)yann_policy(points[k], action);
+        room = room_at(yann_policy(points[k], action));
         by_policy = fmax(by_policy, worst(action, policy[k]));
-        wrong += !(worst(action, policy[k]) <= @ROOM@);
+        wrong += !(worst(action, policy[k]) <= room);
         (void)yann_law(points[k], action);
         by_law = fmax(by_law, worst(action, law[k]));
-        wrong += !(worst(action, law[k]) <= @ROOM@);
+        wrong += !(worst(action, law[k]) <= room);
     }
     yann_init(&state);
+    room = 0.0;
     for (int k = 0; k < N_STEPS; k++) {
         yann_real obs[YANN_N_OBS];
         for (int i = 0; i < YANN_N_OBS; i++) {
@@ -54,8 +61,9 @@ int main(void)
         }
         const unsigned found =
             yann_step(&state, obs, elapsed[k], (yann_mode)requests[k], NULL, action);
+        room = fmax(room, room_at(found)); /* an output is held, and fades */
         by_step = fmax(by_step, worst(action, actions[k]));
-        wrong += !(worst(action, actions[k]) <= @ROOM@);
+        wrong += !(worst(action, actions[k]) <= room);
         wrong += found != (unsigned)status[k] || state.mode != (yann_mode)modes[k];
     }
     printf("@FILE@: largest error %.2g (policy), %.2g (law), %.2g (steps) of the range; %s\n",

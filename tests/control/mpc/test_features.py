@@ -24,6 +24,7 @@ from sb3_yann import (
     Terminal,
     Tracking,
 )
+from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
 from sparse_qp import FEATURES, SparseQP, Spec, draw, problem, worst_difference
 
 Array = NDArray[np.float64]
@@ -70,12 +71,13 @@ def _bellman(mpc: LinearMPC, gamma: float) -> float:
     """Return the largest residual of the value near where the law rests, relative to costs."""
     own, law = mpc.deviations, mpc.law("online")
     value, (A, B) = mpc.value_terms(gamma), own.prediction
-    theta = np.zeros(mpc.n_theta)
+    theta = own.theta_rest
     for _ in range(3000):
         theta = A @ theta + B @ law(theta)
     rng = np.random.default_rng(1)
     points = theta + 1e-4 * rng.uniform(-1, 1, (40, mpc.n_theta)) * own.theta_half
-    points[:, own.layout.limits] = np.minimum(points[:, own.layout.limits], 0)
+    limits = own.layout.limits
+    points[:, limits] = np.clip(points, own.theta_min, own.theta_max)[:, limits]
     u = law(points)
     following = points @ A.T + u @ B.T
     stage = own.stage_cost(points, u)
@@ -113,6 +115,54 @@ def test_bounds_that_change_hold_at_each_theta() -> None:
         plain = cart(u_max=limit, rate=RateLimits(-0.7, 0.7), theta_min=-5, theta_max=5)
         theta = np.array([-2.0, 0.3, limit, -5.0, 0.0])
         assert law.plant_input(theta) == pytest.approx(plain.online()(theta[[0, 1, 4]]), abs=1e-9)
+
+
+def test_a_law_takes_bounds_as_they_are_where_the_model_has_no_operating_point() -> None:
+    mixed = MixedBounds(F=[[1, 1]], low=-7, high=7)
+    changing = ["u_max", "u_min", "x_max[1]", "mixed_max"]
+    mpc = cart(u_max=3, mixed=mixed, parametric_bounds=changing, horizon=3)
+    plain = cart(u_max=1, u_min=-0.5, mixed=MixedBounds(F=[[1, 1]], low=-7, high=6), horizon=3,
+                 x_max=[5, 2], theta_max=5)  # fmt: skip
+    bounds = [1.0, -0.5, 2.0, 6.0]
+    for state in ([-4.0, 0.5], [3.0, 1.9], [4.5, 0.0], [-4.0, 1.0]):
+        theta = np.array([*state, *bounds])
+        expected = plain.online()(state)
+        for law in (mpc.online(), mpc.explicit()):
+            assert law(theta) == pytest.approx(expected, abs=1e-9)
+            assert law.plant_input(theta) == pytest.approx(expected, abs=1e-9)
+    np.testing.assert_array_equal(mpc.theta_ss, np.zeros(mpc.n_theta))
+    assert mpc.theta_rest.tolist() == [0, 0, 3, -1, 5, 7]
+
+
+def test_an_operating_point_moves_bounds_that_change_as_all_else() -> None:
+    x, u = np.array([10.0, 20.0]), np.array([4.0])
+    parts: dict[str, Any] = {"parametric_bounds": ["u_max", "x_min", "du_max", "mixed_max"]}
+    parts |= {"rate": RateLimits(-0.9, 0.9)}
+    own = cart(mixed=MixedBounds([[1, 0]], [[1]], -4, 4), **parts)
+    shown = cart(
+        LinearModel(CART.A, CART.B, 1.0, x_ss=x, u_ss=u), x_min=x - 5, x_max=x + 5, u_min=3,
+        u_max=5, mixed=MixedBounds([[1, 0]], [[1]], 10, 18), **parts,
+    )  # fmt: skip
+    assert shown.deviations == own
+    assert shown.theta_ss.tolist() == [10, 20, 4, 10, 20, 0, 14, 4]
+    rng = np.random.default_rng(0)
+    theta = rng.uniform(own.theta_min, own.theta_max, (50, own.n_theta))
+    at = shown.units.to_plant(theta)
+    np.testing.assert_allclose(shown.online()(theta), own.online()(theta), atol=1e-12)
+    np.testing.assert_allclose(shown.online().plant_input(at), own.online()(theta) + 4, atol=1e-12)
+    for kind in ("x", "u", "du", "mixed"):
+        middle = {"x": x, "u": u, "du": 0, "mixed": 14}[kind]
+        for one, two in zip(shown.limits_at(kind, at), own.limits_at(kind, theta), strict=True):
+            np.testing.assert_allclose(one - middle, two, atol=1e-12)
+
+
+def test_states_between_a_bound_in_theta_and_another_exceed_the_nearer_one() -> None:
+    mpc = cart(parametric_bounds=["x_max[0]"])
+    thetas = np.array([[0, 0, 5.0], [4.0, 0, 3.0], [4.0, 0, 5.0]])
+    inputs = np.zeros((2, 1))
+    assert bound_excess(mpc, thetas, inputs).largest == pytest.approx(1 / 5)
+    near = Bounds.of(mpc, high=[2, np.inf])
+    assert bound_excess(mpc, thetas, inputs, bounds=near).largest == pytest.approx(2 / 5)
 
 
 def test_mixed_bounds_hold_in_closed_loop() -> None:
@@ -193,7 +243,10 @@ def test_a_preview_makes_up_for_a_dead_time_as_well_as_a_sparse_program() -> Non
         ({"control_horizon": "3"}, TypeError, "must be a number of samples, or a list"),
         ({"tracking": Tracking([0], -1, 1, preview=7)}, ValueError, "looks no further"),
         ({"parametric_bounds": ["v_max"]}, ValueError, "known are x_min"),
-        ({"parametric_bounds": ["u_max[1]"]}, ValueError, "is no bound there"),
+        ({"parametric_bounds": ["u_max[1]"]}, ValueError, r"the entries of u are \[0\]"),
+        ({"parametric_bounds": ["u_max[x]"]}, ValueError, "single entries such as 'u_max"),
+        ({"mixed": MixedBounds(G=[[1]])}, ValueError, "Row 0 of MixedBounds has no bound"),
+        ({"mixed": MixedBounds(G=[[1]], high=[1, 2])}, ValueError, "MixedBounds.high has shape"),
         ({"parametric_bounds": "u_max"}, TypeError, r"a list such as \['u_max'\]"),
         ({"x_min": None, "theta_min": -5, "parametric_bounds": ["x_max"]}, ValueError, "how far"),
         ({"mixed": MixedBounds(F=[[0, 0]], high=1)}, ValueError, "bounds nothing"),
