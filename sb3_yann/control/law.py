@@ -161,10 +161,13 @@ class PlantLaw(ReadOnlyArrays):
         law = cls(**{name: each if each.ndim else each.item() for name, each in values.items()})
         if not any(name == "theta_ss" or name.startswith("model_") for name in data):
             return law
-        own = [each.name for each in fields(LinearModel) if each.name != "C" or "model_C" in data]
+        names = [each.name for each in fields(LinearModel)]
+        # Files of before do not hold the last ones.
+        later = {"C", "time_unit"}
+        own = [name for name in names if name not in later or f"model_{name}" in data]
         given = {name: data[f"model_{name}"] for name in own}
-        for name in ("notes", "state_names", "input_names", "units", "estimated"):
-            given[name] = given[name].tolist()
+        for name in ("notes", "state_names", "input_names", "units", "estimated", "time_unit"):
+            given[name] = given[name].tolist() if name in given else ""
         model = LinearModel(**{**given, "dt": float(given["dt"])})
         if model.n_inputs != law.n_inputs or model.n_states > law.n_theta:
             raise ValueError(f"its model has {model.n_states} states and {model.n_inputs} inputs")
