@@ -1,8 +1,8 @@
 """What there is to gain over an MPC, and a better policy from a twin or a simulator."""
 
 from sb3_yann.improvement.gains import Headroom
-from sb3_yann.improvement.headroom import headroom
-from sb3_yann.improvement.improve import Improvement, improve
+from sb3_yann.improvement.improving import Improvement, improve
+from sb3_yann.improvement.measuring import headroom
 from sb3_yann.improvement.trial import Check
 
 __all__ = ["Check", "Headroom", "Improvement", "headroom", "improve"]

@@ -6,7 +6,7 @@ from sb3_yann.policy.checks import register_problem
 from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.policy.ppo import YannPPOPolicy
-from sb3_yann.policy.retarget import retarget
+from sb3_yann.policy.retargeting import retarget
 from sb3_yann.policy.sac import YannSACPolicy
 
 __all__ = [

@@ -19,7 +19,7 @@ from sb3_yann.control import PiecewiseAffine
 from sb3_yann.evaluation.plots import plot_decisions, plot_headroom, plot_twin
 from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of
-from sb3_yann.improvement.improve import fingerprint
+from sb3_yann.improvement.improving import fingerprint
 from sb3_yann.reporting.html import Html, join, lines, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import Finding, Part, Subject, left_out, make_finding
 

@@ -18,7 +18,7 @@ from sb3_yann.control.mpc.choice import Law
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.state import GuardState
 from sb3_yann.improvement import Headroom
-from sb3_yann.improvement.improve import Improvement, fingerprint
+from sb3_yann.improvement.improving import Improvement, fingerprint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.reporting.html import Html, tag

@@ -36,7 +36,7 @@ from weights import is_mpc
 
 UNSEEN = range(900, 930)
 SIMULATED = {kind: {"simulator": True} for kind in (SAC, TQC, PPO)}
-module = importlib.import_module("sb3_yann.improvement.improve")
+module = importlib.import_module("sb3_yann.improvement.improving")
 
 
 @pytest.fixture(autouse=True)

@@ -33,7 +33,7 @@ from sb3_yann import (
     report,
 )
 from sb3_yann.evaluation import evaluate
-from sb3_yann.improvement.improve import Improvement
+from sb3_yann.improvement.improving import Improvement
 from sb3_yann.improvement.trial import Check
 from sb3_yann.reporting import assemble, evidence_parts, loop_parts, problem_parts
 from sb3_yann_envs import problems
