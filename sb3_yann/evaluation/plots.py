@@ -388,16 +388,17 @@ def loops_figure(
 ) -> Figure:
     """Return a figure of quantities over time, in plant units, with limits and set-points.
 
-    Up to six episodes are lines, and controllers share a panel. Of more, each controller has its
-    own, one below the other: a line is the median, a dark band holds 80 % of the episodes, and a
-    light one all. Where some episodes have ended, the others count.
+    Up to six episodes are lines. Of more, a line is their median and a band holds 80 % of them, and
+    what has a set-point is drawn as its distance from it; a panel below holds the differences of
+    the other controllers from the first one, where all were played from the same starts. Where
+    some episodes have ended, the others count.
 
     Parameters
     ----------
     problem : LinearMPC
         With the operating point, limits, names and units.
     runs : mapping of str to Trajectories
-        By controller, the first one uppermost; their observations are theta.
+        By controller; their observations are theta.
     quantities : sequence of int or str, optional
         Entries of ``[theta, u]``: indices, or names as in ``problem.labels()``, or an input's; all
         states and inputs by default.
@@ -421,23 +422,23 @@ def loops_figure(
         n = problem.n_theta
         quantities = [*range(problem.model.n_states), *range(n, n + problem.model.n_inputs)]
     entries = [_entry_of(problem, each, inputs=True) for each in quantities]
-    many = max(len(each.costs) for each in runs.values()) > MAX_LINES
-    groups: list[Runs] = [{name: runs[name]} for name in runs] if many else [runs]
+    counts = {len(each.costs) for each in runs.values()}
+    height = 2 if len(runs) > 1 and len(counts) == 1 and counts.pop() > MAX_LINES else 1
     columns = min(3, len(entries))
-    rows = -(-len(entries) // columns) * len(groups)
+    rows = -(-len(entries) // columns) * height
     figure = new_figure(3.2 * columns + 0.4, 1.9 * rows + 0.6)
     panels = figure.subplots(rows, columns, squeeze=False)
-    for k in range(rows // len(groups) * columns):
+    for k in range(rows // height * columns):
         block, column = divmod(k, columns)
-        own = panels[block * len(groups) : (block + 1) * len(groups), column]
+        own = panels[block * height : (block + 1) * height, column]
         if k >= len(entries):
             for panel in own:
                 panel.set_axis_off()
             continue
-        _draw_loops([*own], problem, groups, entries[k])
-        for panel, group in zip(own, groups, strict=True):
-            if column == 0 and many and len(groups) > 1:
-                panel.set_title(next(iter(group)), loc="left", fontsize="medium")
+        _draw_loops(own[0], problem, runs, entries[k])
+        if height > 1:
+            _draw_differences(own[1], problem, runs, entries[k])
+        own[-1].set_xlabel(_time_label(problem))
     found: dict[str, Any] = {}
     for panel in panels.ravel():
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -451,43 +452,63 @@ def loops_figure(
     return figure
 
 
-def _draw_loops(
-    panels: Sequence[Axes], problem: LinearMPC, groups: Sequence[Runs], entry: int
-) -> None:
-    """Draw one quantity, of each group of controllers in a panel: they share their range."""
-    n, number = problem.n_theta, 0
-    reference = problem.set_points.get(entry, entry)
-    every = [
-        rows[np.isfinite(rows)]
-        for group in groups
-        for each in group.values()
-        for rows in (_rows(each, entry, n), _rows(each, reference, n)[:, :-1])
-    ]
-    data = np.concatenate(every) if sum(map(len, every)) else np.array([0.0, 1.0])
-    label = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
-    for panel, group in zip(panels, groups, strict=True):
-        for name, episodes in group.items():
-            style: dict[str, Any] = {
-                "color": COLORS[number % len(COLORS)],
-                "drawstyle": "steps-post" if entry >= n else "default",
-            }
-            rows = _rows(episodes, entry, n)
-            _draw_rows(panel, rows, problem.model.dt, style, name)
-            number += 1
-        if reference != entry:  # the last set-point belongs to a step that is not taken
-            rows = np.unique(_rows(next(iter(group.values())), reference, n)[:, :-1], axis=0)
-            style = dict(SET_POINT)
-            if len(rows) > 1:
-                style |= {"alpha": 0.7 if len(rows) <= MAX_LINES else 0.35, "linewidth": 0.8}
-            time = problem.model.dt * np.arange(rows.shape[1])
-            for k, row in enumerate(rows):
-                style["label"] = "set-point" if k == 0 else "_nolegend_"
-                panel.plot(time, row, drawstyle="steps-post", **style)
-        _draw_limits(panel, problem, entry, float(data.min()), float(data.max()))
-        panel.set_ylabel(label)
-        panel.grid(alpha=0.3)
+def _time_label(problem: LinearMPC) -> str:
     unit = problem.model.time_unit
-    panels[-1].set_xlabel(f"time ({unit})" if unit else "time")
+    return f"time ({unit})" if unit else "time"
+
+
+def _draw_loops(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
+    """Draw one quantity of all controllers."""
+    n = problem.n_theta
+    reference = problem.set_points.get(entry, entry)
+    label = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
+    many = max(len(each.costs) for each in runs.values()) > MAX_LINES
+    every = []
+    for number, (name, episodes) in enumerate(runs.items()):
+        rows = _rows(episodes, entry, n)
+        if reference != entry and many:
+            # The last set-point belongs to a step that is not taken.
+            rows = rows[:, :-1] - _rows(episodes, reference, n)[:, :-1]
+        _draw_rows(axes, rows, problem.model.dt, _style(number, entry >= n), name)
+        every.append(rows[np.isfinite(rows)])
+    if reference != entry and many:
+        axes.axhline(0, **SET_POINT)  # type: ignore[arg-type]
+        axes.set_ylabel(f"{label}\nless its set-point")
+        axes.grid(alpha=0.3)
+        return
+    if reference != entry:
+        rows = np.unique(_rows(next(iter(runs.values())), reference, n)[:, :-1], axis=0)
+        time = problem.model.dt * np.arange(rows.shape[1])
+        for k, row in enumerate(rows):
+            name = "set-point" if k == 0 else "_nolegend_"
+            axes.plot(time, row, drawstyle="steps-post", label=name, **SET_POINT)  # type: ignore[arg-type]
+        every.append(rows[np.isfinite(rows)])
+    data = np.concatenate(every) if sum(map(len, every)) else np.array([0.0, 1.0])
+    _draw_limits(axes, problem, entry, float(data.min()), float(data.max()))
+    axes.set_ylabel(label)
+    axes.grid(alpha=0.3)
+
+
+def _draw_differences(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
+    """Draw by how much a quantity differs from the first controller's, from the same starts."""
+    first, *others = runs
+    base = _rows(runs[first], entry, problem.n_theta)
+    for number, name in enumerate(others, start=1):
+        rows = _rows(runs[name], entry, problem.n_theta)
+        steps = min(base.shape[1], rows.shape[1])
+        style = _style(number, entry >= problem.n_theta)
+        _draw_rows(axes, rows[:, :steps] - base[:, :steps], problem.model.dt, style, "_nolegend_")
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_ylabel(f"minus {first}")
+    axes.grid(alpha=0.3)
+
+
+def _style(number: int, held: bool) -> dict[str, Any]:
+    """Return how the lines of a controller are drawn; inputs are held for a sample."""
+    return {
+        "color": COLORS[number % len(COLORS)],
+        "drawstyle": "steps-post" if held else "default",
+    }
 
 
 def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:
@@ -502,19 +523,18 @@ def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:
 
 
 def _draw_rows(axes: Axes, rows: Array, dt: float, style: dict[str, Any], name: str) -> None:
-    """Draw lines of a few episodes; of many the median, and bands."""
+    """Draw lines of a few episodes; of many the median, and the band of 80 % of them."""
     time = dt * np.arange(rows.shape[1])
     if len(rows) <= MAX_LINES:
         for k, row in enumerate(rows):
             label = name if k == 0 else "_nolegend_"
             axes.plot(time, row, linewidth=1.1, alpha=0.85, label=label, **style)
         return
-    low, dark, middle, light, high = np.nanpercentile(rows, [0, 10, 50, 90, 100], axis=0)
+    low, middle, high = np.nanpercentile(rows, [10, 50, 90], axis=0)
     step = "post" if style["drawstyle"] == "steps-post" else None
-    band: dict[str, Any] = {"color": style["color"], "linewidth": 0, "step": step}
-    axes.fill_between(time, low, high, alpha=0.18, **band)
-    axes.fill_between(time, dark, light, alpha=0.35, **band)
-    label = f"{name}, median of {len(rows)} (dark: 80 %, light: all)"
+    axes.fill_between(time, low, high, alpha=0.2, color=style["color"], linewidth=0, step=step)
+    hidden = name.startswith("_")
+    label = name if hidden else f"{name}, median of {len(rows)}, and 80 % of them"
     axes.plot(time, middle, linewidth=1.7, label=label, **style)
 
 
@@ -543,6 +563,34 @@ def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: f
             axes.text(0.98, y, text, fontsize=7, **place)
     room = 0.06 * max(top - bottom, width)
     axes.set_ylim(bottom - room, top + room)
+
+
+def plot_gains(runs: Runs, axes: Axes | None = None) -> Axes:
+    """Draw by how much the second controller's cost differs from the first one's, start by start.
+
+    The starts are sorted by it. Where it costs more, the bar has the other color.
+
+    Parameters
+    ----------
+    runs : mapping of str to Trajectories
+        Two controllers, from the same starts.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure's by default.
+    """
+    (first, before), (second, after) = runs.items()
+    change = np.sort(after.costs - before.costs)
+    share = 100 * change / (abs(float(before.costs.mean())) or 1.0)
+    axes = axes_or_new(axes, 6.4, 2.6)
+    colors = [COLORS[2] if each <= 0 else COLORS[1] for each in share]
+    axes.bar(np.arange(1, len(share) + 1), share, color=colors, width=0.8)
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.axhline(float(share.mean()), color="black", linestyle="--", linewidth=0.8, label="mean")
+    axes.set(xlabel="start, sorted", ylabel=f"{second} minus {first}\n(% of {first}'s mean cost)")
+    axes.locator_params(axis="x", integer=True)
+    axes.grid(axis="y", alpha=0.3)
+    axes.set_axisbelow(True)
+    legend_beside(axes)
+    return axes
 
 
 # ---- Decisions of a guard ----

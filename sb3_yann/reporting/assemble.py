@@ -154,6 +154,8 @@ def _body(title: str, parts: Sequence[Part]) -> list[Html]:
             rows.append([verdict, found.text, tag("a", str(k), href=f"#part-{k}")])
             counts[found.verdict] += 1
     summary = f"{counts['passed']} checks passed, {counts['failed']} failed."
+    if counts["look"]:
+        summary += f" {counts['look']} to look at: a person decides."
     if counts["failed"]:
         summary += " Read what failed before you sign."
     signatures = [[clean(role), "", "", ""] for role in ("prepared", "checked", "approved")]

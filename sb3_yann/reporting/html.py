@@ -39,14 +39,16 @@ table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabul
 th, td { border-bottom: 1px solid #ddd; padding: .25rem .7rem .25rem 0; text-align: left;
   vertical-align: top; }
 th { border-bottom: 1.5px solid #888; font-weight: 600; }
-td.number, th.number { text-align: right; white-space: nowrap; }
+td.number, th.number { text-align: right; }
+td.number { white-space: nowrap; }
 pre { background: #f6f6f6; font: .82rem/1.4 ui-monospace, Menlo, Consolas, monospace;
   overflow-x: auto; padding: .7rem .9rem; white-space: pre-wrap; }
 figure { margin: 1rem 0; }
 figcaption { color: #555; font-size: .88rem; max-width: 46rem; }
 img { display: block; height: auto; max-width: 100%; }
-.passed, .failed, .note { font-weight: 600; white-space: nowrap; }
-.passed { color: #00694b; } .failed { color: #a83c00; } .note { color: #555; }
+.passed, .failed, .look, .note { font-weight: 600; white-space: nowrap; }
+.passed { color: #00694b; } .failed { color: #a83c00; }
+.look { color: #7a5c00; } .note { color: #555; }
 .sign td { height: 3.2rem; min-width: 11rem; vertical-align: bottom; }
 @media (max-width: 640px) {
   body { font-size: 15px; padding: 1rem .9rem 3rem; }

@@ -11,11 +11,18 @@ from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_in_words
 from sb3_yann.compare import INPUT_STEP, less_safe
 from sb3_yann.control.model.labels import with_units
-from sb3_yann.evaluation.plots import inputs_of, loops_figure, surfaces_figure, use_figure
+from sb3_yann.evaluation.plots import (
+    inputs_of,
+    loops_figure,
+    plot_gains,
+    surfaces_figure,
+    use_figure,
+)
 from sb3_yann.reporting.html import Html, join, number, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject, left_out, make_finding
 
 NO_ENV = "No env was given: closed loops are left out. Pass report(model, env=...) to play them."
+FAR = 100.0  # % of half the range of an input: as far from the MPC as its middle from a bound
 ROUNDING = 1e-6  # a relative difference of costs, or one in half-widths of inputs, that is none
 
 
@@ -49,9 +56,11 @@ def loops_part(subject: Subject) -> Part:
         "what they say is too favorable. Pass other seeds."
     )
     caption = (
-        "Closed loops in plant units. Of more than six episodes a line is the median, the dark "
-        "band holds 80 % of them, the light one all. Time is in the unit of the sampling time."
+        "Closed loops in plant units. Of more than six episodes a line is the median, and a band "
+        "holds 80 % of them; what has a set-point is drawn as its distance from it. Below: the "
+        "policy less the MPC, from the same starts."
     )
+    gains = "What the policy costs more than the MPC at each start; below zero it costs less."
     each = zip(
         subject.seeds, mpc.costs, policy.costs, mpc.violations, policy.violations, strict=True
     )
@@ -60,13 +69,18 @@ def loops_part(subject: Subject) -> Part:
         for seed, a, b, v, w in each
     ]
     head = ["seed", "MPC", "policy", "change", "MPC: violations", "policy: violations"]
+    apart = np.abs(policy.costs - mpc.costs) > ROUNDING * np.abs(mpc.costs)
+    same: Html | str = ""
+    if not apart.any() and np.array_equal(mpc.violations, policy.violations):
+        same = paragraph("Each costs what it costs with the MPC, and violates as often.")
     content = join(
         [
             paragraph(how, warning if known else ""),
             table(["", "MPC", "policy", "change"], rows),
+            picture(partial(plot_gains, loops), gains),
             picture(partial(loops_figure, subject.problem, subject.shown_loops), caption),
             tag("h3", "Every episode"),
-            table(head, single[:1000]),
+            same if same else table(head, single[:1000]),
         ]
     )
     less = less_safe(policy.unsafe(), mpc.unsafe())[:, :INPUT_STEP]  # of bounds the next part tells
@@ -193,7 +207,8 @@ def distance_part(subject: Subject) -> Part:
         text = f"Inputs keep their bounds at {len(theta)} random points of the box of parameters."
     name, where, *_, share = max(rows, key=lambda row: float(row[-1]))
     largest = f"The policy is at most {share} % of half the range of {name} from the MPC, at"
-    findings = make_finding(inside, text), Finding("note", f"{largest} {where}.")
+    kind = "look" if float(share) > FAR else "note"
+    findings = make_finding(inside, text), Finding(kind, f"{largest} {where}.")
     return Part("Where and how far the policy leaves the MPC", join(content), findings)
 
 

@@ -30,7 +30,10 @@ POLICY, MPC = "policy", "MPC"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the summary: a verdict, "passed", "failed" or "note", and a text."""
+    """One line of the summary: a verdict, and a text.
+
+    The verdict is "passed", "failed", "look" where a person has to decide, or "note".
+    """
 
     verdict: str
     text: str

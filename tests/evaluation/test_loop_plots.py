@@ -10,6 +10,7 @@ from sb3_yann import LinearModel, LinearMPC, SoftBounds, Tracking
 from sb3_yann.evaluation import Trajectories, comparison_table, evaluate
 from sb3_yann.evaluation.plots import (
     loops_figure,
+    plot_gains,
     plot_regions,
     plot_surface,
     region_use,
@@ -56,14 +57,14 @@ def test_few_episodes_are_lines_in_plant_units() -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "level (m)")
 
 
-def test_of_many_episodes_the_median_and_the_bands_are_drawn() -> None:
+def test_of_many_episodes_the_median_and_a_band_are_drawn() -> None:
     axes = plot_loop(tank(), {"MPC": episodes(50)}, "flow")
     values = 40 - np.arange(50) / 50
     (median,) = (line for line in axes.lines if len(line.get_ydata()) == 5)
     assert set(median.get_ydata()) == {np.median(values)}
     spans = [np.ptp(each.get_paths()[0].vertices[:, 1]) for each in axes.collections]
     low, high = np.percentile(values, [10, 90])
-    np.testing.assert_allclose(sorted(spans), [high - low, np.ptp(values)])
+    np.testing.assert_allclose(spans, [high - low])
 
 
 def test_episodes_that_have_ended_count_no_more() -> None:
@@ -102,12 +103,35 @@ def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
     assert set(line.get_ydata()) == {13.0}
 
 
-def test_before_lies_above_after_with_the_same_range() -> None:
-    figure = loops_figure(tank(), {"before": episodes(9), "after": episodes(20)})
-    rows = [panel.get_gridspec() and panel.get_subplotspec().rowspan.start for panel in figure.axes]
+def test_of_many_what_has_a_set_point_is_drawn_as_its_distance_from_it() -> None:
+    played = episodes(9, size=2)
+    for k, x in enumerate(played.observations):
+        x[:, 1], x[-1, 1] = x[0, 0] + 0.5 + k / 100, 21.0
+    axes = plot_loop(tank(tracking=Tracking([0], 10, 14)), {"MPC": played}, "level")
+    (median,) = (line for line in axes.lines if len(line.get_ydata()) == 5)
+    np.testing.assert_allclose(median.get_ydata(), -0.54)
+    assert axes.get_ylabel() == "level (m)\nless its set-point"
+
+
+def test_below_many_pairs_lie_their_differences() -> None:
+    before, after = episodes(9), episodes(9)
+    for x in after.observations:
+        x += 0.25
+    figure = loops_figure(tank(), {"before": before, "after": after})
+    rows = [panel.get_subplotspec().rowspan.start for panel in figure.axes]
     assert rows == [0, 0, 1, 1]
-    assert [panel.get_title(loc="left") for panel in figure.axes] == ["before", "", "after", ""]
-    assert figure.axes[0].get_ylim() == figure.axes[2].get_ylim()
+    difference = figure.axes[2]
+    assert difference.get_ylabel() == "minus before"
+    np.testing.assert_allclose(difference.lines[0].get_ydata(), 0.25)
+    assert len(loops_figure(tank(), {"before": before, "after": episodes(20)}).axes) == 2
+
+
+def test_gains_are_sorted_and_in_percent_of_the_first_one_s_mean() -> None:
+    before, after = episodes(3), episodes(3)
+    after.costs[:] = 0.5, 1.5, 0.25
+    axes = plot_gains({"MPC": before, "policy": after})
+    assert [bar.get_height() for bar in axes.patches] == [-75, -50, 50]
+    assert axes.get_ylabel() == "policy minus MPC\n(% of MPC's mean cost)"
 
 
 def test_few_episodes_of_all_controllers_share_a_panel() -> None:

@@ -130,7 +130,7 @@ def test_it_is_one_small_file_that_loads_nothing_and_has_every_part(whole) -> No
         "To do it again", "Signatures",
     ):  # fmt: skip
         assert title in outline.text
-    assert sum(tag == "img" for tag, _ in outline.found) == 7
+    assert sum(tag == "img" for tag, _ in outline.found) == 8
     assert "was given" not in outline.text and "left out" not in outline.text
 
 
