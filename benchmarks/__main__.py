@@ -17,9 +17,6 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_name] = "1"
 
-BEGIN = "<!-- speed: begin -->\n"
-END = "<!-- speed: end -->"
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the sections that were asked for, write the report, and return the exit status."""
@@ -29,10 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from rich.console import Console
 
     from benchmarks.records import Bench, Figures
-    from benchmarks.report import in_short, write_report
+    from benchmarks.report import write_report
     from benchmarks.sections import NAMES, run
     from benchmarks.timing import Stopwatch
-    from experiments.markdown import quote
 
     th.set_num_threads(1)
     unknown = sorted(set(options.only) - set(NAMES))
@@ -55,9 +51,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = f'make bench ARGS="{shlex.join(given)}"' if given else "make bench"
         write_report(bench, report, command)
         console.print(f"Written: {report}")
-    whole = not (options.quick or options.only or options.cpu)
-    if whole and quote(in_short(bench.figures), Path("README.md"), BEGIN, END):
-        console.print("Written: the speed in README.md")
     console.print(
         f"{time.perf_counter() - began:.0f} s; the process had a processor in "
         f"{100 * watch.share:.0f} % of the time of the measurements."

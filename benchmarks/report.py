@@ -1,4 +1,4 @@
-"""The report: ``performance.md``, and the lines that the README quotes."""
+"""The report: ``performance.md``."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def write_report(bench: Bench, path: Path, command: str) -> None:
 
 
 def in_short(figures: Figures) -> str:
-    """Return the rows that the README quotes as well: how many times faster than the peers."""
+    """Return the rows of the page's first table: how many times as long the peers take."""
     rows = [[name, *cells] for name, cells in _quoted(figures)]
     sizes = [column for column in figures.columns(evaluation.ONE) if column.isdigit()]
     return table(["", *map(heading, sizes)], rows) if rows and sizes else ""

@@ -198,11 +198,3 @@ def test_the_results_it_quotes_are_those_of_the_report() -> None:
     quoted = README.partition("<!-- results: begin -->")[2].partition("<!-- results: end -->")[0]
     assert "| **YANN-RL** |" in quoted
     assert quoted.strip() == in_short.strip()
-
-
-def test_the_speed_it_quotes_is_that_of_the_report() -> None:
-    path = ROOT / "docs" / "performance.md"
-    quoted = README.partition("<!-- speed: begin -->")[2].partition("<!-- speed: end -->")[0]
-    report = path.read_text(encoding="utf-8") if path.exists() else ""
-    in_short = report.partition("## In short\n")[2].partition("\n## ")[0]
-    assert quoted.strip() == (in_short.strip() or "(not measured yet)")
