@@ -246,7 +246,13 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
-        return summary_of(self.state, self.player.policy)
+        taken = f"{self.steps:,} steps of the guard's simulator."
+        return f"{summary_of(self.state, self.player.policy)}\n{taken}"
+
+    @property
+    def steps(self) -> int:
+        """Steps of its simulator: all episodes, but not the five pushes of each input before."""
+        return self.player.steps
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the mean cost of each candidate by the verdict on it; return the axes.

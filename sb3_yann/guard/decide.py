@@ -438,6 +438,7 @@ class Player:
     Inputs may move by ``max_input_step`` (m,) from one sample to the next. Whether its env
     ``pays_cost`` of the problem, as the policy scales it, is known once the MPC has played. Once
     Ctrl-C has restored the accepted policy, it is ``interrupted``, and restores nothing else.
+    ``steps`` are those of the simulator that all episodes took.
     """
 
     def __init__(
@@ -447,6 +448,7 @@ class Player:
         self.max_input_step: Array | None = None
         self.pays_cost = True
         self.interrupted = False
+        self.steps = 0
 
     def __call__(self, checkpoint: ActorCheckpoint, seeds: Sequence[int]) -> Scores:
         """Return a checkpoint's scores; raise Unplayable if an action or the env is at fault."""
@@ -467,6 +469,7 @@ class Player:
             self.policy.actor.load_state_dict(checkpoint.actor)
             with preserve_rng():
                 played = rollout(self._act, self.envs, seeds, check=self._check)
+            self.steps += int(played.lengths.sum())
             if self.interrupted:  # and a simulator has swallowed it
                 raise KeyboardInterrupt
             return played

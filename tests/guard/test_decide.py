@@ -177,6 +177,19 @@ def test_a_fall_back_to_the_mpc_is_called_that() -> None:
     assert is_mpc(model)
     said = guard.summary()
     assert "accepted last is the MPC" in said and "raise n_eval_episodes" in said
+    assert said.endswith(f"{guard.steps:,} steps of the guard's simulator.")
+
+
+def test_the_guard_counts_the_steps_of_its_simulator() -> None:
+    class Counted(Slide):
+        steps = 0
+
+        def step(self, action):
+            Counted.steps += 1
+            return super().step(action)
+
+    _, guard = tried(half_good, half_good, env=Counted)
+    assert guard.steps == Counted.steps - 5  # a push of the input from five starts
 
 
 @pytest.mark.parametrize("rule", [{}, {"least_gain": 0.0}, {"cvar_alpha": 0}])
