@@ -30,7 +30,7 @@ LOGS = "ordinary", "dither"
 STEPS = 25
 TESTS = range(900_000, 900_060)
 DITHER, HOLD = 0.15, 4  # of half the range, samples
-KINDS = "none", "linear", "quadratic", "cubic"  # a fit of networks takes half a minute
+KINDS = "none", "linear", "quadratic"  # a fit of networks takes half a minute
 HIDDEN = "lag", "backlash", "load", "gain"
 
 

@@ -9,11 +9,10 @@ from numba.core.dispatcher import Dispatcher
 from fresh_process import run_python
 from sb3_yann.control._kernels import law, online, polyhedra
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
-from sb3_yann.twin._kernels import step
 from sb3_yann_envs import cstr
 
 LAWS = law, online, polyhedra
-MODULES = (*LAWS, yann_layer, afterstate_value, step, cstr)
+MODULES = (*LAWS, yann_layer, afterstate_value, cstr)
 CALLED = {
     f"{module.__name__}.{name}": function
     for module in MODULES
@@ -49,7 +48,7 @@ def test_all_that_is_known_to_be_called_is_looked_at() -> None:
         "support",
     }
     assert names >= {"backward", "_forms", "_output", "_output_backward", "_forms_backward"}
-    assert names >= {"_rates", "advance", "advance_all", "is_rich", "step"}
+    assert names >= {"_rates", "advance", "advance_all", "is_rich"}
 
 
 @pytest.mark.slow

@@ -73,6 +73,12 @@ class AcceptedPolicy:
         """Take it for the one that the plant has confirmed; or forget which one that was."""
         self._kept = (ActorCheckpoint.of(self.policy), self.policy.max_correction) if kept else None
 
+    def return_to_kept(self) -> None:
+        """Make it the one that the plant has confirmed."""
+        assert self._kept is not None
+        self._kept[0].restore(self.policy)
+        self.limit(self._kept[1])
+
     def show(self) -> None:
         """Make it the one that the plant has confirmed, else the MPC, while no episode is played.
 
@@ -84,8 +90,7 @@ class AcceptedPolicy:
         if self._kept is None:
             self.give_back()
         else:
-            self._kept[0].restore(self.policy)
-            self.limit(self._kept[1])
+            self.return_to_kept()
         self._shown = ActorCheckpoint.of(self.policy), whole
 
     def hold(self) -> None:

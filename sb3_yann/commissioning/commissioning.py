@@ -20,12 +20,11 @@ from sb3_yann.commissioning.comparison import (
     Costs,
     compare,
     excess_of_mpc,
-    is_confirmed,
     is_kept,
     why_taken_back,
 )
 from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal, Verdict
-from sb3_yann.commissioning.plant import Plant, PlantEpisode
+from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import allowed_excess
@@ -40,14 +39,14 @@ class Commissioning:
     """Puts a better policy to work on a plant as plants are commissioned: in growing batches.
 
     The first batch is the MPC's. After each one the twin is fitted to all that the plant has shown,
-    and the policy is improved in it (:func:`improve`). One that was accepted there is on trial in
-    the next batch: the MPC and the policy take turns, in an order that is drawn for each pair. Only
-    the plant decides. It is kept where it surely cost less than the MPC in these turns, and the MPC
-    is back where it surely cost more, by t tests of the pairs. Fewer than five pairs keep nothing:
-    a drift of the plant may do it by the order. The MPC is also back where the policy exceeds a
-    hard bound of the problem by more than the MPC has on this plant. A policy acts at first within
-    a small ``max_correction``, which doubles when the plant confirms at least half of the gain that
-    the twin promised. Nothing else ever acts.
+    and a policy is improved in it (:func:`improve`). One that was accepted there is on trial from
+    the next batch on: the MPC and the policy take turns, in an order that is drawn for each pair.
+    Only the plant decides, by all pairs of all batches of the trial. The policy is kept where it
+    surely costs less than the MPC, with an error of 5 % over all looks. The MPC is back where it
+    surely costs more, where ten pairs show no gain, or where it exceeds a hard bound of the problem
+    by more than the MPC has on this plant. Fewer than six pairs keep nothing: a drift of the plant
+    may do it by the order. A policy acts at first within a small ``max_correction``, which doubles
+    with each one that is kept. Nothing else ever acts.
 
     What counts is the stage cost, or the plant's own reward where that is another one. The twin's
     searches know the stage cost alone.
@@ -75,6 +74,10 @@ class Commissioning:
     log_path : path-like, optional
         The record: a file of one line of JSON for each event, or a folder for it. The accepted
         models lie beside it.
+    excite : float, default 0
+        How far inputs may be moved at random beside the MPC's, as a fraction of their range, in
+        every other episode while no policy is on trial: so a log of the MPC alone tells their
+        gains.
     shadow : bool, default False
         The MPC acts throughout; the record shows what the policy would have done.
     rounds, updates : int, default 4 and 4000
@@ -99,7 +102,7 @@ class Commissioning:
     ('MPC', 2)
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (each is a choice of whoever owns the plant)
         self,
         model: OffPolicyAlgorithm,
         plant_env: Source,
@@ -107,6 +110,7 @@ class Commissioning:
         batch: int = 4,
         max_correction: float = 0.1,
         log_path: str | PathLike[str] | None = None,
+        excite: float = 0.0,
         shadow: bool = False,
         rounds: int = 4,
         updates: int = 4000,
@@ -123,6 +127,7 @@ class Commissioning:
         self.model, self.plant_env, self.verbose = model, plant_env, verbose
         self.batch = check_int("batch", batch, 2)
         self.smallest = check_range("max_correction", max_correction, 0, 1, "(]")
+        self.excite = check_range("excite", excite, 0, 1, "[]")
         self.shadow = check_bool("shadow", shadow)
         self.rounds = check_int("rounds", rounds)
         self.updates = check_int("updates", updates)
@@ -189,6 +194,7 @@ class Commissioning:
         number = len(journal.batch)
         turn = np.random.default_rng([self.seed, len(journal.batches), number // 2]).integers(2)
         acts = trial and not doubted and turn == number % 2
+        excites = self.excite > 0 and not trial and not journal.doubted and number % 2
         self.incumbent.restore()
         # A simulator gives both of a pair the same start, but not after an alarm: an odd start
         # would look like a changed plant.
@@ -196,7 +202,9 @@ class Commissioning:
         first = plant.begin(self.seed + len(journal.episodes) - again)
         journal.begin(acts)
         try:
-            act = plant.policy if acts else plant.mpc
+            act: Inputs = plant.policy if acts else plant.mpc
+            if excites:
+                act = plant.excited_mpc(self.seed + len(journal.episodes), self.excite)
             limit = float(allowed_excess(excess_of_mpc(journal, plant.problem).largest.max()))
             played = plant.play(first, act, self.watchdog, limit)
         except KeyboardInterrupt:
@@ -237,76 +245,81 @@ class Commissioning:
                 saved = journal.record.save(self.model, number)
                 digest = journal.record.digest_of(saved)
                 policy = f"batch {number}"
-                outlook = replace(outlook, policy=policy, model=saved, model_digest=digest)
+                outlook = replace(
+                    outlook, policy=policy, model=saved, model_digest=digest, since=number
+                )
             elif verdict != "stays":
                 self.incumbent.keep(False)
-                outlook = replace(
-                    outlook,
-                    policy="MPC",
-                    model=None,
-                    model_digest=None,
-                    kept=None,
-                    kept_digest=None,
-                    kept_bound=None,
-                )
+                outlook = outlook.with_mpc()
             self.incumbent.limit(outlook.max_correction)
             shown = costs.actual, costs.predicted, costs.mpc
             sizes = number, len(journal.batch), alarms
-            journal.close(Batch(*sizes, who, within, *shown, verdict, reason), outlook)
+            journal.close(
+                Batch(*sizes, who, within, *shown, costs.difference.pairs, verdict, reason), outlook
+            )
         if self.verbose:
             print(self.report().splitlines()[-1])
 
     def _learn(self, plant: Plant, number: int) -> tuple[Costs, CommissioningState, Verdict, str]:
-        """Fit the twin anew, and improve the policy in it if the plant has confirmed it."""
+        """Decide by the pairs, fit the twin anew, and improve where no policy is on trial."""
         before, numbers, seed = self.twin, self.journal.log, self.seed + number
         twin = self._fit(numbers, seed) if len(numbers) > 1 else None
-        known = twin if twin is not None and twin.trusted else before
-        costs, outlook, said = compare(self.journal, plant, before, known), self.journal.outlook, ""
+        known = twin if twin is not None and twin.trusted else None
+        costs = compare(self.journal, plant, before, known or before)
+        outlook, said = self.journal.outlook, ""
+        if known is not None:
+            self.twin, self.watchdog = known, Watchdog.of(known)
+            outlook = replace(outlook, twin=numbers, twin_seed=seed)
         if why := why_taken_back(self.journal, costs):
-            self.incumbent.give_back()
-            outlook = replace(outlook, max_correction=self._first_bound)
-        elif is_kept(costs):
+            return costs, *self._take_back(outlook, number, why)
+        if self.journal.accepted and not outlook.is_kept:
+            if not is_kept(costs):
+                return costs, outlook, "stays", f"{costs.difference.pairs} pairs are not enough."
             self.incumbent.keep(True)
-            file, digest, bound = outlook.model, outlook.model_digest, outlook.max_correction
-            outlook = replace(outlook, kept=file, kept_digest=digest, kept_bound=bound)
-        if why:
-            said = f"The policy was taken back: {why}. "
-        elif is_confirmed(self.journal, costs):
-            wider = min(2 * outlook.max_correction, self.largest)
-            outlook = replace(outlook, max_correction=wider)
-        if twin is None:
+            outlook = outlook.with_kept()
+            said = f"{costs.difference.pairs} pairs show that it costs less. "
+        if known is None:
             why = f"There are {len(numbers)} episodes to learn from."
-        elif not twin.trusted:
-            why = " ".join(["The twin is not trusted.", *twin.trust.problems])
-        if twin is None or not twin.trusted:
-            self.incumbent.give_back()
-            return costs, outlook, "the MPC acts", f"{said}{why}"
-        self.twin, self.watchdog = twin, Watchdog.of(twin)
-        outlook = replace(outlook, twin=numbers, twin_seed=seed)
-        if why:  # what learns from that acts after a batch of the MPC
-            return costs, outlook, "the MPC acts", said.strip()
-        outlook, verdict, found = self._improve(twin, outlook, seed)
+            if twin is not None:
+                why = " ".join(["The twin is not trusted.", *twin.trust.problems])
+            verdict: Verdict = "stays" if outlook.is_kept else "the MPC acts"
+            return costs, outlook, verdict, f"{said}{why}"
+        outlook, verdict, found = self._improve(known, outlook, seed)
         return costs, outlook, verdict, f"{said}{found}"
+
+    def _take_back(
+        self, outlook: CommissioningState, number: int, why: str
+    ) -> tuple[CommissioningState, Verdict, str]:
+        """Go back to what the plant has confirmed before, else to the MPC."""
+        said = f"The policy was taken back: {why}."
+        if outlook.kept_policy not in ("MPC", outlook.policy):
+            self.incumbent.return_to_kept()
+            return outlook.back_to_kept(number), "stays", said
+        self.incumbent.give_back()
+        return replace(outlook, max_correction=self._first_bound), "the MPC acts", said
 
     def _improve(
         self, twin: PlantTwin, outlook: CommissioningState, seed: int
     ) -> tuple[CommissioningState, Verdict, str]:
         """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
-        bound, outlook = self.journal.outlook.max_correction, replace(outlook, tried=True)
+        wider = outlook
+        if outlook.is_kept:  # the plant has confirmed it: the next one may leave the MPC farther
+            wider = replace(outlook, max_correction=min(2 * outlook.max_correction, self.largest))
         self.incumbent.take_candidate()
         held = ActorCheckpoint.of(self.policy)
-        self.incumbent.limit(outlook.max_correction)
+        self.incumbent.limit(wider.max_correction)
         found = improve(self.model, twin, rounds=self.rounds, updates=self.updates, seed=seed)
         before = found.before
-        if found.accepted or (before is not None and before.accepted):
-            return outlook, "accepted", f"{100 * found.change:+.2f} % in the twin."
-        if before is not None and self.journal.accepted and before.safe and before.change <= 0:
+        known = before is not None and before.accepted and not outlook.is_kept
+        if found.accepted or known:
+            said = f"{100 * found.change:+.2f} % in the twin."
+            return replace(wider, tried=True), "accepted", said
+        if outlook.is_kept:
             held.restore(self.policy)
-            self.incumbent.limit(bound)
-            said = f"{100 * before.change:+.2f} % in the twin. {found.reason}"
-            return replace(outlook, max_correction=bound), "stays", said
+            self.incumbent.limit(outlook.max_correction)
+            return replace(outlook, tried=True), "stays", found.reason
         self.incumbent.give_back()
-        return outlook, "the MPC acts", found.reason
+        return replace(outlook, tried=True), "the MPC acts", found.reason
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
@@ -343,6 +356,7 @@ class Commissioning:
         learner = f"{type(self.model).__name__} {self.policy.actor.net_arch}"
         return {
             "batch": self.batch,
+            "excite": self.excite,
             "max_correction": self.smallest,
             "shadow": self.shadow,
             "rounds": self.rounds,

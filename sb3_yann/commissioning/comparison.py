@@ -10,7 +10,7 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.journal import Journal
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
-from sb3_yann.compare import Difference, allowed_excess
+from sb3_yann.compare import Difference, allowed_excess, level_of_look
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import (
     BoundExcess,
@@ -20,8 +20,12 @@ from sb3_yann.control.mpc.bound_excess import (
 )
 from sb3_yann.twin.plant_twin import PlantTwin
 
-ENOUGH = 0.5
-"""Of the gain that the twin promised, so much lets the bound of the correction grow."""
+ENOUGH = 10
+"""Pairs after which a policy that shows no gain is given up."""
+SIGNIFICANCE = 0.05
+"""Probability that a policy that is no better is ever kept, over all looks at it."""
+LEAST_GAIN = 0.001
+"""As a fraction of the MPC's cost: what gains surely less is not worth more episodes."""
 MOST = 0.05
 """What a policy may cost more than the MPC in any case, as a fraction of the MPC's cost."""
 OWN = 0.95
@@ -31,53 +35,42 @@ ALARMS = 0.25
 
 
 class Costs(NamedTuple):
-    """Mean costs of the episodes of the one that acted in a batch; NaN where nothing is known.
+    """What the plant has shown; NaN where nothing is known.
 
     Attributes
     ----------
-    actual : float
-        The plant's, episodes with an alarm included.
-    predicted, promised : float
-        What the twin had predicted, and how much less than for the MPC.
+    actual, predicted : float
+        The mean cost of the episodes of the one that acted in the batch, those with an alarm
+        included, and what the twin had predicted of them.
     mpc : float
-        What the plant showed of the MPC, which took turns with the policy.
-    more : float, default nan
-        What the policy cost more, over pairs of episodes, less what the twin says that their starts
-        differ by.
-    error : float, default 0
-        Its standard error, widened where pairs that follow each other are correlated.
-    pairs : int, default 0
-        Episodes of the policy that have one of the MPC beside them.
-    own_reward : bool, default False
-        Whether the costs are minus the rewards, which are not the stage cost: a twin, whose costs
-        are stage costs, promises nothing then.
-    longer : str, default ""
+        What the MPC cost on the plant, in turns with the policy.
+    difference : Difference
+        Of all pairs since the policy is on trial, in the order in which they were played.
+    look : int
+        How often the policy has been looked at, this one included.
+    own_reward : bool
+        Whether the costs are minus the rewards, which are not the stage cost: no twin knows them.
+    longer : str
         By how much more than the MPC the policy exceeds hard bounds, summed over an episode.
-    chance : float, default 0
-        How often the order that was drawn for each of few pairs alone brings a mean as low.
     """
 
-    actual: float
-    predicted: float
-    promised: float
-    mpc: float
-    more: float = np.nan
-    error: float = 0.0
-    pairs: int = 0
+    actual: float = np.nan
+    predicted: float = np.nan
+    mpc: float = np.nan
+    difference: Difference = Difference(np.nan, np.inf, 0)
+    look: int = 1
     own_reward: bool = False
     longer: str = ""
-    chance: float = 0.0
-
-    @property
-    def difference(self) -> Difference:
-        """The policy's cost less the MPC's."""
-        return Difference(self.more, self.error, self.pairs, self.chance)
 
 
 def compare(
     journal: Journal, plant: Plant, before: PlantTwin | None, now: PlantTwin | None
 ) -> Costs:
-    """Return the costs of the present batch.
+    """Return what the present batch cost, and all pairs of the policy that is on trial.
+
+    A plant does not repeat a start. Which of a pair plays first is drawn, so their starts differ by
+    nothing on average, and so does what a twin says that the MPC costs from them: it is a control
+    variate, taken where the differences vary less with it. It biases nothing, however wrong.
 
     Parameters
     ----------
@@ -88,41 +81,31 @@ def compare(
     before, now : PlantTwin, optional
         The twin that was in force, and the one that has learnt from the batch.
     """
-    by_policy = any(each for _, each in journal.batch)
-    of_mpc = [each for each, policys in journal.batch if not policys and each.alarm is None]
-    own = [each for each, policys in journal.batch if policys] if by_policy else of_mpc
-    if not own:
-        return Costs(np.nan, np.nan, np.nan, np.nan)
-    pays_own, problem = pays_its_own(plant.problem, journal.episodes), plant.problem
-    actual, predicted, promised = _costs(problem, own, pays_own), np.nan, np.nan
+    problem, by_policy = plant.problem, any(each for _, each in journal.batch)
+    quiet = [each for each, own in journal.batch if not own and not each.alarm and not each.excited]
+    acted = [each for each, own in journal.batch if own] if by_policy else quiet
+    if not acted:
+        return Costs()
+    pays_own, predicted = pays_its_own(problem, journal.episodes), np.nan
+    actual = float(_costs(problem, acted, pays_own).mean())
     if before is not None and not pays_own:
-        as_mpc = predicted_costs(before, own, plant.mpc)
-        told = predicted_costs(before, own, plant.policy) if by_policy else as_mpc
-        predicted, promised = float(told.mean()), float(as_mpc.mean() - told.mean())
-    mean, pairs = float(actual.mean()), min(len(own), len(of_mpc))
+        act = plant.policy if by_policy else plant.mpc
+        predicted = float(predicted_costs(before, acted, act).mean())
+    mpc = float(_costs(problem, quiet, pays_own).mean()) if quiet else np.nan
     if not by_policy:
-        return Costs(mean, predicted, promised, mean, own_reward=pays_own)
-    longer = _longer(journal, problem, own)
+        return Costs(actual, predicted, mpc, own_reward=pays_own)
+    found = Costs(actual, predicted, mpc, look=len(journal.trial), own_reward=pays_own)
+    found = found._replace(longer=_longer(journal, problem, acted))
+    pairs = journal.pairs
     if not pairs:
-        return Costs(mean, predicted, promised, np.nan, own_reward=pays_own, longer=longer)
-    mpc = _costs(problem, of_mpc, pays_own)
-    more = actual[:pairs] - mpc[:pairs]
+        return found
+    ours, its = zip(*pairs, strict=True)
+    more = _costs(problem, ours, pays_own) - _costs(problem, its, pays_own)
     if now is not None and not pays_own:
-        starts = [predicted_costs(now, each[:pairs], plant.mpc) for each in (own, of_mpc)]
-        more = more - (starts[0] - starts[1])
-    found = Difference.of(more, in_turns=True)
-    return Costs(
-        actual=mean,
-        predicted=predicted,
-        promised=promised,
-        mpc=float(mpc.mean()),
-        more=found.mean,
-        error=found.error,
-        pairs=pairs,
-        own_reward=pays_own,
-        longer=longer,
-        chance=found.chance,
-    )
+        starts = [predicted_costs(now, each, plant.mpc) for each in (ours, its)]
+        varied = more - (starts[0] - starts[1])
+        more = varied if np.isfinite(varied).all() and varied.std() < more.std() else more
+    return found._replace(difference=Difference.of(more, in_turns=True))
 
 
 def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
@@ -155,21 +138,35 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     alarms = sum(each.alarm is not None for each in played)
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
-    room = min(costs.difference.room(0.05), MOST * abs(costs.mpc))
-    if not costs.more <= room < np.inf:  # nor does NaN pass
+    if not costs.difference.pairs:
+        return "no pair of episodes tells what it costs"
+    more, room = costs.difference.mean, costs.difference.room(SIGNIFICANCE)
+    if not more <= min(room, MOST * abs(costs.mpc)):  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
+    if is_hopeless(costs):
+        return f"{costs.difference.pairs} pairs show no gain"
     return ""
 
 
 def is_kept(costs: Costs) -> bool:
-    """Return whether the plant has shown that the policy surely costs less than the MPC."""
-    return costs.difference.is_below_zero(0.05)
+    """Return whether the plant has shown that the policy surely costs less than the MPC.
+
+    All looks at a policy together err with a probability of 5 % at most.
+    """
+    return costs.difference.is_below_zero(level_of_look(SIGNIFICANCE, costs.look))
+
+
+def is_hopeless(costs: Costs) -> bool:
+    """Return whether more pairs would hardly show a gain that counts."""
+    more, least = costs.difference, LEAST_GAIN * abs(costs.mpc)
+    return bool(more.pairs >= ENOUGH and more.mean - more.error > -least / 2)
 
 
 def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
     """Return the excess over the bounds of the MPC's own episodes in the log, one 0 without any."""
     own = [journal.episodes[i] for i in journal.log if not journal.by_policy[i]]
+    own = [each for each in own if not each.excited]
     if not own:
         return BoundExcess(*np.zeros((5, 1)))
     return excess_of_episodes(problem, ((each.thetas, each.actions) for each in own))
@@ -187,13 +184,6 @@ def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]
         f"it exceeded hard bounds by {summed:.3g} half-widths, summed over an episode, the MPC by "
         f"{before:.3g}: {words}"
     )
-
-
-def is_confirmed(journal: Journal, costs: Costs) -> bool:
-    """Return whether the plant gave at least half of what the twin had promised, without alarm."""
-    quiet = not any(each.alarm for each, by_policy in journal.batch if by_policy)
-    gained = -costs.more
-    return quiet and 0 < ENOUGH * costs.promised <= gained < np.inf
 
 
 def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode], own_reward: bool) -> Array:

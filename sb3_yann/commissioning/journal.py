@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
 from typing import Any, Literal
+
+import numpy as np
 
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.record import Event, Record, as_episode, as_event
@@ -33,15 +36,18 @@ class Batch:
         for it from these starts; and what the MPC cost, which took turns with it on the plant. NaN
         where it did not, or where there was no twin. Minus the plant's rewards where these are not
         the stage cost.
+    pairs : int
+        Of the policy and the MPC, since it is on trial.
     verdict : str
-        "accepted" (a new policy), "stays" (the one that acted), "the MPC acts" or "begins anew".
+        "accepted" (a new policy, on trial), "stays" (the one that acted, or that was kept before),
+        "the MPC acts" or "begins anew".
     reason : str
         What was found, in words.
 
     Examples
     --------
     >>> from sb3_yann.commissioning import Batch
-    >>> Batch(1, 4, 0, "MPC", 0.0, 97.1, math.nan, math.nan, "accepted", "").verdict
+    >>> Batch(1, 4, 0, "MPC", 0.0, 97.1, math.nan, math.nan, 0, "accepted", "").verdict
     'accepted'
     """
 
@@ -53,6 +59,7 @@ class Batch:
     cost: float
     predicted: float
     mpc: float
+    pairs: int
     verdict: Verdict
     reason: str
 
@@ -79,8 +86,12 @@ class CommissioningState:
         The file of the accepted policy, and its digest.
     kept, kept_digest, kept_bound : str, str and float, or None
         The file of the policy that the plant has confirmed, its digest, and its bound.
+    kept_policy : str
+        Its name; "MPC" if there is none.
     tried : bool
         Whether what the model had learnt before has been tried.
+    since : int
+        After how many batches the policy came on trial.
     """
 
     max_correction: float
@@ -94,7 +105,41 @@ class CommissioningState:
     kept: str | None = None
     kept_digest: str | None = None
     kept_bound: float | None = None
+    kept_policy: str = "MPC"
     tried: bool = False
+    since: int = 0
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the plant has confirmed the policy that acts in turns with the MPC."""
+        return self.kept_policy == self.policy != "MPC"
+
+    def with_kept(self) -> CommissioningState:
+        """Return it with the present policy as the one that the plant has confirmed."""
+        return replace(
+            self,
+            kept=self.model,
+            kept_digest=self.model_digest,
+            kept_bound=self.max_correction,
+            kept_policy=self.policy,
+        )
+
+    def back_to_kept(self, number: int) -> CommissioningState:
+        """Return it with the policy that was kept on trial, from a batch on."""
+        assert self.kept_bound is not None
+        return replace(
+            self,
+            model=self.kept,
+            model_digest=self.kept_digest,
+            max_correction=self.kept_bound,
+            policy=self.kept_policy,
+            since=number,
+        )
+
+    def with_mpc(self) -> CommissioningState:
+        """Return it without a policy."""
+        first = CommissioningState(self.max_correction, first=self.first, anew=self.anew)
+        return replace(first, twin=self.twin, twin_seed=self.twin_seed, tried=self.tried)
 
 
 class Journal:
@@ -147,6 +192,25 @@ class Journal:
         """The episodes since the last decision, and whether the policy began them."""
         rows = slice(self._first_of_batch, None)
         return [*zip(self.episodes[rows], self.by_policy[rows], strict=True)]
+
+    @property
+    def trial(self) -> list[range]:
+        """The numbers of the episodes of each batch since the policy is on trial."""
+        ends = np.cumsum([0, *(each.episodes for each in self.batches)])
+        ends = np.append(ends[self.outlook.since :], len(self.episodes))
+        return [range(a, b) for a, b in pairwise(ends.tolist()) if b > a]
+
+    @property
+    def pairs(self) -> list[tuple[PlantEpisode, PlantEpisode]]:
+        """An episode of the policy that is on trial and one of the MPC, played in turns."""
+        found = []
+        for batch in self.trial:
+            for first, second in zip(batch[::2], batch[1::2], strict=False):
+                both = sorted((first, second), key=lambda i: not self.by_policy[i])
+                ours, its = (self.episodes[i] for i in both)
+                if self.by_policy[first] != self.by_policy[second] and its.alarm is None:
+                    found.append((ours, its))
+        return found
 
     @property
     def log(self) -> list[int]:
@@ -236,12 +300,13 @@ class Journal:
 
     def report(self) -> str:
         """Return the batches as a table."""
-        lines = ["batch  episodes  alarms  acted     within       cost  predicted  the MPC's  then"]
+        costs = "      cost  predicted  the MPC's"
+        lines = [f"batch  episodes  alarms  acted     within {costs}  pairs  then"]
         for each in self.batches:
             numbers = "".join(f"{v:>11.5g}" for v in (each.cost, each.predicted, each.mpc))
             then = each.verdict + (f": {each.reason}" if each.reason else "")
             lines.append(
                 f"{each.number:>5}{each.episodes:>10}{each.alarms:>8}  {each.acted:<9}"
-                f"{100 * each.max_correction:>5.3g} %{numbers}  {then}"
+                f"{100 * each.max_correction:>5.3g} %{numbers}{each.pairs:>7}  {then}"
             )
         return "\n".join(lines)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, cast
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
 from sb3_yann.improvement.imitation import policy_of
+from sb3_yann.improvement.simulator import Excited
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
@@ -47,6 +49,8 @@ class PlantEpisode:
     apart : float
         The largest distance of the policy's inputs from the MPC's, in input ranges, whichever of
         them acted.
+    excited : bool
+        Whether random steps were added to the MPC's inputs: its cost is not the MPC's.
     """
 
     thetas: Array
@@ -56,6 +60,7 @@ class PlantEpisode:
     alarm: Alarm | None
     step: int
     apart: float
+    excited: bool = False
 
     @property
     def tells(self) -> bool:
@@ -109,7 +114,19 @@ class Plant:
 
     def mpc(self, theta: Array) -> Array:
         """Return the MPC's inputs (rows, m), within the bounds of their rate if there are some."""
-        u, problem = self.law(theta), self.problem
+        return self._within_rates(theta, self.law(theta))
+
+    def excited_mpc(self, seed: int, share: float) -> Inputs:
+        """Return the MPC of one episode, moved at random by a share of the range at most."""
+        moved, steps = Excited(self.problem, seed, 2 * share), count()
+
+        def act(theta: Array) -> Array:
+            return self._within_rates(theta, moved(next(steps), theta, np.arange(len(theta))))
+
+        return act
+
+    def _within_rates(self, theta: Array, u: Array) -> Array:
+        problem = self.problem
         if not problem.has_rate_bounds:
             return u
         previous = theta[:, problem.layout.previous]
@@ -146,7 +163,7 @@ class Plant:
         known : ndarray, shape (n_theta,)
             From :meth:`begin`.
         act : callable
-            The one that acts until then: :meth:`policy` or :meth:`mpc`.
+            The one that acts until then: :meth:`policy`, :meth:`mpc` or :meth:`excited_mpc`.
         watchdog : Watchdog, optional
             Without one only violations and readings that are not finite are seen.
         allowed : float, optional
@@ -154,8 +171,9 @@ class Plant:
             the plant reports is none where its size is known, and allowed.
         """
         if watchdog is not None:
-            watchdog.start(known, act)
+            watchdog.start(known)
         thetas, actions, reward, violations, apart = [known], list[Array](), 0.0, 0, 0.0
+        excited = act not in (self.policy, self.mpc)
         alarm, step, over, space = None, -1, False, cast(Any, self.env.action_space)
         while not over:
             u = act(known[None])[0].astype(np.float32)
@@ -188,7 +206,7 @@ class Plant:
             if len(actions) >= LONGEST:
                 raise RuntimeError(f"An episode of the plant did not end in {LONGEST} steps.")
         played = np.array(thetas), np.array(actions)
-        return PlantEpisode(*played, reward, violations, alarm, step, apart)
+        return PlantEpisode(*played, reward, violations, alarm, step, apart, excited)
 
     def _theta(self, observation: Any) -> Array:
         seen = normalized(self.model, observation)

@@ -160,6 +160,7 @@ def as_event(episode: PlantEpisode) -> Event:
         "alarm": None if alarm is None else [alarm.kind, alarm.message],
         "step": episode.step,
         "apart": episode.apart,
+        "excited": episode.excited,
         "thetas": episode.thetas.tolist(),
         "actions": episode.actions.tolist(),
     }
@@ -171,4 +172,4 @@ def as_episode(event: Event) -> PlantEpisode:
     reward = math.nan if event["reward"] is None else event["reward"]
     numbers = reward, event["violations"]
     played = np.array(event["thetas"], float), np.array(event["actions"], float)
-    return PlantEpisode(*played, *numbers, alarm, event["step"], event["apart"])
+    return PlantEpisode(*played, *numbers, alarm, event["step"], event["apart"], event["excited"])

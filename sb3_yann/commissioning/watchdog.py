@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_array
-from sb3_yann.commissioning.control_limits import GAINS, Act, ControlLimits, EwmaCharts
 from sb3_yann.control.model.labels import name_of
 from sb3_yann.twin.dynamics import Dynamics
+from sb3_yann.twin.log import pieces
 from sb3_yann.twin.plant_twin import PlantTwin
+from sb3_yann.twin.selection import FOLDS
 
+GAINS = np.array([1.0, 0.2, 0.05, 0.02])
+"""Of the charts: one without a memory, others with one of 5, 20 and 50 samples."""
+FACTOR, FACTOR_OF_FEW = 2.0, 7.5
+"""A band is so many times the largest held-out ratio: 2 + 7.5 / episodes."""
+LEAST_RATIO = 0.5
+"""The largest ratio is taken to be at least this, however well the log is predicted."""
+LEAST = 0.1
+"""The residual is taken to be at least so large, in standard deviations of one-step errors."""
+NORMAL_MEDIAN = 0.6745
+"""Median of what is normally distributed, without its sign, in standard deviations."""
+NOISY = 0.3
+"""Correlation of successive errors below which they are noise; those of a model change slowly."""
 FROZEN = 3
 """Repeats of a reading from which on it may be frozen."""
 MOVED = 3.0
 """Standard deviations that the twin's prediction moves in a sample while a reading stands."""
-WINDOW = 60
-"""Transitions in which an actuator may have stuck."""
-SHARE, UNEXPLAINED, CERTAIN = 0.2, 0.1, 5.0
-"""A stuck input: how near to one its share is, what it leaves of the squared errors, certainty."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +40,7 @@ class Alarm:
     Attributes
     ----------
     kind : str
-        "not a number", "violation", "outside the band", "drift", "frozen sensor", "actuator" or
-        "cost".
+        "not a number", "violation", "outside the band", "drift" or "frozen sensor".
     message : str
         What was seen, for people.
 
@@ -45,14 +54,140 @@ class Alarm:
     message: str
 
 
+@dataclass(frozen=True)
+class Familiarity:
+    """How far the twin may be wrong at a point that the log tells little about.
+
+    The standard deviation of fits without each fold of the episodes; beyond the log also what the
+    residual explains, times the distance in widths of the log.
+
+    Attributes
+    ----------
+    dynamics : Dynamics
+        A member for each fold.
+    low, high : ndarray, shape (k,)
+        The box of the logged features ``[x, d, u]``.
+    size : ndarray, shape (n,)
+        What the residual explains.
+    """
+
+    dynamics: Dynamics
+    low: Array
+    high: Array
+    size: Array
+
+    def doubt(self, rows: Array, u: Array) -> Array:
+        """Return standard deviations (..., n) at rows (..., size) and inputs (..., m)."""
+        z = self.dynamics.row.features(rows, u)
+        width = np.maximum(self.high - self.low, 1e-6 * self.dynamics.coordinates.scale)
+        beyond = np.maximum(np.maximum(z - self.high, self.low - z), 0.0)
+        far = (beyond / width).sum(axis=-1, keepdims=True)
+        far = far + far**2  # a twin of a narrow log underrates what is far away
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (rows, u))
+        apart = self.dynamics.residual(*flat).std(axis=0).reshape(*far.shape[:-1], -1)
+        return np.asarray(np.hypot(apart, far * self.size))
+
+
+class _Charts:
+    """Exponentially weighted averages of innovations, and of what is not known (Roberts 1959)."""
+
+    def __init__(self, n: int) -> None:
+        self.means, self.doubts = np.zeros((2, len(GAINS), n))
+
+    def take(self, innovation: Array, doubt: Array) -> None:
+        """Take in those of a sample, (n,) each."""
+        self.means += GAINS[:, None] * (innovation - self.means)
+        self.doubts += GAINS[:, None] * (doubt - self.doubts)
+
+
+@dataclass(frozen=True)
+class Bands:
+    """How far charts may go while all is well, from episodes that a fit has not seen.
+
+    Attributes
+    ----------
+    known : Familiarity
+    error : ndarray, shape (n,)
+        Root mean squares of one-step errors.
+    spread, most : ndarray, shape (gains, n)
+        Typical deviations of the charts, and the largest ratios to their scale.
+    noisy : ndarray of bool, shape (n,)
+        Whether a sensor's errors change from step to step, as noise does.
+    repeats : ndarray of int, shape (n,)
+        How often in a row a reading repeats itself in the log.
+    factor : float
+        By how much the largest ratio is exceeded only where something is wrong.
+    """
+
+    known: Familiarity
+    error: Array
+    spread: Array
+    most: Array
+    noisy: NDArray[np.bool_]
+    repeats: NDArray[np.int64]
+    factor: float
+
+    @classmethod
+    def of(cls, twin: PlantTwin) -> Bands:
+        """Return those of a twin's own log."""
+        if not twin.judges:
+            raise ValueError(
+                "The twin's log is one episode: nothing is left to calibrate a watchdog on. Log "
+                "at least one episode more; four are a good number."
+            )
+        unseen, log = twin.judges[0].dynamics, pieces(twin.episodes, FOLDS)
+        row, units = unseen.row, unseen.coordinates.units
+        left = []
+        for i, each in enumerate(log):
+            one = Dynamics(unseen.problem, unseen.coordinates, (unseen.members[i % FOLDS],))
+            after = one.step(each.thetas[None, :-1], each.actions[None])[0]
+            left.append((each.thetas[1:] - after)[:, row.state])
+        squares = np.sum([np.sum(each**2, axis=0) for each in left], axis=0)
+        products = np.sum([np.sum(each[1:] * each[:-1], axis=0) for each in left], axis=0)
+        lag = products / np.maximum(squares, 1e-300)
+        error = np.maximum(np.sqrt(squares / sum(map(len, left))), 1e-9 * units)
+        explained = [twin.dynamics.residual(e.thetas[None, :-1], e.actions[None])[0] for e in log]
+        size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST * error) ** 2)
+        seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log])
+        known = Familiarity(unseen, seen.min(axis=0), seen.max(axis=0), size)
+        means, doubts = [], []
+        for each, errors in zip(log, left, strict=True):
+            charts = _Charts(len(units))
+            for step in zip(errors, known.doubt(each.thetas[:-1], each.actions), strict=True):
+                charts.take(*step)
+                means.append(charts.means.copy())
+                doubts.append(charts.doubts.copy())
+        # A median: where an episode leaves what the others show, the doubt explains its errors.
+        spread = np.median(np.abs(means), axis=0) / NORMAL_MEDIAN + 1e-9 * error
+        most = np.max(np.abs(means) / np.hypot(spread, doubts), axis=0)
+        repeats = np.max([_repeats(e.thetas[:, row.state]) for e in twin.episodes], axis=0)
+        factor = FACTOR + FACTOR_OF_FEW / len(twin.episodes)
+        most = np.maximum(most, LEAST_RATIO)
+        return cls(known, error, spread, most, lag < NOISY, repeats, factor)
+
+    def ratios(self, charts: _Charts) -> Array:
+        """Return charts (gains, n) in units of their bands: beyond 1 something is wrong."""
+        band = self.factor * self.most * np.hypot(self.spread, charts.doubts)
+        return np.asarray(charts.means / band)
+
+
+def _repeats(x: Array) -> NDArray[np.int64]:
+    """Return how often in a row, at most, each column repeats its entry."""
+    run, longest = np.zeros((2, x.shape[1]), np.int64)
+    for same in x[1:] == x[:-1]:
+        run = (run + 1) * same
+        longest = np.maximum(longest, run)
+    return longest
+
+
 @dataclass(eq=False, repr=False)
 class Watchdog:
     """Compares each transition of the plant with what its twin predicts.
 
     Innovations are charted at several gains: at once for what is abrupt, averaged over up to 50
     samples for what is small and lasts. Their bands come from episodes of the log that the fit
-    has not seen, times a factor. They widen where the log tells little. A run of the twin under
-    the policy bounds the cost. A reading that repeats itself while the twin moves is frozen.
+    has not seen, times a factor. They widen where the log tells little. A reading that repeats
+    itself while the twin moves is frozen.
 
     Make one with :meth:`of`, anew after each fit of the twin. It holds nothing from one episode
     to the next, and pickles.
@@ -61,7 +196,7 @@ class Watchdog:
     ----------
     dynamics : Dynamics
         The twin's members.
-    bands : ControlLimits
+    bands : Bands
         How far all may go while all is well.
     alarm : Alarm or None
         The first one of this episode.
@@ -74,9 +209,9 @@ class Watchdog:
     >>> law = (problem := gymnasium.make("CSTR-v0").observation_space.problem).explicit()
     >>> log = evaluate(law, "CSTR-v0", seeds=range(6))
     >>> x, u = log.observations[5], log.actions[5]
-    >>> twin = PlantTwin.fit(problem, [*zip(log.observations[:5], log.actions)])
+    >>> twin = PlantTwin.fit(problem, [*zip(log.observations[:5], log.actions)], updates=200)
     >>> dog = Watchdog.of(twin)
-    >>> dog.start(x[0], law)
+    >>> dog.start(x[0])
     >>> any(dog.watch(x[k], u[k], x[k + 1]) for k in range(200))
     False
     >>> dog.watch(x[200], u[200], x[201] + [0, 0, 0, 5]).kind
@@ -84,7 +219,7 @@ class Watchdog:
     """
 
     dynamics: Dynamics
-    bands: ControlLimits
+    bands: Bands
     alarm: Alarm | None = None
     _episode: _Episode | None = field(default=None, init=False)
 
@@ -101,44 +236,31 @@ class Watchdog:
         """
         if not isinstance(twin, PlantTwin):
             raise TypeError(f"twin = {twin!r} must be a PlantTwin.")
-        return cls(twin.dynamics, ControlLimits.of(twin))
+        return cls(twin.dynamics, Bands.of(twin))
 
     def __repr__(self) -> str:
         """Say whether it is quiet."""
         return f"Watchdog({'quiet' if self.alarm is None else self.alarm})"
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave out the running episode: its policy need not pickle."""
-        return {"dynamics": self.dynamics, "bands": self.bands, "alarm": self.alarm}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        self.__dict__.update(state, _episode=None)
+        """Leave out the running episode."""
+        return vars(self) | {"_episode": None}
 
     @property
     def quiet(self) -> bool:
         """Whether there has been no alarm in this episode."""
         return self.alarm is None
 
-    def start(self, theta: Array, act: Act) -> None:
-        """Begin an episode.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (n_theta,)
-            The first one.
-        act : callable
-            The policy that will act, from theta (rows, n_theta) to inputs (rows, m).
+    def start(self, theta: Array) -> None:
+        """Begin an episode at theta (n_theta,).
 
         Raises
         ------
         ValueError
             If theta has another shape, or is not finite.
         """
-        problem = self.dynamics.problem
-        first = check_array("theta", theta, (problem.n_theta,))
-        first = self.dynamics.row.begin(first)
-        tracks = EwmaCharts(self.dynamics, self.bands.predictive_variance, first, act)
-        self.alarm, self._episode = None, _Episode(tracks, first)
+        first = check_array("theta", theta, (self.dynamics.problem.n_theta,))
+        self.alarm, self._episode = None, _Episode(self.dynamics, self.dynamics.row.begin(first))
 
     def watch(self, theta: Array, u: Array, after: Array, violation: bool = False) -> Alarm | None:
         """Return an alarm, or None: after one the episode's alarm stays as it is.
@@ -158,127 +280,83 @@ class Watchdog:
             Before :meth:`start`.
         """
         if self._episode is None:
-            raise RuntimeError("No episode has begun: call start(theta, act) first.")
+            raise RuntimeError("No episode has begun: call start(theta) first.")
         if self.alarm is None:
             theta, u, after = (np.array(each, np.float64) for each in (theta, u, after))
             with np.errstate(all="ignore"):
-                self.alarm = self._seen(self._episode, theta, u, after, violation)
+                found = self._seen(self._episode, theta, u, after, violation)
+            if found is not None:
+                kind, said = found
+                self.alarm = Alarm(kind, f"Step {self._episode.steps}: {said}.")
         return self.alarm
 
     def _seen(
         self, episode: _Episode, theta: Array, u: Array, after: Array, violation: bool
-    ) -> Alarm | None:
-        """Return what is wrong with a transition."""
+    ) -> tuple[str, str] | None:
+        """Return what is wrong with a transition: the kind, and what is said."""
         for name, values in (("theta", theta), ("the input", u), ("the reading", after)):
             if not np.isfinite(values).all():
-                return episode.alarm("not a number", f"{name} is {np.asarray(values).tolist()}")
+                return "not a number", f"{name} is {np.asarray(values).tolist()}"
         if violation:
-            return episode.alarm("violation", "the plant reports a violation")
-        episode.take(theta, u, after)
-        return self._frozen(episode) or self._beyond(episode) or self._dear(episode)
+            return "violation", "the plant reports a violation"
+        episode.take(theta, u, after, self.bands.known.doubt)
+        return self._frozen(episode) or self._beyond(episode)
 
-    def _frozen(self, episode: _Episode) -> Alarm | None:
+    def _frozen(self, episode: _Episode) -> tuple[str, str] | None:
         """Return an alarm where a reading repeats itself as it would not.
 
         A noisy sensor does so never, or as the log shows. A settled one may for ever: there the
         twin must say that the state moves.
         """
         stands, bands = episode.stands, self.bands
-        if stands.max() < FROZEN:
-            return None
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
-        unsure = np.hypot(bands.error, episode.tracks.doubts[0])  # what is not familiar counts
+        unsure = np.hypot(bands.error, episode.charts.doubts[0])  # what is not familiar counts
         moving = np.abs(episode.moved) > MOVED * stands * unsure
+        problem, reading = self.dynamics.problem, episode.row[self.dynamics.row.state]
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
-            problem = self.dynamics.problem
             name = problem.model.state_names
-            shown = problem.units.to_plant(episode.reading)[i]
+            shown = problem.units.to_plant(reading)[i]
             said = f"{name[i] if name else f'reading {i}'} has been {shown:.6g}"
-            said += f" for {stands[i]} samples"
-            return episode.alarm("frozen sensor", f"{said}; the twin moves or the sensor is noisy")
+            said += f" for {stands[i]} samples; the twin moves or the sensor is noisy"
+            return "frozen sensor", said
         return None
 
-    def _beyond(self, episode: _Episode) -> Alarm | None:
+    def _beyond(self, episode: _Episode) -> tuple[str, str] | None:
         """Return an alarm where a chart leaves its band."""
-        ratios = np.abs(self.bands.ratios(episode.tracks))
+        ratios = np.abs(self.bands.ratios(episode.charts))
         if not ratios.max() > 1.0:
             return None
-        gain, i = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
-        mean, times = episode.tracks.charts[gain, i], ratios[gain, i]
-        model = self.dynamics.problem.model
-        said = f"{name_of(model, 'state', int(i))} is off the twin's prediction by {mean:.3g}"
+        at_once = ratios[:1] if ratios[0].max() > 1.0 else ratios
+        gain, i = np.unravel_index(int(np.argmax(at_once)), at_once.shape)
+        name = name_of(self.dynamics.problem.model, "state", int(i))
+        said = f"{name} is off the twin's prediction by {episode.charts.means[gain, i]:.3g}"
         if GAINS[gain] < 1.0:
             said += f" on an average of {1 / GAINS[gain]:.0f} samples"
-        said += f", {times:.3g} bands"
-        stuck = self._stuck(episode)
-        if stuck is not None:
-            j, value = stuck
-            value += self.dynamics.problem.units.u_ss[j]
-            return episode.alarm(
-                "actuator", f"{said}: as if {name_of(model, 'input', j)} stuck at {value:.4g}"
-            )
-        return episode.alarm("outside the band" if GAINS[gain] == 1.0 else "drift", said)
-
-    def _dear(self, episode: _Episode) -> Alarm | None:
-        """Return an alarm where the episode costs more than the twin's."""
-        ratio, tracks = self.bands.cost_ratio(episode.tracks), episode.tracks
-        if not ratio > 1.0:
-            return None
-        expected = f"{tracks.costs.mean():.4g} in the twin ({ratio:.3g} bands)"
-        return episode.alarm("cost", f"the cost so far is {tracks.cost:.4g}, {expected}")
-
-    def _stuck(self, episode: _Episode) -> tuple[int, float] | None:
-        """Return an input, and its value, with which alone the last transitions agree.
-
-        The errors are regressed on what the twin does with an input that stuck at an earlier
-        value: one means that it did.
-        """
-        theta, u, after = (np.array(each) for each in zip(*episode.last, strict=True))
-        dynamics, x = self.dynamics, self.dynamics.row.state
-        first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
-        predicted = first.step(theta[None], u[None])[0]
-        errors = (after - predicted)[:, x] / self.bands.error
-        best, found = 0.0, None
-        for j in range(u.shape[1]):
-            for since in range(len(u) - FROZEN):
-                held = u[since:].copy()
-                held[:, j] = u[since, j]
-                moved = first.step(theta[None, since:], held[None])[0] - predicted[since:]
-                effect, error = moved[:, x] / self.bands.error, errors[since:]
-                total = float(np.sum(effect**2))
-                share = float(np.sum(effect * error)) / max(total, 1e-300)
-                left = float(np.sum((error - effect) ** 2)) - error.size
-                agrees = abs(share - 1) < SHARE and left < UNEXPLAINED * float(np.sum(error**2))
-                if agrees and share * np.sqrt(total) > max(CERTAIN, best):
-                    best, found = share * np.sqrt(total), (j, float(u[since, j]))
-        return found
+        kind = "outside the band" if GAINS[gain] == 1.0 else "drift"
+        return kind, f"{said}, {ratios[gain, i]:.3g} bands"
 
 
 class _Episode:
     """What is remembered within an episode."""
 
-    def __init__(self, tracks: EwmaCharts, row: Array) -> None:
-        self.tracks, self.row, n = tracks, row, tracks.dynamics.problem.model.n_states
+    def __init__(self, dynamics: Dynamics, row: Array) -> None:
+        n = dynamics.problem.model.n_states
+        self.first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
+        self.row, self.charts, self.steps = row, _Charts(n), 0
         self.stands, self.moved = np.zeros(n, np.int64), np.zeros(n)
-        self.last: deque[tuple[Array, Array, Array]] = deque(maxlen=WINDOW)
 
-    def take(self, theta: Array, u: Array, after: Array) -> None:
+    def take(
+        self, theta: Array, u: Array, after: Array, doubt: Callable[[Array, Array], Array]
+    ) -> None:
         """Take in a transition, of which all is finite."""
-        layout = self.tracks.dynamics.row
+        layout = self.first.row
         if not np.array_equal(layout.shown(self.row), theta):  # one that does not follow the last
             self.row = layout.begin(theta)
         before, self.row = self.row, layout.after(self.row, u, after)
-        self.last.append((before, u, self.row))
-        self.tracks.step(before, u, self.row)
-        same = self.reading == before[layout.state]
+        predicted = self.first.step(before[None, None], u[None, None])[0, 0]
+        innovation = (self.row - predicted)[layout.state]
+        self.charts.take(innovation, doubt(before, u))
+        self.steps += 1
+        same = self.row[layout.state] == before[layout.state]
         self.stands = (self.stands + 1) * same
-        self.moved = (self.moved + self.tracks.innovation) * same
-
-    @property
-    def reading(self) -> Array:
-        """The plant's state (n,) as it was measured last."""
-        return self.row[self.tracks.dynamics.row.state]
-
-    def alarm(self, kind: str, said: str) -> Alarm:
-        """Return an alarm that names the step."""
-        return Alarm(kind, f"Step {self.tracks.steps}: {said}.")
+        self.moved = (self.moved + innovation) * same

@@ -223,7 +223,7 @@ def improve(
     >>> from sb3_yann_envs import problems
     >>> mpc = problems.cstr()
     >>> log = evaluate(mpc.explicit(), "CSTR-v0", seeds=range(5))  # a plant's own episodes
-    >>> twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions)], residuals=["cubic"])
+    >>> twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions)], residuals=["quadratic"])
     >>> found = improve(mpc, twin, rounds=1, n_starts=8, updates=200)  # a glance
     >>> found.change <= 0, found.model.policy.problem is mpc
     (True, True)

@@ -24,7 +24,6 @@ from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Coordinates, law_of
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Monomials
 
 STANDARD_ERRORS = 4.0
 """A coefficient of a regression differs from a value where it is farther away than so many."""
@@ -491,7 +490,8 @@ class _Effects:
         z = z / log.coordinates.scale
         y = np.concatenate([e.thetas[k + 1, row.state] for e, k in steps])
         x, u = z[:, :-m], z[:, -m:]
-        curved = Monomials(x.shape[1], 2).values(x)
+        first, second = np.triu_indices(x.shape[1])
+        curved = np.hstack([x, x[:, first] * x[:, second]])
         states = curved if len(z) > 5 * (curved.shape[1] + m + 1) else x
         F = np.column_stack([u, np.ones(len(z)), states])
         if len(z) <= 5 * F.shape[1]:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual, as_polynomials
+from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.row_layout import RowLayout
 
 MARGIN = 0.25
@@ -135,23 +134,9 @@ class Dynamics:
     members: tuple[Residual, ...]
 
     @cached_property
-    def _stack(self) -> Any:
-        """All members as one that maps (members, batch, k), of a kind that can."""
-        stack = getattr(type(self.members[0]), "stack", None)
-        return stack and stack(self.members)
-
-    @cached_property
-    def packed(self) -> tuple[Any, ...] | None:
-        """The twin as arrays for compiled code; None where a residual is no polynomial."""
-        box, row = self.coordinates, self.row
-        found = as_polynomials(self.members, len(row.inputs))
-        if found is None:
-            return None
-        *order, weights = found
-        if row.observer is not None:
-            weights = np.ascontiguousarray(weights @ row.spread.T)
-        limits = np.stack([box.low, box.high, box.scale])
-        return row.linear, row.inputs, limits, *order, weights
+    def _stack(self) -> Residual:
+        """All members as one that maps (members, batch, k)."""
+        return Residual.stack(self.members)
 
     @property
     def row(self) -> RowLayout:
@@ -160,28 +145,16 @@ class Dynamics:
 
     def residual(self, theta: Array, u: Array) -> Array:
         """Return the residuals (members, batch, n) at rows (members, or 1 for all, batch, size)."""
-        return self._each("predict", self.coordinates.scaled(self.row.features(theta, u)))
+        return self._stack.predict(self._scaled(theta, u))
 
-    def _each(self, method: str, z: Array) -> Array:
-        """Return what the members say of z (members, batch, k), or all of them of one (1, ...)."""
-        z = np.broadcast_to(z, (len(self.members), *z.shape[1:]))
-        if self._stack is not None:
-            return np.asarray(getattr(self._stack, method)(z))
-        pairs = zip(self.members, z, strict=True)
-        return np.array([getattr(member, method)(rows) for member, rows in pairs])
+    def _scaled(self, theta: Array, u: Array) -> Array:
+        z = self.coordinates.scaled(self.row.features(theta, u))
+        return np.broadcast_to(z, (len(self.members), *z.shape[1:]))
 
     def step(self, theta: Array, u: Array) -> Array:
         """Return the next rows (members, batch, size); r and a measured d stay as they are."""
-        if self.packed is not None and theta.shape[0] == len(self.members):
-            from sb3_yann.twin._kernels.step import step  # compiled once
-
-            after = np.empty(theta.shape)
-            rows = *(np.array(each, np.float64, order="C") for each in (theta, u)), after
-            given: Any = (*self.packed, *(each.reshape(-1, each.shape[-1]) for each in rows))
-            step(*given)
-        else:
-            after = np.concatenate([theta, u], axis=-1) @ self.row.linear.T
-            after = after + self.residual(theta, u) @ self.row.spread.T
+        after = np.concatenate([theta, u], axis=-1) @ self.row.linear.T
+        after = after + self.residual(theta, u) @ self.row.spread.T
         self.row.clip(after)
         self.coordinates.wrap(after)
         return np.asarray(after)
@@ -189,7 +162,7 @@ class Dynamics:
     def jacobians(self, theta: Array, u: Array) -> tuple[Array, Array]:
         """Return the derivatives of the step by theta and by u, for each member and row."""
         row, at = self.row, self.row.features(theta, u)
-        J = self._each("jacobian", self.coordinates.scaled(at))
+        J = self._stack.jacobian(self._scaled(theta, u))
         inside = (at > self.coordinates.low) & (at < self.coordinates.high)
         J = J * (inside / self.coordinates.scale)[..., None, :]
         whole = np.broadcast_to(row.linear, (*J.shape[:-2], *row.linear.shape)).copy()

@@ -1,4 +1,4 @@
-"""An ensemble of small networks as the residual: fitted in torch side by side, stepped in numpy."""
+"""An ensemble of small networks as residuals, fitted in torch side by side."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from sb3_yann._validation import Array
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.residuals import Residual
 
 HIDDEN = 48  # units in each of two hidden layers
 BATCH = 256  # rows in a step of Adam
@@ -21,45 +22,6 @@ ROUNDING = 1e-6  # of float32 observations, in how far the states move
 RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
 
 
-class NetworkResidual:
-    """``y = tanh(tanh(z W1 + b1) W2 + b2) W3 + b3 + z L`` in scaled coordinates.
-
-    Parameters
-    ----------
-    weights : sequence of ndarray
-        W1 (k, h), b1 (1, h), W2 (h, h), b2 (1, h), W3 (h, n), b3 (1, n) and L (k, n). Those of
-        several networks have an axis of the members before all else.
-    """
-
-    def __init__(self, weights: Sequence[Array]) -> None:
-        self.weights = tuple(weights)
-
-    @classmethod
-    def stack(cls, members: Sequence[NetworkResidual]) -> NetworkResidual:
-        """Return several as one, from z (members, batch, k) to (members, batch, n)."""
-        return cls([np.array(each) for each in zip(*(m.weights for m in members), strict=True)])
-
-    def _hidden(self, z: Array) -> tuple[Array, Array]:
-        W1, b1, W2, b2 = self.weights[:4]
-        first = np.tanh(z @ W1 + b1)
-        return first, np.tanh(first @ W2 + b2)
-
-    def predict(self, z: Array) -> Array:
-        """Return the residual (..., batch, n) at z (..., batch, k)."""
-        W3, b3, L = self.weights[4:]
-        return np.asarray(self._hidden(z)[1] @ W3 + b3 + z @ L)
-
-    def jacobian(self, z: Array) -> Array:
-        """Return its derivatives (..., batch, n, k)."""
-        W1, _, W2, _, W3, _, L = (np.swapaxes(each, -1, -2) for each in self.weights)
-        first, second = self._hidden(z)
-        rows = W3[..., None, :, :] * (1 - second**2)[..., None, :]  # (..., batch, n, h)
-        flat = rows.reshape(*rows.shape[:-3], -1, rows.shape[-1]) @ W2
-        rows = flat.reshape(rows.shape) * (1 - first**2)[..., None, :]
-        flat = rows.reshape(*rows.shape[:-3], -1, rows.shape[-1]) @ W1
-        return np.asarray(flat.reshape(*rows.shape[:-1], -1) + L[..., None, :, :])
-
-
 def fit_ensemble(
     coordinates: Coordinates,
     logs: Sequence[Sequence[Episode]],
@@ -67,7 +29,7 @@ def fit_ensemble(
     *,
     ahead: int = 1,
     updates: int = 3000,
-) -> list[NetworkResidual]:
+) -> list[Residual]:
     """Return one network for each log, all fitted at once.
 
     A linear part is fitted by least squares, the networks to what it leaves of single steps. With
@@ -202,7 +164,7 @@ class _Networks:
             adam.step()
             schedule.step()
 
-    def residuals(self) -> list[NetworkResidual]:
+    def residuals(self) -> list[Residual]:
         """Return them in scaled coordinates, one by one."""
         with th.no_grad():
             W1, b1, W2, b2, W3, b3, L = self.weights
@@ -210,8 +172,9 @@ class _Networks:
             b1 = b1 - self.center @ first
             b3 = b3 * self.unit - self.center @ L
             parts = [first, b1, W2, b2, W3 * self.unit, b3, L]
+            parts.append(th.zeros((len(L), L.shape[1], L.shape[1] * L.shape[2])))
             arrays = [each.double().numpy().copy() for each in parts]
-        return [NetworkResidual([each[i] for each in arrays]) for i in range(len(arrays[0]))]
+        return [Residual([each[i] for each in arrays]) for i in range(len(arrays[0]))]
 
 
 def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:

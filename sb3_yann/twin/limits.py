@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, law_of
-from sb3_yann.twin.residuals import ZeroResidual
+from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.starts import Starts
 
@@ -64,7 +64,7 @@ class Limits:
 def _planned(problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
     """Return the box of the MPC's runs on its own model: as long as the log's, from its starts."""
     n, steps = problem.model.n_states, len(starts.rows) // len(starts.first)
-    model = Dynamics(problem, coordinates, (ZeroResidual(n),))
+    model = Dynamics(problem, coordinates, (Residual.zero(len(coordinates.scale), n),))
     first = starts.draw(PLANNED, np.random.default_rng(0))
     rows = model.roll_out(law_of(problem), first[None], steps)[0]
     x = rows[..., coordinates.row.state].reshape(-1, n)

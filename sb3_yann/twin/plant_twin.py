@@ -14,8 +14,9 @@ from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.env import TwinEnv
-from sb3_yann.twin.forecast import Forecast, Judge, forecast
+from sb3_yann.twin.forecast import Forecast, Judge, forecast, judges
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from sb3_yann.twin.observers import observer_of, warn_of_estimates
@@ -27,15 +28,12 @@ from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.sampling import cut_at_gaps
 from sb3_yann.twin.selection import (
     FOLDS,
-    MORE_THAN_A_POLYNOMIAL,
-    NETWORK,
-    Networks,
+    KINDS,
+    Candidate,
     candidates,
-    choose,
-    fitted,
-    judges,
-    networks_may_help,
-    unseen,
+    held_out,
+    ridge,
+    without_each_fold,
 )
 from sb3_yann.twin.starts import Starts
 from sb3_yann.twin.trust import (
@@ -52,15 +50,20 @@ if TYPE_CHECKING:
 
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
-KINDS = ("none", "linear", "quadratic", "cubic", "network")
+AHEAD = 20
+"""Steps of the windows that networks are fitted to."""
+ROWS, LACKS = 300, 0.01
+"""Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
+episodes err by so much of the mean."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlantTwin:
     """A simulator learnt from a plant's own episodes, which says what it is worth.
 
-    ``x+ = A x + B u + E d + residual(x, d, u)``. Which residual, and how strongly it is shrunk
-    towards the given model, is chosen by free runs over episodes that its fit has not seen.
+    ``x+ = A x + B u + E d + residual(x, d, u)``. The residual is none, a polynomial that is shrunk
+    towards the given model, or small networks, by free runs over episodes that its fit has not
+    seen.
     Several members, fitted to episodes drawn with replacement, tell how much is not known. Two to
     four episodes are cut into pieces for both. Outside the data the residual stays what it is at
     their edge.
@@ -127,8 +130,9 @@ class PlantTwin:
         previous: Sequence[ArrayLike] | None = None,
         time: Sequence[ArrayLike] | None = None,
         observer: DisturbanceObserver | None = None,
-        residuals: Sequence[str | Callable[[], Any]] = KINDS,
+        residuals: Sequence[str] = KINDS,
         n_members: int = 5,
+        updates: int = 3000,
         seed: int = 0,
         units_confirmed: bool = False,
     ) -> PlantTwin:
@@ -152,12 +156,12 @@ class PlantTwin:
             The one whose estimates x and d of theta are, of all states: that of
             :class:`ObserveDisturbance`. Without ``disturbances`` states (T + 1, n) are what it
             measured, and it is run over them.
-        residuals : sequence, default ("none", "linear", "quadratic", "cubic", "network")
-            What there is to choose from. Networks are tried where nothing else predicts well. A
-            function makes a regressor with ``fit(z, y)`` and ``predict(z)``, as scikit-learn has
-            it.
+        residuals : sequence, default ("none", "linear", "quadratic", "network")
+            What there is to choose from. Networks are tried where nothing else predicts well.
         n_members : int, default 5
             The first is fitted to all episodes, the others to as many drawn from them.
+        updates : int, default 3000
+            Steps of Adam of networks.
         seed : int, default 0
             Of the draws of episodes, and of the weights that networks start from.
         units_confirmed : bool, default False
@@ -176,6 +180,9 @@ class PlantTwin:
         check_int("n_members", n_members)
         check_int("seed", seed, 0)
         check_bool("units_confirmed", units_confirmed)
+        check_int("updates", updates)
+        if isinstance(residuals, str) or not residuals or not {*residuals} <= {*KINDS}:
+            raise ValueError(f"residuals = {residuals!r} must be a list of some of {KINDS}.")
         row, given = RowLayout(problem, observer), (references, disturbances, previous)
         observed = observer is not None
         log = as_episodes(problem, episodes, *given, observed=observed)
@@ -188,38 +195,39 @@ class PlantTwin:
             warn_of_estimates(problem, log)
         log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)
         coordinates = Coordinates.of(problem, log, observer)
-        asked = candidates(problem, residuals)
-        # The model as it is comes first, to compare with, whether it may be chosen or not.
-        others = [each for each in asked if each.name != "none"]
-        choices = [*candidates(problem, ["none"]), *others]
-        parts, first = pieces(log, FOLDS), int(bool(asked) and len(others) == len(asked))
-        runs, chosen = choose(problem, coordinates, parts, choices, first)
+        parts = pieces(log, FOLDS)
         blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
         draws = np.random.default_rng(seed).integers(len(blocks), size=(n_members - 1, len(blocks)))
         drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
+        # The model as it is comes first, to compare with, whether it may be chosen or not.
+        choices = candidates(coordinates, parts, residuals)
+        first = int("none" not in residuals and len(residuals) > 0)
+        alone = first == len(choices)
+        runs = held_out(coordinates, parts, choices)
+        chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
+        known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
+        long = sum(map(len, parts)) >= ROWS and len(parts) > 1
+        members: list[Residual] = []
+        if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
+            kept = without_each_fold(parts)
+            networks = fit_ensemble(
+                coordinates, [*kept, *drawn], seed, ahead=AHEAD, updates=updates
+            )
+            choices.append(Candidate("network", tuple(networks[: len(kept)])))
+            runs = held_out(coordinates, parts, choices)
+            chosen = runs.choose(first) if len(parts) > 1 else first
+            members = networks[len(kept) :]
+            known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
         choice = choices[chosen]
-        members: tuple[Residual, ...] | None = None
-        own: Sequence[Residual] = unseen(coordinates, parts, choice)
-        known, alone = costs_of_each(problem, coordinates, parts, own), not asked
-        if NETWORK in residuals and len(parts) > 1:
-            if alone or networks_may_help(relative_error(*known), parts):
-                tried = Networks.fit(coordinates, parts, drawn, seed)
-                runs = tried.compared(problem, coordinates, parts, runs)
-                freedom = [each.freedom for each in choices] + [MORE_THAN_A_POLYNOMIAL]
-                chosen = first + runs.from_number(first).choose(freedom[first:])
-                chosen = len(choices) if alone else chosen
-            if chosen == len(choices):
-                own, members = tried.by_fold, tried.members
-                known = costs_of_each(problem, coordinates, parts, own)
-            else:
-                choice = choices[chosen]
-                own = unseen(coordinates, parts, choice)
-        if members is None:
-            members = tuple(fitted(problem, coordinates, e, [choice.make()])[0] for e in drawn)
-        dynamics = Dynamics(problem, coordinates, members)
+        if choice.setting is not None:
+            members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
+        elif choice.name == "none":
+            members = [Residual.zero(len(coordinates.scale), problem.model.n_states)] * n_members
+        dynamics = Dynamics(problem, coordinates, tuple(members))
         trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
-        rivals = judges(coordinates, parts, runs.only(chosen), choice, own) if own else ()
-        return cls(problem, log, runs.names[chosen], dynamics, trust, notes, rivals)
+        own = Dynamics(problem, coordinates, choice.by_fold)
+        found = judges(own, log) if choice.by_fold else ()
+        return cls(problem, log, choice.name, dynamics, trust, notes, found)
 
     @classmethod
     def from_buffer(cls, model: Any, **options: Any) -> PlantTwin:

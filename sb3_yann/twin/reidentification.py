@@ -11,7 +11,7 @@ from sb3_yann.control import LinearModel, LinearMPC, Terminal
 from sb3_yann.control.mpc.steady_state import steady_states
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode, pieces
-from sb3_yann.twin.selection import FOLDS, candidates, choose, fitted
+from sb3_yann.twin.selection import FOLDS, candidates, held_out, ridge
 
 
 def reidentified(
@@ -24,11 +24,12 @@ def reidentified(
     problem, coordinates, log : LinearMPC, Coordinates and tuple of Episode
         Of a twin; two episodes at least.
     """
-    choices = candidates(problem, ["none", "linear"])
-    _, chosen = choose(problem, coordinates, pieces(log, FOLDS), choices, 0)
-    if chosen == 0:
+    parts = pieces(log, FOLDS)
+    choices = candidates(coordinates, parts, ["linear"])
+    choice = choices[held_out(coordinates, parts, choices).choose()]
+    if choice.setting is None:
         return problem
-    (residual,) = fitted(problem, coordinates, log, [choices[chosen].make()])
+    (residual,) = ridge(coordinates, log, [choice.setting])
     middle, model = np.zeros((1, len(coordinates.scale))), problem.model
     n, m, d = model.n_states, model.n_inputs, len(middle[0]) - model.n_states - model.n_inputs
     slopes = residual.jacobian(middle)[0] / coordinates.scale
@@ -38,7 +39,7 @@ def reidentified(
     u: Array = np.zeros(m)
     if problem.layout.has_constants:  # else the residual has no constant term
         x, u = _rest(problem, A, B, residual.predict(middle)[0])
-    note = f"Re-identified from {len(log)} episodes: {choices[chosen].name}."
+    note = f"Re-identified from {len(log)} episodes: {choice.name}."
     own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
     own |= {"notes": [*model.notes, note], "drift": None}
     found = LinearModel(**{**vars(model), **own})

@@ -1,259 +1,84 @@
 """What a plant does beyond its linear model, as a function of states, disturbances and inputs.
 
-A residual is fitted and asked in scaled coordinates: features z, and outputs in the units of what
-the linear model leaves unexplained.
+A residual is asked in scaled coordinates: see :class:`~sb3_yann.twin.dynamics.Coordinates`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from itertools import combinations_with_replacement
-from typing import Any, Protocol
+from collections.abc import Sequence
 
 import numpy as np
-from scipy import linalg
 
-from sb3_yann._validation import Array, check_int
-
-STEP = 1e-4
-"""Of a finite difference, in scaled coordinates."""
+from sb3_yann._validation import Array
 
 
-class Residual(Protocol):
-    """A function from z (batch, k) to the residual (batch, n)."""
+class Residual:
+    """``y = tanh(tanh(z W1 + b1) W2 + b2) W3 + b3 + z L + z' Q z``.
 
-    def predict(self, z: Array) -> Array:
-        """Return the residual (batch, n)."""
-
-    def jacobian(self, z: Array) -> Array:
-        """Return its derivatives (batch, n, k)."""
-
-
-class ZeroResidual:
-    """The linear model as it is."""
-
-    def __init__(self, n: int) -> None:
-        self.n = n
-
-    def predict(self, z: Array) -> Array:
-        """Return zeros (batch, n)."""
-        return np.zeros((len(z), self.n))
-
-    def jacobian(self, z: Array) -> Array:
-        """Return zeros (batch, n, k)."""
-        return np.zeros((len(z), self.n, z.shape[1]))
-
-
-@dataclass(frozen=True)
-class Monomials:
-    """All monomials of k variables up to a degree, without the constant one.
-
-    Attributes
-    ----------
-    k, degree : int
-    parents, variables : tuple of ndarray
-        Of each degree from 2 on: monomial i is ``parents[i]`` of the degree below, times one of
-        the variables.
-    """
-
-    k: int
-    degree: int
-    parents: tuple[Any, ...] = field(init=False)
-    variables: tuple[Any, ...] = field(init=False)
-
-    def __post_init__(self) -> None:
-        parents, variables = [], []
-        below: dict[tuple[int, ...], int] = {(j,): j for j in range(self.k)}
-        for degree in range(2, self.degree + 1):
-            powers = [*combinations_with_replacement(range(self.k), degree)]
-            parents.append(np.array([below[each[:-1]] for each in powers]))
-            variables.append(np.array([each[-1] for each in powers]))
-            below = {each: i for i, each in enumerate(powers)}
-        object.__setattr__(self, "parents", tuple(parents))
-        object.__setattr__(self, "variables", tuple(variables))
-
-    def holding(self, first: int) -> Array:
-        """Return which monomials hold a variable from number ``first`` on, as bools (size,)."""
-        blocks = [np.arange(self.k) >= first]
-        for parents, variables in zip(self.parents, self.variables, strict=True):
-            blocks.append(blocks[-1][parents] | (variables >= first))
-        return np.concatenate(blocks)
-
-    def values(self, z: Array) -> Array:
-        """Return the monomials at z (..., k): (..., size)."""
-        blocks = [z]
-        for parents, variables in zip(self.parents, self.variables, strict=True):
-            blocks.append(blocks[-1][..., parents] * z[..., variables])
-        return np.concatenate(blocks, axis=-1)
-
-    def slopes(self, z: Array, weights: Array) -> Array:
-        """Return the derivatives (..., k, n) at z (..., k) of ``values(z) @ weights``.
-
-        Backward: what a monomial is worth passes to its parent and to its variable.
-        """
-        blocks = [z]
-        for parents, variables in zip(self.parents, self.variables, strict=True):
-            blocks.append(blocks[-1][..., parents] * z[..., variables])
-        n = weights.shape[-1]
-        edges = np.cumsum([0, *(each.shape[-1] for each in blocks)])
-        out = np.zeros((*z.shape, n))
-        worth = np.broadcast_to(weights[..., edges[-2] :, :], (*blocks[-1].shape, n))
-        for level in range(len(blocks) - 1, 0, -1):
-            parents, variables = self.parents[level - 1], self.variables[level - 1]
-            below = blocks[level - 1]
-            to_variable = worth * below[..., parents, None]
-            to_parent = worth * z[..., variables, None]
-            select = np.zeros((self.k, len(variables)))
-            select[variables, np.arange(len(variables))] = 1.0
-            out += select @ to_variable
-            gather = np.zeros((below.shape[-1], len(parents)))
-            gather[parents, np.arange(len(parents))] = 1.0
-            worth = gather @ to_parent + weights[..., edges[level - 1] : edges[level], :]
-        return out + worth
-
-
-class Polynomial:
-    """A polynomial without a constant term: the equilibrium stays where it is.
-
-    Its coefficients are those of a ridge regression, shrunk towards the linear model.
+    Without hidden units it is a polynomial, and without L, Q and b3 the linear model as it is.
 
     Parameters
     ----------
-    degree : int
-    shrinkage : float
-        Weight of the squared coefficients, times the number of samples.
-    offset : bool, default False
-        Whether there is a constant term after all.
-    inputs : tuple of int and float, default (0, 1)
-        How many of the last variables are inputs, and how many times as strongly what holds one of
-        them is shrunk: the log of a closed loop tells little about them.
-    towards : ndarray, shape (k, n), optional
-        The linear coefficients that it is shrunk towards.
+    weights : sequence of ndarray
+        W1 (k, h), b1 (1, h), W2 (h, h), b2 (1, h), W3 (h, n), b3 (1, n), L (k, n) and Q (k, k n),
+        which is symmetric for each of the n. Those of several
+        residuals have an axis of the members before all else.
     """
 
-    def __init__(
-        self,
-        degree: int,
-        shrinkage: float,
-        offset: bool = False,
-        inputs: tuple[int, float] = (0, 1.0),
-        towards: Array | None = None,
-    ) -> None:
-        self.degree, self.shrinkage = check_int("degree", degree), shrinkage
-        self.offset, self.inputs, self.towards = offset, inputs, towards
+    def __init__(self, weights: Sequence[Array]) -> None:
+        self.weights = tuple(weights)
+        self.is_polynomial = self.weights[0].shape[-1] == 0
+        self._is_linear = not np.any(self.weights[7])
 
     @classmethod
-    def stack(cls, members: Sequence[Polynomial]) -> Polynomial:
-        """Return fitted ones as one, from z (members, batch, k) to (members, batch, n)."""
-        first = members[0]
-        found = cls(first.degree, first.shrinkage, first.offset, first.inputs)
-        found.monomials = first.monomials
-        found.weights = np.array([each.weights for each in members])
-        return found
+    def polynomial(cls, L: Array, b: Array | None = None, Q: Array | None = None) -> Residual:
+        """Return ``z L + b + z' Q z`` for L (k, n), b (n,) and a symmetric Q (k, k, n)."""
+        k, n = L.shape
+        hidden = np.zeros((k, 0)), np.zeros((1, 0)), np.zeros((0, 0)), np.zeros((1, 0))
+        constant = np.zeros(n) if b is None else b
+        bent = np.zeros((k, k, n)) if Q is None else Q
+        return cls([*hidden, np.zeros((0, n)), constant[None], L, bent.reshape(k, k * n)])
 
-    def fit(self, z: Array, y: Array) -> Polynomial:
-        """Fit to residuals y (N, n) at z (N, k)."""
-        self.solve(*self.moments(z, y))
-        return self
+    @classmethod
+    def zero(cls, k: int, n: int) -> Residual:
+        """Return zeros (n,) for k features."""
+        return cls.polynomial(np.zeros((k, n)))
 
-    def moments(self, z: Array, y: Array) -> tuple[Monomials, Array, Array, int]:
-        """Return the monomials, and the sums of their products with each other and with y."""
-        self.monomials = Monomials(z.shape[1], self.degree)
-        F = self._features(z)
-        return self.monomials, F.T @ F, F.T @ y, len(z)
+    @classmethod
+    def stack(cls, members: Sequence[Residual]) -> Residual:
+        """Return several as one, from z (members, batch, k) to (members, batch, n)."""
+        return cls([np.array(each) for each in zip(*(m.weights for m in members), strict=True)])
 
-    def solve(self, monomials: Monomials, gram: Array, cross: Array, count: int) -> None:
-        """Fit to the moments of some data, which polynomials of other shrinkages may share.
+    def _hidden(self, z: Array) -> tuple[Array, Array]:
+        W1, b1, W2, b2 = self.weights[:4]
+        first = np.tanh(z @ W1 + b1)
+        return first, np.tanh(first @ W2 + b2)
 
-        Parameters
-        ----------
-        monomials, gram, cross, count : Monomials, ndarray, ndarray and int
-            As :meth:`moments` returns them.
-        """
-        self.monomials = monomials
-        number, factor = self.inputs
-        own = self.monomials.holding(self.monomials.k - number)
-        ridge = self.shrinkage * count * np.where(own, factor, 1.0)
-        if self.offset:
-            ridge = np.append(ridge, 1e-9 * count)  # a constant is not shrunk
-        matrix = linalg.cho_factor(gram + np.diag(ridge + 1e-12 * count))
-        about, k = np.zeros(cross.shape), self.monomials.k
-        if self.towards is not None:
-            about[:k] = self.towards
-        self.weights = about + np.asarray(linalg.cho_solve(matrix, cross - gram @ about))
-
-    def _features(self, z: Array) -> Array:
-        F = self.monomials.values(z)
-        return np.concatenate([F, np.ones((*F.shape[:-1], 1))], axis=-1) if self.offset else F
+    def _bent(self, z: Array) -> Array:
+        """Return ``Q z``, (..., batch, k, n)."""
+        return np.asarray((z @ self.weights[7]).reshape(*z.shape, -1))
 
     def predict(self, z: Array) -> Array:
-        """Return the residual (batch, n)."""
-        return np.asarray(self._features(z) @ self.weights)
+        """Return the residual (..., batch, n) at z (..., batch, k)."""
+        W3, b3, L = self.weights[4:7]
+        found = z @ L + b3
+        if not self._is_linear:
+            found = found + np.sum(z[..., None] * self._bent(z), axis=-2)
+        if not self.is_polynomial:
+            found = found + self._hidden(z)[1] @ W3
+        return np.asarray(found)
 
     def jacobian(self, z: Array) -> Array:
-        """Return its derivatives (batch, n, k)."""
-        weights = self.weights[..., :-1, :] if self.offset else self.weights
-        # Between the members of a stack and their monomials is the batch.
-        slopes = self.monomials.slopes(z, np.expand_dims(weights, -3))
-        return np.asarray(np.swapaxes(slopes, -1, -2))
-
-
-def as_polynomials(members: Sequence[Any], k: int) -> tuple[Any, Any, Array] | None:
-    """Return residuals of k variables as arrays for compiled code, None where one is no polynomial.
-
-    Monomial k + i is monomial ``parents[i]`` times variable ``variables[i]``, its weights are
-    ``weights[:, k + i]`` (members, n). A constant one comes last, if there is one.
-    """
-    none, first = np.empty(0, np.int64), members[0]
-    if all(isinstance(each, ZeroResidual) for each in members):
-        return none, none, np.zeros((len(members), k, first.n))
-    if not all(isinstance(each, Polynomial) for each in members):
-        return None
-    below, parents, found = 0, [none], first.monomials
-    for each, size in zip(found.parents, [k, *map(len, found.parents)], strict=False):
-        parents.append(below + each)
-        below += size
-    weights = np.array([each.weights for each in members])
-    return np.concatenate(parents), np.concatenate([none, *found.variables]), weights
-
-
-class Regressor:
-    """Anything with ``fit`` and ``predict``, as scikit-learn has it; differences for derivatives.
-
-    Parameters
-    ----------
-    make : callable
-        Returns a new one.
-    """
-
-    def __init__(self, make: Callable[[], Any]) -> None:
-        self.make = make
-
-    def fit(self, z: Array, y: Array) -> Regressor:
-        """Fit to residuals y (N, n) at z (N, k)."""
-        self.estimator, self.n = self.make(), y.shape[1]
-        if not all(callable(getattr(self.estimator, name, None)) for name in ("fit", "predict")):
-            raise TypeError(
-                f"residuals holds a function that made {self.estimator!r}; it must make a "
-                "regressor with fit(z, y) and predict(z), as scikit-learn has it."
-            )
-        self.estimator.fit(z, y)
-        return self
-
-    def predict(self, z: Array) -> Array:
-        """Return the residual (batch, n)."""
-        found = np.asarray(self.estimator.predict(z), np.float64)
-        if found.size != len(z) * self.n:
-            raise ValueError(
-                f"A residual of residuals= predicts shape {found.shape} for {len(z)} rows, "
-                f"expected ({len(z)}, {self.n})."
-            )
-        return found.reshape(len(z), self.n)
-
-    def jacobian(self, z: Array) -> Array:
-        """Return its derivatives (batch, n, k), by central differences."""
-        batch, k = z.shape
-        moved = z + STEP * np.concatenate([np.eye(k), -np.eye(k)])[:, None]
-        found = self.predict(moved.reshape(-1, k)).reshape(2, k, batch, self.n)
-        return np.moveaxis((found[0] - found[1]) / (2 * STEP), 0, -1)
+        """Return its derivatives (..., batch, n, k)."""
+        W1, _, W2, _, W3, _, L, _ = (np.swapaxes(each, -1, -2) for each in self.weights)
+        found = np.broadcast_to(L[..., None, :, :], (*z.shape[:-1], *L.shape[-2:]))
+        if not self._is_linear:
+            found = found + 2 * np.swapaxes(self._bent(z), -1, -2)
+        if self.is_polynomial:
+            return np.asarray(found)
+        first, second = self._hidden(z)
+        rows = W3[..., None, :, :] * (1 - second**2)[..., None, :]  # (..., batch, n, h)
+        flat = rows.reshape(*rows.shape[:-3], -1, rows.shape[-1]) @ W2
+        rows = flat.reshape(rows.shape) * (1 - first**2)[..., None, :]
+        flat = rows.reshape(*rows.shape[:-3], -1, rows.shape[-1]) @ W1
+        return np.asarray(flat.reshape(*rows.shape[:-1], -1) + found)

@@ -107,15 +107,12 @@ def costs_of(problem: LinearMPC, episode: Episode) -> float:
 
 
 def costs_of_each(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    episodes: tuple[Episode, ...],
-    by_fold: Sequence[Residual],
+    coordinates: Coordinates, episodes: tuple[Episode, ...], by_fold: Sequence[Residual]
 ) -> tuple[Array, Array]:
     """Return predicted and actual costs of episodes, each by the residual without its fold."""
     if not by_fold:
         return np.empty(0), np.empty(0)
-    predicted = []
+    predicted, problem = [], coordinates.row.problem
     for i, episode in enumerate(episodes):
         own = Dynamics(problem, coordinates, (by_fold[i % len(by_fold)],))
         with np.errstate(all="ignore"):

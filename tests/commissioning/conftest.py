@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from sb3_yann.twin import selection
+from sb3_yann.twin import plant_twin
 
 
 @pytest.fixture(autouse=True)
 def no_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no log be long enough for them, but where a test asks for nothing else."""
-    monkeypatch.setattr(selection, "ROWS", 10**9)
+    monkeypatch.setattr(plant_twin, "ROWS", 10**9)

@@ -17,7 +17,7 @@ from sb3_yann import Commissioning, Improvement, YannPolicy
 from sb3_yann.commissioning import commissioning
 from sb3_yann.commissioning.comparison import (
     Costs,
-    is_confirmed,
+    is_hopeless,
     is_kept,
     pays_its_own,
     predicted_costs,
@@ -25,6 +25,7 @@ from sb3_yann.commissioning.comparison import (
 )
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.commissioning.watchdog import Alarm
+from sb3_yann.compare import Difference
 from sb3_yann.improvement import Check
 from sb3_yann.rollout import one_env
 from twin_samples import Cart, problem
@@ -177,6 +178,7 @@ def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(monkeypatch) -> N
         raise KeyboardInterrupt
 
     monkeypatch.setattr(commissioning, "improve", cut)
+    monkeypatch.setattr(commissioning, "is_kept", lambda _: True)
     with pytest.raises(KeyboardInterrupt):
         run.run(2)
     assert all(th.equal(a, b) for a, b in zip(before, run.policy.actor.parameters(), strict=True))
@@ -230,21 +232,15 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     run.incumbent.restore()
     bound = run.policy.max_correction
     before = [each.clone() for each in run.policy.actor.parameters()]
-    refused = Check(0, False, "start 3 costs a little more", -0.01, 0.001, True)
-    monkeypatch.setattr(
-        commissioning,
-        "improve",
-        lambda *_, **__: Improvement((refused,), -0.01, False, refused),
-    )
+    refused = Check(0, False, "start 3 violates a limit", 0.0, 0.0, False)
+    found = Improvement((refused,), 0.0, False, refused)
+    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: found)
+    monkeypatch.setattr(commissioning, "is_kept", lambda _: True)
     assert run.run(2)[-1].verdict == "stays"
     assert all(th.equal(a, b) for a, b in zip(before, run.policy.actor.parameters(), strict=True))
     assert run.policy.max_correction == bound
-    unsafe = replace(refused, safe=False)
-    monkeypatch.setattr(
-        commissioning, "improve", lambda *_, **__: Improvement((unsafe,), 0.0, False)
-    )
-    run.batch = 1  # short
-    assert run.run(3)[-1].verdict == "the MPC acts" and is_mpc(run.model)
+    monkeypatch.setattr(commissioning, "is_kept", lambda _: False)
+    assert run.run(3)[-1].verdict == "stays"  # it has been kept
 
 
 def test_weights_that_nobody_accepted_never_act() -> None:
@@ -324,26 +320,69 @@ def test_another_cost_is_another_commissioning(tmp_path) -> None:
         Commissioning(model, Cart, log_path=tmp_path, **options)
 
 
-def test_the_bound_grows_only_with_what_was_promised() -> None:
-    journal = commission().journal
-    assert is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.6, -0.6))
-    assert not is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.6, -0.4))
-    assert not is_confirmed(journal, Costs(100.0, 101.0, -1.0, 100.0, 0.0))
-    for unknown in (Costs(*4 * (np.nan,)), Costs(100.0, 90.0, np.inf, np.inf, -np.inf)):
-        assert not is_confirmed(journal, unknown)
+def costs(more: float, error: float, pairs: int, look: int = 1) -> Costs:
+    return Costs(10.0 + more, np.nan, 10.0, Difference(more, error, pairs), look)
 
 
-def test_a_policy_is_taken_back_where_it_surely_costs_more() -> None:
+def test_a_policy_is_taken_back_where_it_surely_costs_more_or_shows_no_gain() -> None:
     played = SimpleNamespace(violations=0, alarm=None)
     journal = SimpleNamespace(batch=[(played, True)], cut_off=0)
-    costs = Costs(10.3, 10.0, 0.5, 10.0, 0.3, pairs=8)  # Student's t of 7 degrees of freedom: 1.895
-    assert "it cost 10.3, the MPC in turns with it 10" in why_taken_back(journal, costs)
-    assert why_taken_back(journal, costs._replace(error=0.2)) == ""
-    assert why_taken_back(journal, costs._replace(error=0.15)) != ""
-    assert why_taken_back(journal, costs._replace(pairs=1)) == ""  # one pair tells nothing
-    dear = costs._replace(more=0.6, error=1.0)  # more than five per cent in any case
-    assert why_taken_back(journal, dear) != ""
-    assert why_taken_back(journal, costs._replace(more=np.nan)) != ""
+    said = "it cost 10.3, the MPC in turns with it 10"
+    assert said in why_taken_back(journal, costs(0.3, 0.15, 8))  # Student's t: 1.895
+    assert why_taken_back(journal, costs(0.3, 0.2, 8)) == ""
+    assert why_taken_back(journal, costs(0.3, np.inf, 1)) == ""  # one pair tells nothing
+    assert why_taken_back(journal, costs(0.6, 1.0, 8)) != ""  # more than five per cent in any case
+    assert why_taken_back(journal, costs(np.nan, 1.0, 8)) != ""
+    assert (
+        why_taken_back(journal, costs(np.nan, np.inf, 0))
+        == "no pair of episodes tells what it costs"
+    )
+    assert why_taken_back(journal, costs(0.11, 0.1, 10)) == "10 pairs show no gain"
+    assert not is_hopeless(costs(0.11, 0.1, 9)) and not is_hopeless(costs(-0.01, 0.1, 10))
+
+
+def test_a_policy_is_kept_where_it_surely_costs_less_at_the_level_of_the_look() -> None:
+    # Student's t of 7 degrees of freedom: 2.36 at 2.5 %, 3.13 at .83 %.
+    assert is_kept(costs(-0.3, 0.12, 8)) and not is_kept(costs(-0.3, 0.13, 8))
+    assert is_kept(costs(-0.3, 0.09, 8, look=2)) and not is_kept(costs(-0.3, 0.1, 8, look=2))
+    assert not is_kept(costs(-0.3, np.inf, 1)) and not is_kept(costs(np.nan, 0.1, 8))
+
+
+def test_pairs_of_all_batches_of_a_trial_decide_together() -> None:
+    run = commission(max_correction=0.1)
+    run.run(3)
+    journal = run.journal
+    (second, third) = run.batches[1:]
+    assert second.acted == third.acted == "batch 1"
+    assert second.verdict == "stays" and (second.pairs, third.pairs) == (5, 15)
+    assert sum(journal.by_policy) == 15
+    assert third.verdict == "accepted" and "15 pairs show that it costs less" in third.reason
+    assert third.max_correction == 0.1 < run.journal.outlook.max_correction == 0.2
+
+
+def test_a_policy_that_is_taken_back_gives_way_to_the_one_that_was_kept(monkeypatch) -> None:
+    run = commission(max_correction=0.1)
+    run.run(3)
+    kept = [each.clone() for each in run.policy.actor.parameters()]
+    monkeypatch.setattr(commissioning, "why_taken_back", lambda *_: "a test")
+    last = run.run(4)[-1]
+    assert last.acted == "batch 3" and last.verdict == "stays" and "taken back" in last.reason
+    assert run.journal.outlook.policy == "batch 1" and run.policy.max_correction == 0.1
+    for ours, theirs in zip(run.policy.actor.parameters(), kept, strict=True):
+        assert th.equal(ours, theirs)
+
+
+def test_while_no_policy_is_on_trial_every_other_episode_is_moved_at_random() -> None:
+    run = commission(excite=0.03, shadow=True)
+    run.run(1)
+    law = problem().explicit()
+    for number, each in enumerate(run.episodes):
+        apart = np.abs(each.actions - law(each.thetas[:-1])) / 2  # the range is 2
+        assert each.excited == bool(number % 2)
+        assert (1e-3 < apart.max() <= 0.03 + 1e-6) if each.excited else apart.max() < 1e-6
+    quiet = [each for each in run.episodes if not each.excited]
+    expected = [np.sum(problem().stage_cost(e.thetas[:-1], e.actions)) for e in quiet]
+    assert run.batches[0].mpc == pytest.approx(np.mean(expected))
 
 
 def test_shadow_computes_and_does_not_act() -> None:
@@ -418,13 +457,6 @@ def test_a_plant_that_its_model_describes_keeps_the_mpc(tmp_path) -> None:
 
     found = commission(tmp_path / "record", Described()).run(3)
     assert [each.acted for each in found] == ["MPC"] * 3
-
-
-def test_a_policy_is_kept_where_it_surely_costs_less_in_turns() -> None:
-    costs = Costs(9.7, 10.0, 0.5, 10.0, -0.3, 0.1, 8)
-    assert is_kept(costs) and not is_kept(costs._replace(error=0.2))
-    assert not is_kept(costs._replace(pairs=1, error=0.0))
-    assert not is_kept(costs._replace(more=np.nan))
 
 
 def test_a_reward_of_its_own_decides_what_is_kept() -> None:

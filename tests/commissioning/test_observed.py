@@ -50,7 +50,7 @@ def test_the_watchdog_is_quiet_and_sees_what_the_observer_smooths() -> None:
     dog, env = Watchdog.of(found), plant()
     for fault, quiet in ((0.0, True), (0.3, False)):
         theta, over = env.reset(seed=901)[0].astype(float), False
-        dog.start(theta, law)
+        dog.start(theta)
         for k in range(60):
             if k == 20:
                 env.unwrapped.x = env.unwrapped.x + np.array([0.0, fault])

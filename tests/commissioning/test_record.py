@@ -5,13 +5,12 @@ from __future__ import annotations
 import errno
 import json
 import os
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal
+from sb3_yann.commissioning.journal import CommissioningState, Journal
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Alarm
@@ -148,13 +147,3 @@ def test_a_model_is_on_the_disk_before_the_line_that_names_it(path: Path, monkey
     with pytest.raises(OSError, match="full"):
         Record(path).save(Unsaved(OSError("full")), 2)
     assert {each.name for each in path.parent.iterdir()} == {path.name, saved.name}
-
-
-def test_where_a_record_of_before_goes_on_nothing_waits_to_be_tried(path: Path) -> None:
-    batch, outlook = (
-        Batch(1, 2, 0, "MPC", 0.0, 1.0, 1.0, 1.0, "stays", ""),
-        asdict(CommissioningState(0.1)),
-    )
-    del outlook["tried"]
-    Record(path).append({"event": "batch", **asdict(batch), "from_here": outlook})
-    assert journal(path).outlook.tried

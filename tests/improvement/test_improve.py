@@ -393,14 +393,14 @@ def twin_of(make=Spring, episodes: int = 5) -> PlantTwin:
     mpc = make().observation_space.problem
     played = evaluate(mpc.explicit(), make, range(episodes))
     pairs = [*zip(played.observations, played.actions, strict=True)]
-    return PlantTwin.fit(mpc, pairs, residuals=["none", "linear", "quadratic", "cubic"])
+    return PlantTwin.fit(mpc, pairs, residuals=["none", "linear", "quadratic"])
 
 
 def reactor(seeds: range) -> PlantTwin:
     """Return the reactor's twin from episodes of its MPC."""
     mpc = DDPG("YannPolicy", "CSTR-v0", device="cpu").policy.problem
     played = evaluate(mpc.explicit(), "CSTR-v0", seeds)
-    kinds = ["none", "linear", "quadratic", "cubic"]
+    kinds = ["none", "linear", "quadratic"]
     pairs = [*zip(played.observations, played.actions, strict=True)]
     return PlantTwin.fit(mpc, pairs, residuals=kinds)
 

@@ -23,7 +23,7 @@ from sb3_yann_envs import ProblemBox
 
 DT = 0.1
 
-POLYNOMIALS = ("none", "linear", "quadratic", "cubic")  # a fit of networks takes seconds
+POLYNOMIALS = ("none", "linear", "quadratic")  # a fit of networks takes seconds
 
 
 @cache

@@ -15,14 +15,14 @@ from sb3_yann.evaluation.plots import plot_twin
 from sb3_yann.twin import trust as trusts
 from sb3_yann.twin.log import Episode, as_episodes, records
 from sb3_yann.twin.report import report
-from sb3_yann.twin.residuals import ZeroResidual
-from sb3_yann.twin.selection import Candidate, FreeRuns, unseen
+from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.selection import FreeRuns
 from twin_samples import log, problem, random_episode, twin
 
 
 def runs(*errors: list[float]) -> FreeRuns:
     """Return errors 1 and 10 steps ahead, of the given model first."""
-    return FreeRuns(np.array([1, 10]), np.array(errors, float)[:, None], ("",) * len(errors))
+    return FreeRuns(np.array([1, 10]), np.array(errors, float)[:, None])
 
 
 def judged(found: FreeRuns, standing=(1.0, 1.0), **changes):
@@ -47,27 +47,15 @@ def test_the_error_of_costs_is_relative_to_their_mean() -> None:
     assert trusts.relative_error(np.zeros(0), np.zeros(0)) == np.inf
 
 
-def test_every_episode_is_left_out_of_the_fit_that_predicts_it() -> None:
-    rows: list[int] = []
-
-    class Counts:
-        predict, jacobian = ZeroResidual(2).predict, ZeroResidual(2).jacobian
-
-        def fit(self, z, y):
-            rows.append(len(z))
-            return self
-
-    x, u = np.zeros((41, 2)), np.zeros((40, 1))
-    episodes = as_episodes(problem(), [(x[: n + 1], u[:n]) for n in (10, 25, 40)])
-    choice = Candidate("counts", Counts, 0.0)
+def test_costs_of_each_episode_are_predicted_by_the_residual_without_its_fold() -> None:
+    x, u = np.zeros((11, 2)), np.zeros((10, 1))
+    episodes = as_episodes(problem(), [(x, u)] * 3)
     coordinates = twin().dynamics.coordinates
-    own = unseen(coordinates, episodes, choice)
-    assert rows == [65, 50, 35]
-    predicted, actual = trusts.costs_of_each(problem(), coordinates, episodes, own)
-    assert predicted.tolist() == actual.tolist() == [0.0, 0.0, 0.0]
-    none = unseen(coordinates, episodes[:1], choice)
-    found = trusts.costs_of_each(problem(), coordinates, episodes[:1], none)
-    assert [len(each) for each in found] == [0, 0]
+    moved = [Residual.polynomial(np.zeros((3, 2)), np.array([0.0, b])) for b in (0.0, 0.1, 0.2)]
+    predicted, actual = trusts.costs_of_each(coordinates, episodes, moved)
+    assert actual.tolist() == [0.0, 0.0, 0.0]
+    assert predicted[0] == 0.0 < predicted[1] < predicted[2]
+    assert [len(each) for each in trusts.costs_of_each(coordinates, episodes, ())] == [0, 0]
 
 
 def test_rows_count_as_beyond_the_box_where_they_are_beyond_rounding() -> None:

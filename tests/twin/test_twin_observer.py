@@ -223,15 +223,6 @@ def test_the_slopes_of_a_step_are_those_of_differences_on_bounds_of_d_as_well() 
     assert on_bound.any() and not on_bound.all()
 
 
-def test_compiled_steps_are_those_of_numpy(monkeypatch) -> None:
-    found, rng = observed(), np.random.default_rng(0)
-    at = np.array([found.starts.draw_anywhere(30, rng) for _ in found.dynamics.members])
-    u = rng.uniform(-1, 1, (*at.shape[:2], 1))
-    compiled = found.dynamics.step(at, u)
-    monkeypatch.setattr(Dynamics, "packed", None)
-    np.testing.assert_allclose(compiled, found.dynamics.step(at, u), rtol=1e-12, atol=1e-12)
-
-
 def test_starts_begin_with_the_estimate_of_an_observer_that_begins() -> None:
     found, rng = observed(), np.random.default_rng(0)
     row = found.dynamics.row
