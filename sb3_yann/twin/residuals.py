@@ -56,7 +56,8 @@ class Residual:
 
     def _bent(self, z: Array) -> Array:
         """Return ``Q z``, (..., batch, k, n)."""
-        return np.asarray((z @ self.weights[7]).reshape(*z.shape, -1))
+        found = z @ self.weights[7]
+        return np.asarray(found.reshape(*found.shape[:-1], z.shape[-1], -1))
 
     def predict(self, z: Array) -> Array:
         """Return the residual (..., batch, n) at z (..., batch, k)."""
@@ -71,7 +72,8 @@ class Residual:
     def jacobian(self, z: Array) -> Array:
         """Return its derivatives (..., batch, n, k)."""
         W1, _, W2, _, W3, _, L, _ = (np.swapaxes(each, -1, -2) for each in self.weights)
-        found = np.broadcast_to(L[..., None, :, :], (*z.shape[:-1], *L.shape[-2:]))
+        batch = np.broadcast_shapes(z.shape[:-1], (*L.shape[:-2], 1))
+        found = np.broadcast_to(L[..., None, :, :], (*batch, *L.shape[-2:]))
         if not self._is_linear:
             found = found + 2 * np.swapaxes(self._bent(z), -1, -2)
         if self.is_polynomial:

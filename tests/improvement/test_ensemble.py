@@ -10,8 +10,9 @@ import pytest
 import torch as th
 
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
-from sb3_yann.twin.ensemble import NetworkResidual, fit_ensemble
+from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.residuals import Residual
 from twin_samples import log, observed, problem
 
 
@@ -31,12 +32,12 @@ def coordinates(noise: float = 0.0) -> Coordinates:
 
 
 @cache
-def fitted(updates: int = 800) -> tuple[NetworkResidual, ...]:
+def fitted(updates: int = 800) -> tuple[Residual, ...]:
     logs = [episodes(8), episodes(8)[:5]]
     return tuple(fit_ensemble(coordinates(), logs, seed=3, updates=updates))
 
 
-def weights(residuals: tuple[NetworkResidual, ...]) -> list[np.ndarray]:
+def weights(residuals: tuple[Residual, ...]) -> list[np.ndarray]:
     return [part for each in residuals for part in each.weights]
 
 
@@ -68,7 +69,7 @@ def test_its_slopes_are_those_of_differences(batch) -> None:
 
 def test_a_stack_is_the_members_one_by_one() -> None:
     members, rng = fitted(), np.random.default_rng(1)
-    stack, z = NetworkResidual.stack(members), rng.uniform(-1, 1, (2, 7, 3))
+    stack, z = Residual.stack(members), rng.uniform(-1, 1, (2, 7, 3))
     for at in (z, z[:1]):  # rows of each, or the same for both
         rows = np.broadcast_to(at, z.shape)
         for name in ("predict", "jacobian"):

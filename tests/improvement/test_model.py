@@ -16,7 +16,7 @@ from sb3_yann.plan import TwinPlant
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import ZeroResidual
+from sb3_yann.twin.residuals import Residual
 from twin_samples import log, observed, problem, rated
 
 
@@ -172,6 +172,6 @@ def test_what_a_model_lacks_is_told_from_noise(noise, bend, lacks) -> None:
             rows.append(after + noise * rng.standard_normal(after.shape) + bend * np.sin(rows[-1]))
         episodes.append(Episode(np.array(rows), u))
     box = Coordinates.of(mpc, episodes)
-    none = ZeroResidual(mpc.model.n_states)
+    none = Residual.zero(len(box.scale), mpc.model.n_states)
     found = SimulatorModel(mpc, tuple(episodes), Dynamics(mpc, box, (none, none)))
     assert found.lacks() == lacks
