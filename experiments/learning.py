@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 
 from experiments.markdown import number, quote, spread, table
-from experiments.measures import IMPROVED
+from experiments.measures import IMPROVED, OBSERVER
 from experiments.optimum import cstr_optimum
-from experiments.pictures import save_in_short
-from experiments.plants import CASES
+from experiments.pictures import RIVALS, save_in_short
+from experiments.plants import CASES, Case
 from experiments.runner import RESULTS, Outcome, Run, load_all, run_all
-from sb3_yann import LinearMPC, PlantTwin, headroom, improve
+from sb3_yann import LinearMPC, PlantTwin, headroom, improve, offset_free
 from sb3_yann.evaluation import evaluate
 from sb3_yann.rollout import Trajectories
-from sb3_yann.wrappers import StageCost
+from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs import problems
 
 SEEDS = range(40, 43)
@@ -70,6 +70,22 @@ def costs_on(mpc: LinearMPC, make: Callable[[], Any], policy: Any) -> Trajectori
     return evaluate(policy, lambda: StageCost(make(), mpc, violation_cost=0.0), TESTS)
 
 
+def offset_free_on(case: Case) -> Trajectories:
+    """Return the tested episodes of the offset-free MPC, with the costs of the MPC without it.
+
+    The steady state of its own stage cost moves with the estimates: such costs are not comparable.
+    """
+    mpc, observer = offset_free(case.mpc)
+    bounds = mpc.disturbances.d_min, mpc.disturbances.d_max
+
+    def make() -> Any:
+        return ObserveDisturbance(
+            StageCost(case.make(), case.mpc, violation_cost=0.0), observer, *bounds
+        )
+
+    return evaluate(mpc.explicit(), make, TESTS)
+
+
 def moves_of(played: Trajectories) -> tuple[float, float]:
     """Return the largest step of an input from sample to sample, and the mean of all steps."""
     steps = np.concatenate([np.abs(np.diff(each, axis=0)) for each in played.actions])
@@ -88,6 +104,11 @@ def execute(run: Run) -> Outcome:
         costs = np.array([found.mpc_costs, found.best_costs])
         violations = np.zeros(costs.shape)
         seconds = time.perf_counter() - started
+    elif run.learner == OBSERVER:
+        seconds = 0.0
+        played = [costs_on(case.mpc, case.make, case.mpc.explicit()), offset_free_on(case)]
+        costs = np.array([each.costs for each in played])
+        violations = np.array([each.violations for each in played])
     else:
         result = improve(case.mpc, case.make, seed=run.seed)
         seconds = time.perf_counter() - started
@@ -152,7 +173,9 @@ def _untrained(
 def runs(names: Sequence[str]) -> list[Run]:
     """Return all runs, those of one seed before those of the next."""
     learners = {name: [*LOGS] if name == FROM_A_LOG else [IMPROVED] for name in names}
-    return [Run(name, PLANNED, 0, 0) for name in names] + [
+    fixed = [Run(name, PLANNED, 0, 0) for name in names]
+    fixed += [Run(name, OBSERVER, 0, 0) for name in names if name in RIVALS]
+    return fixed + [
         Run(name, learner, seed, 0)
         for seed in SEEDS
         for name in names

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from experiments.measures import IMPROVED, MPC, OURS
+from experiments.measures import IMPROVED, MPC, OBSERVER, OURS
 from experiments.runner import Outcome, Run
 from sb3_yann._validation import Array
 
@@ -22,13 +22,8 @@ from sb3_yann._validation import Array
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = "osD^vPX"
-RIVALS = {
-    "bioreactor": ("bioreactor", "bioreactor, an observer"),
-    "van de Vusse's reactor": ("van de Vusse's reactor", "van de Vusse's reactor, an observer"),
-    "worn tank": ("worn tank, set-points", "worn tank, an observer"),
-    "the paper's reactor": ("reactor", "reactor, an observer"),
-}
-"""Plants of the README's picture: how they are called without and with an observer."""
+RIVALS = ("bioreactor", "pH", "van de Vusse's reactor", "worn tank, set-points", "reactor")
+"""Plants of the README's picture, on which the MPC with an observer is tried as well."""
 
 
 def save_pictures(outcomes: Mapping[Run, Outcome], folder: Path) -> dict[str, Path]:
@@ -56,7 +51,7 @@ def save_in_short(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
     if not panels:
         return []
     folder.mkdir(parents=True, exist_ok=True)
-    figure = Figure(figsize=(3 * len(panels), 3.6), layout="constrained")
+    figure = Figure(figsize=(2.4 * len(panels) + 0.6, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     row = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (name, found) in zip(row, panels.items(), strict=True):
@@ -82,30 +77,17 @@ def save_in_short(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
 
 def _shares(outcomes: Mapping[Run, Outcome], plant: str) -> dict[str, tuple[Array, float]]:
     """Return each controller's costs in parts of the MPC's, and how its mean differs."""
-    base, linear = RIVALS[plant]
-    ours = _median_costs(outcomes, base)
-    over = _median_costs(outcomes, linear)
-    if ours is None or over is None:
-        return {}
-    mpc = ours[0]
-    every = {
-        "policy learnt from the MPC": ours[1],
-        "offset-free MPC, untrained": over[0],
-        "policy learnt from the offset-free MPC": over[1],
-    }
-    return {
-        name: (costs / mpc, float(costs.mean() / mpc.mean() - 1)) for name, costs in every.items()
-    }
-
-
-def _median_costs(outcomes: Mapping[Run, Outcome], plant: str) -> Array | None:
-    """Return what the first controller and the improved one cost at each start, (2, starts)."""
-    found = [
-        out.test_costs
-        for run, out in outcomes.items()
-        if (run.plant, run.learner) == (plant, IMPROVED)
-    ]
-    return np.median(found, axis=0) if found else None
+    costs = {}
+    for label, learner in (("policy learnt from the MPC", IMPROVED), ("offset-free MPC", OBSERVER)):
+        found = [
+            out.test_costs
+            for run, out in outcomes.items()
+            if (run.plant, run.learner) == (plant, learner)
+        ]
+        if not found:
+            return {}
+        mpc, costs[label] = np.median(found, axis=0)
+    return {name: (each / mpc, float(each.mean() / mpc.mean() - 1)) for name, each in costs.items()}
 
 
 def _learners(outcomes: Mapping[Run, Outcome]) -> dict[str, list[Outcome]]:

@@ -299,7 +299,6 @@ def with_observer(case: Callable[[], Case]) -> Case:
 
 CASES: dict[str, Callable[[], Case]] = {
     "reactor": partial(of_paper, problems.cstr, "CSTR-v0"),
-    "reactor, an observer": partial(with_observer, partial(of_paper, problems.cstr, "CSTR-v0")),
     "reactor, true model": partial(of_paper, true_reactor, "CSTR-v0"),
     "pendulum, Q = diag(1, 0.1)": partial(
         of_paper, problems.clipped_pendulum, "ClippedPendulum-v0"
