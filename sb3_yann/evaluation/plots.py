@@ -25,6 +25,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+__all__ = [
+    "loops_figure",
+    "plot_decisions",
+    "plot_gains",
+    "plot_headroom",
+    "plot_regions",
+    "plot_surface",
+    "plot_twin",
+    "surfaces_figure",
+    "use_figure",
+]
 Runs = Mapping[str, Trajectories]
 Quantity = int | str
 Frame = tuple[ArrayLike, ArrayLike]
