@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import Any
@@ -22,7 +23,7 @@ from sb3_yann.deployment.exporting import Exported, export
 from sb3_yann.improvement.confirmation import ENOUGH, FIRST_LOOK, LOOKS, Pairs, confirm
 from sb3_yann.improvement.critic import refit_critic
 from sb3_yann.improvement.imitation import Teacher, imitate, policy_of
-from sb3_yann.improvement.model import Model, Scenarios, SimulatorModel
+from sb3_yann.improvement.model import Model, Scenarios, SimulatorModel, one_step_error
 from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
 from sb3_yann.improvement.trial import RULE, Check, Trial
 from sb3_yann.networks.yann import LawLayer
@@ -34,8 +35,11 @@ from sb3_yann.policy.policies import (
     require_yann_policy,
 )
 from sb3_yann.rollout import Source, maker, name_of, preserve_rng
+from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
+from sb3_yann.twin.row_layout import RowLayout
 
+ROUNDING = 1e-6  # of a half-width, in float32 observations: no error of a model
 LEAST = 2e-4  # what a policy must gain in a twin, relative to the MPC's mean cost
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
 PROMISED = 0.95  # share of what the model promised that, shown by the simulator, ends the rounds
@@ -173,6 +177,9 @@ def improve(
     every twin that the log does not refute. What is refused is taught; then half and a quarter of
     the correction are tried. Beyond what the log shows the MPC acts alone: no member of the twin
     knows the plant there.
+
+    Where the actor keeps the problem's bounds, and no ``bounds_margin`` was given, it keeps as far
+    from them as the MPC's model errs in 95 % of the steps.
 
     The model ends with the policy that was accepted and a critic that is refitted to it, else as it
     was. It saves and goes on learning as any other.
@@ -374,9 +381,19 @@ class _Work:
             for network in (policy.actor, policy.critic):
                 network.optimizer.state.clear()  # what other weights were moved by
             refit_critic(policy, model, self.seed)
+        margin = float(self.layer.margin)
+        if policy.keep_bounds and margin != policy.bounds_margin:
+            policy.set_bounds_margin(margin)
+
+    def keep_margin(self, row: RowLayout, episodes: Sequence[Episode]) -> None:
+        """Let the layer keep as far from bounds as the MPC's model errs, if no margin was given."""
+        if len(self.layer.rows) and float(self.layer.margin) == 0:
+            error = one_step_error(row, episodes)
+            self.layer.keep(error if error > ROUNDING else 0.0)
 
     def in_twin(self, twin: PlantTwin) -> Improvement:
         """Plan in the members of a twin, imitate, and check on every member."""
+        self.keep_margin(twin.dynamics.row, twin.episodes)
         self.say(f"the MPC from {self.n_starts} starts in each member; at first this compiles code")
         trial = Trial.draw(twin, self.n_starts, self.rng)
         before = self._check_in(trial) if self.has_learnt else None
@@ -464,6 +481,7 @@ class _Work:
         note, accepted = "", False
         try:
             simulator.begin()
+            self.keep_margin(simulator.row, simulator.episodes)
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
             trial = Pairs(simulator)
             known = self.act() if self.has_learnt else None

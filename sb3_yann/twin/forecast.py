@@ -335,10 +335,11 @@ def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float,
     of_fits = np.sqrt((len(ratios) - 1) * ratios.var())
     likely = [stats.t.ppf(SURE, max(k - 1, 1)) for k in (independent, len(ratios))]
     mean = float(ratios.mean())
-    # A mean lies between the least and the largest of what it is taken over.
-    each = changes.mean(axis=0) / np.maximum(size.mean(axis=0), 1e-300)
-    room = likely[0] * of_episodes
-    up, down = (float(np.clip(most, 0, room)) for most in (each.max() - mean, mean - each.min()))
+    up = down = float(likely[0] * of_episodes)
+    if independent >= EACH:
+        # A median is beyond the largest of n draws with a probability of 2 ** -n.
+        each = changes.mean(axis=0) / np.maximum(size.mean(axis=0), 1e-300)
+        up, down = (float(np.clip(m, 0, up)) for m in (each.max() - mean, mean - each.min()))
     fits = float(likely[1] * of_fits)
     return mean, mean - float(np.hypot(down, fits)), mean + float(np.hypot(up, fits))
 
