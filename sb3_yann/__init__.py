@@ -21,7 +21,7 @@ from typing import Any
 
 import sb3_yann_envs
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _NAMES = {
     "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning",
