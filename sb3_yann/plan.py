@@ -196,15 +196,9 @@ class Task:
 
     def limits(self, thetas: Array) -> tuple[Array, Array]:
         """Return the bounds (..., m) of the inputs at thetas (..., n_theta)."""
-        problem = self.problem.deviations
-        low, high = (np.broadcast_to(each, (*thetas.shape[:-1], problem.model.n_inputs))
-                     for each in problem.limits_at("u", thetas))  # fmt: skip
-        if problem.has_rate_bounds:
-            before = thetas[..., problem.layout.previous]
-            du_min, du_max = problem.limits_at("du", thetas)
-            low = np.maximum(low, before + du_min)
-            high = np.maximum(np.minimum(high, before + du_max), low)
-        return low, high
+        shape = *thetas.shape[:-1], self.problem.model.n_inputs
+        low, high = self.problem.deviations.input_range(thetas)
+        return np.broadcast_to(low, shape), np.broadcast_to(high, shape)
 
     def penalty(self, thetas: Array) -> tuple[Array, Array]:
         """Return gradient (..., n) and curvature (..., n, n) of what is beyond bounds."""

@@ -113,25 +113,18 @@ class Plant:
         return u if finite.all() else np.where(finite, u, self.mpc(theta))
 
     def mpc(self, theta: Array) -> Array:
-        """Return the MPC's inputs (rows, m), within the bounds of their rate if there are some."""
-        return self._within_rates(theta, self.law(theta))
+        """Return the MPC's inputs (rows, m)."""
+        return self.law(theta)
 
     def excited_mpc(self, seed: int, share: float) -> Inputs:
         """Return the MPC of one episode, moved at random by a share of the range at most."""
         moved, steps = Excited(self.problem, seed, 2 * share), count()
+        within = self.problem.deviations.input_range
 
         def act(theta: Array) -> Array:
-            return self._within_rates(theta, moved(next(steps), theta, np.arange(len(theta))))
+            return np.clip(moved(next(steps), theta, np.arange(len(theta))), *within(theta))
 
         return act
-
-    def _within_rates(self, theta: Array, u: Array) -> Array:
-        problem = self.problem
-        if not problem.has_rate_bounds:
-            return u
-        previous = theta[:, problem.layout.previous]
-        low, high = previous + problem.rate.du_min, previous + problem.rate.du_max
-        return np.clip(np.clip(u, low, high), problem.deviations.u_min, problem.deviations.u_max)
 
     def begin(self, seed: int) -> Array:
         """Reset the plant, and return the first theta (n_theta,).

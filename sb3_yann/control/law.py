@@ -44,11 +44,19 @@ class PlantLaw(ReadOnlyArrays):
         With operating point, dt, names and units. None for a law that was built by hand.
     theta_ss : ndarray, shape (n_theta,), or None
         Theta at the operating point, as the plant shows it: of a state its x_ss.
+    rate : ndarray, shape (2, m), or None
+        du_min and du_max, for a theta that ends with the previous input.
+    moving : ndarray of int, shape (2, m), or None
+        Which entries of theta are lower and upper bounds of the inputs, -1 for none.
+
+    Inputs keep both where the problem has no solution as well, see `MPCProblem.input_range`.
     """
 
     # The class is no dataclass: these are no fields of a law.
     model: LinearModel | None = None
     theta_ss: Array | None = None
+    rate: Array | None = None
+    moving: NDArray[np.intp] | None = None
     # What a file should hold, for a message.
     _kind = "a law"
 
@@ -62,18 +70,47 @@ class PlantLaw(ReadOnlyArrays):
         def n_inputs(self) -> int:
             """Number of inputs."""
 
+        u_min: Array
+        u_max: Array
+
         def __getstate__(self) -> dict[str, Any]:
             """Return what a copy keeps."""
 
         def __call__(self, theta: ArrayLike) -> Array:
             """Return the input, both in deviations."""
 
-    def on_plant(self, model: LinearModel, theta_ss: ArrayLike) -> Self:
-        """Return the same law with its plant; theta_ss is (n_theta,)."""
+    def on_plant(
+        self,
+        model: LinearModel,
+        theta_ss: ArrayLike,
+        rate: ArrayLike | None = None,
+        moving: NDArray[np.intp] | None = None,
+    ) -> Self:
+        """Return the same law with its plant, see the attributes."""
         law = object.__new__(type(self))
-        plant = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
+        plant: dict[str, Any] = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
+        plant |= {} if rate is None else {"rate": np.array(rate, np.float64)}
+        plant |= {} if moving is None else {"moving": np.array(moving, np.intp)}
         law.__setstate__({**self.__getstate__(), **plant})
         return law
+
+    @property
+    def _is_fixed(self) -> bool:
+        return self.rate is None and self.moving is None
+
+    def _within_range(self, u: Array, theta: Array) -> Array:
+        """Return inputs (batch, m) within what rate and bounds in theta leave."""
+        if self.moving is not None:
+            fixed = self.u_min, self.u_max
+            low, high = (
+                np.where(at >= 0, theta[:, at], side)
+                for at, side in zip(self.moving, fixed, strict=True)
+            )
+            u = np.clip(np.clip(u, low, np.maximum(low, high)), *fixed)
+        if self.rate is not None:
+            before = theta[:, -u.shape[1] :]
+            u = np.clip(u, *(np.clip(before + side, self.u_min, self.u_max) for side in self.rate))
+        return u
 
     def plant_input(self, shown: ArrayLike) -> Array:
         """Return the input as the plant takes it, for theta as the plant shows it.
@@ -150,8 +187,10 @@ class PlantLaw(ReadOnlyArrays):
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
         if self.model is not None:
             arrays["theta_ss"] = self.theta_ss
-            own = {name: value for name, value in vars(self.model).items() if value is not None}
-            arrays |= {f"model_{name}": value for name, value in own.items()}
+            own = {"rate": self.rate, "moving": self.moving}
+            arrays |= {name: value for name, value in own.items() if value is not None}
+            model = {name: value for name, value in vars(self.model).items() if value is not None}
+            arrays |= {f"model_{name}": value for name, value in model.items()}
         return arrays
 
     @classmethod
@@ -171,7 +210,12 @@ class PlantLaw(ReadOnlyArrays):
         model = LinearModel(**{**given, "dt": float(given["dt"])})
         if model.n_inputs != law.n_inputs or model.n_states > law.n_theta:
             raise ValueError(f"its model has {model.n_states} states and {model.n_inputs} inputs")
-        return law.on_plant(model, check_array("theta_ss", data["theta_ss"], (law.n_theta,)))
+        theta_ss = check_array("theta_ss", data["theta_ss"], (law.n_theta,))
+        rate, moving = (
+            check_array(name, data[name], (2, law.n_inputs)) if name in data else None
+            for name in ("rate", "moving")
+        )
+        return law.on_plant(model, theta_ss, rate, None if moving is None else moving.astype(int))
 
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""
@@ -293,7 +337,7 @@ class PiecewiseAffine(PlantLaw):
     def __call__(self, theta: ArrayLike) -> Array:
         """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
         # The short way: real numbers, none masked, in one row as compiled code takes them.
-        if type(theta) is np.ndarray and theta.ndim == 1:
+        if type(theta) is np.ndarray and theta.ndim == 1 and self._is_fixed:
             if theta.dtype.kind in "fiu" and theta.flags.carray:
                 u = np.empty(len(self.u_min))
                 if self._at(theta.astype(np.float64, copy=False), u):
@@ -301,8 +345,9 @@ class PiecewiseAffine(PlantLaw):
         from sb3_yann.control._kernels.law import law_of_batch
 
         points, rows = as_points(theta, self.n_theta)
-        inputs = np.empty((len(rows), self.n_inputs))
+        inputs: Array = np.empty((len(rows), self.n_inputs))
         law_of_batch(*self.packed, rows, inputs)
+        inputs = self._within_range(inputs, rows)
         return inputs if points.ndim == 2 else inputs[0]
 
     def locate(self, theta: ArrayLike) -> NDArray[np.int64]:

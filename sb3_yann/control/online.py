@@ -245,7 +245,8 @@ class OnlineLaw(PlantLaw):
             softened = self.dual.solve(again, soft=True)
             u[outside] = self.dual.inputs(again, softened)
         u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
-        return np.clip(u, self.u_min, self.u_max), feasible, found, softened
+        u = self._within_range(np.clip(u, self.u_min, self.u_max), rows)
+        return u, feasible, found, softened
 
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
         """Write the input and active set where the compiled method has no certificate."""

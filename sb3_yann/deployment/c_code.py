@@ -79,6 +79,7 @@ def _definitions(data: Arrays, precision: str) -> str:
         "DISJOINT": int(data["disjoint"]),
         "ZERO_INPUT": int(data["zero_input"]),
         "RATE": int(len(data["change"]) > 0),
+        "MOVING": int(len(data["moving"]) > 0),
         "N_NETWORKS": n_networks,
         "ONLINE": int("qp_gram" in data),
     }

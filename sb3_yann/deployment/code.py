@@ -84,6 +84,9 @@ def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
         numbers["resting"] = data["resting"]
     if len(data["change"]):
         numbers["change_min"], numbers["change_max"] = data["change"]
+    if len(data["moving"]):
+        indices["moving_min"], indices["moving_max"] = data["moving"]
+    if len(data["change"]) or len(data["moving"]):
         numbers |= {"per_input": data["per_input"], "middle": data["middle"]}
     if "qp_gram" in data:
         numbers |= {name: data[name] for name in ("qp_D", "qp_d0", "qp_gram", "qp_E")}

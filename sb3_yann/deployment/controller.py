@@ -78,6 +78,7 @@ def _check_arrays(data: Mapping[str, Any]) -> None:
         ((n_obs,), "obs_rest obs_min obs_max watched obs_names"),
         ((2, m), "bounds"),
         ((2 if len(data["change"]) else 0, m), "change"),
+        ((2 if len(data["moving"]) else 0, m), "moving"),
         ((m,), "action_scale action_shift resting per_input middle action_names"),
         ((), f"{counts} late_after reach zero_input"),
     ]
@@ -181,6 +182,7 @@ class Controller:
         try:
             (_, m, n) = self.data["gains"].shape
             self.data.setdefault("kept", np.empty((0, n + m + 2)))  # as there was none
+            self.data.setdefault("moving", np.empty((0, m), np.int64))
             version = int(self.data["format"])
             if version not in FORMATS:
                 raise ValueError(
@@ -379,9 +381,15 @@ class Controller:
             law = np.where(inside[:, None], law, data["resting"])
         low, high = np.broadcast_to(data["bounds"][:, None], (2, *law.shape))
         law = np.clip(np.nan_to_num(law), low, high)
-        if len(data["change"]):
+        if len(data["moving"]):  # bounds in theta, the lower one first
+            shown = theta[:, data["moving"]] * data["per_input"] - data["middle"]
+            shown = np.clip(np.swapaxes(shown, 0, 1), low, high)
+            low, high = np.where(data["moving"][:, None] >= 0, shown, [low, high])
+            high = np.maximum(low, high)
+        if len(data["change"]):  # these are reached as fast as the rate allows
             last = theta[:, -law.shape[1] :] * data["per_input"] - data["middle"]
-            low, high = np.clip(last + data["change"][:, None], low, high)
+            slowest = np.clip(last + data["change"][:, None], *data["bounds"])
+            low, high = np.clip(low, *slowest), np.clip(high, *slowest)
         law, sound = np.clip(law, low, high), np.ones(len(law), bool)
         action = law
         if networks:

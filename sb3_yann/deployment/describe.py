@@ -72,8 +72,8 @@ def describe(
     else:
         law, program = _with_regions(policy.law() if isinstance(policy, LinearMPC) else policy)
         networks, change = _no_networks(law), np.empty((0, law.n_inputs))
-        if problem is not None and problem.rate is not None and problem.has_rate_bounds:
-            change = np.array([problem.rate.du_min, problem.rate.du_max]) / _input_range(law)[2]
+        if law.rate is not None:
+            change = law.rate / _input_range(law)[2]
 
     n, states = law.n_theta, np.zeros(law.n_theta, bool)
     state_names: list[str] = []
@@ -98,6 +98,7 @@ def describe(
         **program,
         **networks,
         "change": change,
+        "moving": np.empty((0, law.n_inputs), np.int64) if law.moving is None else law.moving,
         **checks.arrays(matrix.shape[1]),
         "watched": watched,
         "format": np.int64(FORMATS[len(networks["kept"]) > 0]),
@@ -196,7 +197,7 @@ def _with_regions(law: Any) -> tuple[PiecewiseAffine, dict[str, Any]]:
         infeasible=law.infeasible,
     )
     if law.model is not None and law.theta_ss is not None:
-        free = free.on_plant(law.model, law.theta_ss)
+        free = free.on_plant(law.model, law.theta_ss, law.rate, law.moving)
     program = {
         "qp_D": dual.D,
         "qp_d0": dual.d0,

@@ -78,8 +78,7 @@ def export(
     given : model, YannPolicy, LinearMPC or PiecewiseAffine
         Where a model has learnt what neither a guard nor `improve` has confirmed, every file says
         so. An MPC and a law take theta and put out the input, in plant units where the model has an
-        operating point. A law alone does not know the `RateLimits` of its problem: pass the
-        problem, and they are kept.
+        operating point.
     path : str or PathLike
         Its suffix tells the format.
     format : {"npz", "c", "onnx", "st", "xml", "fmu"}, optional

@@ -136,15 +136,26 @@ def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
         law = op("Where", inside, law, constant(data["resting"][None]))
     low, high = (constant(each[None]) for each in data["bounds"])
     law = graph.between(law, low, high)
-    if len(data["change"]):
-        m = len(data["action_scale"])
-        ends = (constant(np.array([each])) for each in (-m, 2**31 - 1, 1))
-        last = op("Slice", theta, *ends)
-        last = op("Mul", last, constant(data["per_input"][None]))
-        last = op("Sub", last, constant(data["middle"][None]))
+    fixed = low, high
+
+    def input_in(entries: NDArray[np.int64]) -> str:
+        shown = op("Gather", theta, constant(entries), axis=1)
+        shown = op("Mul", shown, constant(data["per_input"][None]))
+        return op("Sub", shown, constant(data["middle"][None]))
+
+    if len(data["moving"]):  # bounds in theta, the lower one first
+        low, high = (
+            op("Where", constant(at[None] >= 0), graph.between(input_in(abs(at)), *fixed), side)
+            for at, side in zip(data["moving"], fixed, strict=True)
+        )
+        high = op("Max", low, high)
+    if len(data["change"]):  # these are reached as fast as the rate allows
+        n = len(data["per_theta"])
+        last = input_in(np.arange(n - len(data["action_scale"]), n))
         ways = [op("Add", last, constant(each[None])) for each in data["change"]]
-        low, high = (graph.between(each, low, high) for each in ways)
-        law = graph.between(law, low, high)
+        slowest = [graph.between(each, *fixed) for each in ways]
+        low, high = (graph.between(each, *slowest) for each in (low, high))
+    law = graph.between(law, low, high)
     if int(data["n_layers"]):
         added = _correction(graph, data, theta, region)
         added = op("Where", graph.any(lost), zero, added)

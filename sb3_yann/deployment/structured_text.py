@@ -110,6 +110,7 @@ def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str
         "second": n_layers > 2,
         "kept": networks and len(data["kept"]) > 0,
         "rate": len(data["change"]) > 0,
+        "moving": len(data["moving"]) > 0,
         "zero input": bool(data["zero_input"]),
     }
     (p, m, n), hidden = data["gains"].shape, [1, 1]

@@ -72,6 +72,7 @@ class LawLayer(nn.Module):
         half = half_widths(law.theta_min, law.theta_max)
         self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
         change: Array = np.empty((0, law.n_inputs))
+        self.moving = law.moving
         if rate is not None:
             if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
                 raise ValueError(
@@ -82,7 +83,13 @@ class LawLayer(nn.Module):
             room = np.maximum(np.stack([-rate[0], rate[1]]) / half_range - 1e-6, 0.0)
             change = room * [[-1.0], [1.0]]
             register_constants(self, change=change)
-        if rate is not None or not isinstance(self, YannLayer):
+        if self.moving is not None:  # bounds in theta: their entries below the change
+            self.rated = True
+            if rate is None:
+                change = np.full((2, law.n_inputs), np.inf) * [[-1.0], [1.0]]
+                register_constants(self, change=change)
+            change = np.concatenate([change, self.moving])
+        if self.rated or not isinstance(self, YannLayer):
             register_constants(self, middle=middle, half_range=half_range)
         self.register_buffer("confines", th.zeros((2, law.n_theta), dtype=th.float64))
         no_box = np.zeros(2 * law.n_theta)
@@ -145,10 +152,21 @@ class LawLayer(nn.Module):
 
     @th.no_grad()
     def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return the bounds (batch, m) that the rate leaves of [-1, 1]."""
+        """Return the bounds (batch, m) that rate and bounds in theta leave of [-1, 1]."""
         previous = (theta[:, -len(self.middle) :] - self.middle) / self.half_range
-        low, high = (previous + self.change[:, None]).clamp(-1, 1).to(self.theta_half)
-        return low, high
+        slowest = (previous + self.change[:, None]).clamp(-1, 1)
+        low, high = slowest
+        if self.moving is not None:
+            low, high = (
+                th.where(
+                    th.as_tensor(at >= 0, device=theta.device),
+                    ((theta[:, at] - self.middle) / self.half_range).clamp(-1, 1),
+                    side,
+                )
+                for at, side in zip(self.moving, (-1.0, 1.0), strict=True)
+            )
+            low, high = low.clamp(*slowest), th.maximum(low, high).clamp(*slowest)
+        return low.to(self.theta_half), high.to(self.theta_half)
 
     @property
     def explicit_law(self) -> PiecewiseAffine | None:

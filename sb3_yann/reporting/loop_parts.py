@@ -200,7 +200,10 @@ def distance_part(subject: Subject) -> Part:
         *_pictures(subject),
     ]
     u, rounding = inputs_of(problem, policy, theta), ROUNDING * problem.u_half
-    low, high = problem.deviations.u_min - rounding, problem.deviations.u_max + rounding
+    low, high = problem.deviations.input_range(theta)
+    # Where the MPC has no solution, bounds that change may give way: no further than with it.
+    law = subject.law(theta)
+    low, high = np.minimum(low, law) - rounding, np.maximum(high, law) + rounding
     inside = bool(np.all((u >= low) & (u <= high)))
     text = "Inputs leave their bounds at random points of the box of parameters."
     if inside:

@@ -85,13 +85,20 @@ def constraints_part(subject: Subject) -> Part:
     head = ["quantity", "lower", "upper", "kind", "acts in the plan"]
     head += [f"{name}: {what}" for name in loops for what in ("range", "steps beyond")]
     rows = []
-    for name, key, low, high, kind, series in _bounds(problem):
+    for name, key, (of, k), kind, series in _bounds(problem):
         share = 100 * acting[key] / max(len(solvable), 1)
+        low, high = (side[k] for side in problem.limits[of])
         row = [name, number(low), number(high), kind, f"{share:.1f} %"]
         rounding = 1e-6 * (high - low if np.isfinite(high - low) else 1.0)
         for episodes in subject.shown_loops.values():
-            values = np.concatenate([series(x, u) for x, u in _pairs(episodes)])
-            beyond = int(np.sum((values < low - rounding) | (values > high + rounding)))
+            parts, beyond = [np.zeros(0)], 0
+            for x, u in _pairs(episodes):
+                values = series(x, u)
+                below, above = problem.limits_at(of, x[: len(values)])  # at run time
+                parts.append(values)
+                out = (values < below[..., k] - rounding) | (values > above[..., k] + rounding)
+                beyond += int(out.sum())
+            values = np.concatenate(parts)
             row += [f"{number(np.nanmin(values))} to {number(np.nanmax(values))}", str(beyond)]
         rows.append(row)
     last = problem.terminal.set[1]
@@ -157,43 +164,38 @@ def _pairs(episodes: Trajectories) -> Iterator[tuple[Array, Array]]:
     return zip(episodes.observations, episodes.actions, strict=True)
 
 
-def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, float, float, str, Any]]:
-    """Yield label, key, bounds, kind, and the values in an episode, of what is bounded.
+def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, tuple[str, int], str, Any]]:
+    """Yield label, key, which of the limits, kind, and the values in an episode, of all bounds.
 
     All of it is in plant units.
     """
     model, C = problem.model, problem.outputs.C
     labels, names = with_units(model), labels_of(model)
     outputs, previous = [f"y[{i}]" for i in range(len(C))], problem.layout.previous
-    y_min, y_max = problem.outputs.y_min, problem.outputs.y_max
     hard = np.zeros(model.n_inputs, bool)
     groups: list[tuple[Any, ...]] = [
-        (labels[1], names[1], problem.u_min, problem.u_max, hard, lambda x, u: u),
-        (labels[0], names[0], problem.x_min, problem.x_max, problem.soft.x > 0, lambda x, u: x),
-        (outputs, outputs, y_min, y_max, problem.soft.y > 0,
-         lambda x, u: x[:, : C.shape[1]] @ C.T),
-    ]  # fmt: skip
+        (labels[1], names[1], "u", hard, lambda x, u: u),
+        (labels[0], names[0], "x", problem.soft.x > 0, lambda x, u: x),
+        (outputs, outputs, "y", problem.soft.y > 0, lambda x, u: x[:, : C.shape[1]] @ C.T),
+    ]
     if problem.has_rate_bounds:
         called = [f"change of {each} in a step" for each in labels[1]]
         keys = [f"the rate of {each}" for each in names[1]]
-        limits = problem.rate.du_min, problem.rate.du_max
-        groups.append((called, keys, *limits, hard, lambda x, u: u - x[:-1, previous]))
+        groups.append((called, keys, "du", hard, lambda x, u: u - x[:-1, previous]))
     mixed = problem.mixed
     combined = [f"mixed[{i}]" for i in range(len(mixed.F))]
     groups.append(
-        (combined, combined, mixed.low, mixed.high, mixed.soft > 0,
+        (combined, combined, "mixed", mixed.soft > 0,
          lambda x, u: x[:-1, : mixed.F.shape[1]] @ mixed.F.T + u @ mixed.G.T)
     )  # fmt: skip
-    for called, keys, low, high, is_soft, values in groups:
-        for k in range(len(called)):
-            if not np.isfinite([low[k], high[k]]).any():
-                continue
+    for called, keys, of_limits, is_soft, values in groups:
+        for k in np.flatnonzero(np.isfinite(problem.limits[of_limits]).any(axis=0)):
 
             def series(x: Array, u: Array, k: int = k, of: Any = values) -> Array:
                 return np.asarray(of(x, u)[:, k])
 
             kind = "soft" if is_soft[k] else "hard"
-            yield called[k], keys[k], low[k], high[k], kind, series
+            yield called[k], keys[k], (of_limits, int(k)), kind, series
 
 
 # ---- The law ----
@@ -275,8 +277,6 @@ def _error_of_law(subject: Subject) -> tuple[int, float, int]:
 def _error_inside_policy(subject: Subject) -> float:
     """Return the error of the law inside the policy, in half-widths of the input range."""
     problem, policy = subject.problem, subject.policy
-    if problem.has_rate_bounds:
-        return 0.0  # the policy's law keeps rates outside the domain too
     with th.no_grad():
         own = policy.actor.mu.law(th.as_tensor(subject.samples, device=policy.device)).double()
     middle = (problem.deviations.u_max + problem.deviations.u_min) / 2

@@ -129,7 +129,8 @@ class SetPoint(Appending):
     hold : int, optional
         Steps after which another one is drawn. The default is one reference for each episode.
     schedule : callable, optional
-        ``schedule(step) -> r`` replaces the random reference after so many steps of an episode.
+        ``schedule(step) -> r`` replaces the random reference after so many steps of an episode; or
+        a sequence of references, the last of which stays.
     preview : int, default 0
         Appends the references of so many samples ahead as well, as `Tracking(preview=)` has them.
 
@@ -149,7 +150,7 @@ class SetPoint(Appending):
         high: ArrayLike,
         *,
         hold: int | None = None,
-        schedule: Schedule | None = None,
+        schedule: Schedule | Sequence[ArrayLike] | None = None,
         preview: int = 0,
     ) -> None:
         self.preview = check_int("preview", preview, 0, "It counts samples ahead.")
@@ -161,7 +162,7 @@ class SetPoint(Appending):
             )
         if hold is not None:
             check_int("hold", hold, hint="It counts steps; None is one reference in each episode.")
-        self.hold, self.schedule, self.steps = hold, schedule, 0
+        self.hold, self.schedule, self.steps = hold, _as_schedule(schedule), 0
         self.reference: Array = np.zeros(len(self.low))
         self._last: Array = self.reference
         self._ahead: list[Array] = [self._last]
@@ -197,13 +198,31 @@ class SetPoint(Appending):
         if self.schedule is None:
             generator = self.np_random if self._own is None else self._own
             return np.asarray(generator.uniform(low, high))
-        r = np.atleast_1d(np.array(self.schedule(step), np.float64))
+        try:
+            r = np.atleast_1d(np.array(self.schedule(step), np.float64))
+        except IndexError as error:
+            raise ValueError(
+                f"schedule({step}) ends in {error!r}. With preview={self.preview} it is asked "
+                f"{self.preview} steps beyond the last one that is played: hold the last reference "
+                "there, or pass the sequence itself, whose last one stays."
+            ) from error
         if r.shape != low.shape or not np.all((low <= r) & (r <= high)):
             raise ValueError(
                 f"schedule({step}) = {r.tolist()} must have shape {low.shape} and lie "
                 f"between low = {low.tolist()} and high = {high.tolist()}."
             )
         return r
+
+
+def _as_schedule(given: Schedule | Sequence[ArrayLike] | None) -> Schedule | None:
+    """Return a schedule; of a sequence the last reference stays."""
+    if given is None or callable(given):
+        return given
+    if not isinstance(given, Sequence | np.ndarray) or len(given) == 0:
+        raise TypeError(
+            f"schedule = {given!r} must be a function of the step, or references one after another."
+        )
+    return lambda step: given[min(step, len(given) - 1)]
 
 
 def _repeated(low: ArrayLike, high: ArrayLike, count: int) -> tuple[Array, Array]:
@@ -226,7 +245,8 @@ class MeasuredDisturbance(Appending):
         The entry of ``info``, after reset and after each step, that holds d.
     preview : int, default 0
         That entry holds the disturbances of so many samples ahead as well, (preview + 1, d), as
-        `DisturbanceBounds(preview=)` has them.
+        `DisturbanceBounds(preview=)` has them. Of fewer rows in the course of an episode, as a
+        record ends, the last one stays.
 
     Examples
     --------
@@ -267,11 +287,7 @@ class MeasuredDisturbance(Appending):
                 f"info has no {self.key!r}, only {sorted(info)}. Pass the name of the entry that "
                 "holds the measured disturbance as key."
             )
-        d = np.atleast_1d(np.asarray(info[self.key], np.float64))
-        if d.ndim == 2 and d.shape[1] == self.n_loads:
-            d = d.ravel()
-        if d.shape != self.low.shape:
-            raise ValueError(f"info[{self.key!r}] has shape {d.shape}, expected {self.low.shape}.")
+        d = self._with_preview(np.atleast_1d(np.asarray(info[self.key], np.float64)), u is None)
         failing = ~np.isfinite(d)
         self.held = np.where(failing, self.held, d)
         if np.any(failing & ~self.failing):  # once, for a sensor that stays so
@@ -283,6 +299,18 @@ class MeasuredDisturbance(Appending):
             )
         self.failing = failing
         return joined(observation, self.held)
+
+    def _with_preview(self, given: Array, begins: bool) -> Array:
+        """Return d with its preview, (preview + 1) n_loads; the last row stays in an episode."""
+        size, rows = self.n_loads, len(self.low) // self.n_loads
+        d = given.reshape(-1, size) if given.ndim == 1 and len(given) % size == 0 else given
+        if d.ndim != 2 or d.shape[1] != size or not (rows if begins else 1) <= len(d) <= rows:
+            expected = (size,) if rows == 1 else (rows, size)
+            ahead = f", a row for this sample and each of {rows - 1} ahead" if rows > 1 else ""
+            raise ValueError(
+                f"info[{self.key!r}] has shape {given.shape}, expected {expected}{ahead}."
+            )
+        return d[np.minimum(np.arange(rows), len(d) - 1)].ravel()
 
 
 def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:

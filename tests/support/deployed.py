@@ -20,7 +20,7 @@ from gymnasium import spaces
 import general_problems
 import sample_laws
 from policy_samples import make_policy
-from sb3_yann import AffineObservation, Checks, LinearMPC, YannPolicy, export
+from sb3_yann import AffineObservation, Checks, LinearMPC, RateLimits, YannPolicy, export
 from sb3_yann.deployment.controller import Controller
 from weights import network_of
 
@@ -80,6 +80,15 @@ CASES: dict[str, Callable[[], YannPolicy]] = {
     "mixed observations": lambda: _seen(sample_laws.solved("two inputs"), max_correction=0.1),
     "confined": lambda: confined(disturbed(sample_laws.solved("reactor"), networks="shared")),
     "keeps its bounds": lambda: disturbed(general_problems.solved("servo with a disturbance"), 3.0),
+    "bounds in theta": lambda: disturbed(
+        replaced(
+            sample_laws.solved("two inputs"),
+            horizon=1,
+            parametric_bounds=["u_max[0]", "u_min[1]"],
+            rate=RateLimits(-0.5, 0.5),
+        ),
+        keep_bounds=False,
+    ),
     "nothing learnt": lambda: disturbed(sample_laws.solved("reactor"), size=0.0),
 }
 

@@ -101,6 +101,40 @@ def test_a_schedule_says_which_reference_the_next_action_follows() -> None:
     assert [env.step(np.zeros(1))[0][2] for _ in range(3)] == [1, 2, 3]
 
 
+def test_references_one_after_another_are_a_schedule_whose_last_one_stays() -> None:
+    env = SetPoint(Counter(), [0], [9], schedule=[3, 1, 4], preview=2)
+    assert env.reset()[0][2:].tolist() == [3, 1, 4]
+    assert env.step(np.zeros(1))[0][2:].tolist() == [1, 4, 4]
+    ends = SetPoint(Counter(), [0], [9], schedule=[3, 1, 4].__getitem__, preview=2)
+    ends.reset()
+    with pytest.raises(ValueError, match=r"schedule\(3\) ends in .* pass the sequence itself"):
+        ends.step(np.zeros(1))
+
+
+def test_the_last_disturbance_that_is_known_stays() -> None:
+    class Record(Counter):
+        """Reports what is left of a record."""
+
+        def reset(self, **kwargs):
+            self.left = [[1.0], [2.0], [3.0]]
+            return super().reset(**kwargs)[0], {"disturbance": self.left}
+
+        def step(self, action):
+            self.left = self.left[1:]
+            return *super().step(action)[:4], {"disturbance": self.left}
+
+    env = MeasuredDisturbance(Record(), 0, 9, preview=2)
+    assert env.reset()[0][2:].tolist() == [1, 2, 3]
+    assert env.step(np.zeros(1))[0][2:].tolist() == [2, 3, 3]
+    assert env.step(np.zeros(1))[0][2:].tolist() == [3, 3, 3]
+    with pytest.raises(ValueError, match=r"shape \(0,\), expected \(3, 1\)"):
+        env.step(np.zeros(1))
+    with pytest.raises(
+        ValueError, match=r"shape \(3, 1\), expected \(5, 1\), a row for this sample"
+    ):
+        MeasuredDisturbance(Record(), 0, 9, preview=4).reset()
+
+
 def test_the_estimate_takes_the_place_of_the_measurement() -> None:
     model = LinearModel(np.diag([0.9, 0.8, 0.7]), np.ones((3, 1)), 1.0, E=[[1], [0], [0]])
     observer = DisturbanceObserver(model, [0, 2])

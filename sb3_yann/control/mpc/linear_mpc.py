@@ -36,6 +36,7 @@ from sb3_yann.control.mpc.groups import (
     SoftBounds,
     Terminal,
     Tracking,
+    bound_entry,
     parametric_box,
     parametric_names,
 )
@@ -119,7 +120,8 @@ class LinearMPC(MPCProblem):
         Linear terms p and q of the stage cost.
     parametric_bounds : list of str, optional
         Bounds that change at run time, such as ["u_max"] or ["u_max[0]", "mixed_min"]: they join
-        theta. The problem's own are the widest, and each may move in to the other side.
+        theta. The problem's own are the widest, and each may move in to the other side. One of an
+        input is reached as fast as `RateLimits` allow.
     control_horizon : int or sequence of int, optional
         The number of samples in which the inputs move, before they stay; or for how many samples
         each move is held, which sum up to the horizon. The default is each sample.
@@ -318,8 +320,8 @@ class LinearMPC(MPCProblem):
 
     @property
     def has_hard_bounds(self) -> bool:
-        """Whether a bound of a state or an output is hard, or a mixed one."""
-        return bool(len(hard_rows(self, ("x", "y", "mixed"))[1]))
+        """Whether a bound of a state or an output is hard, or a mixed one, or one in theta."""
+        return bool(self.parametric_bounds or len(hard_rows(self, ("x", "y", "mixed"))[1]))
 
     @cached_property
     def kept_set(self) -> KeptSet:
@@ -407,7 +409,7 @@ class LinearMPC(MPCProblem):
             with BudgetTimer(budget) as timer:
                 program = self.condensed()
                 law = solve_explicit(program, *limits, self.infeasible, solver, timer)
-            self._laws[solver] = law.on_plant(self.model, self.theta_ss)
+            self._laws[solver] = law.on_plant(*self._plant)
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
 
@@ -434,7 +436,18 @@ class LinearMPC(MPCProblem):
         limits = self.deviations.u_min, self.deviations.u_max
         require_sane_sizes(program, *limits)
         law = OnlineLaw.of(program, *limits, self.infeasible)
-        return law.on_plant(self.model, self.theta_ss)
+        return law.on_plant(*self._plant)
+
+    @property
+    def _plant(self) -> tuple[LinearModel, Array, Array | None, NDArray[np.intp] | None]:
+        """What a law knows of the plant: see `PlantLaw`."""
+        moving = np.full((2, self.model.n_inputs), -1)
+        for at, name in enumerate(self.parametric_bounds, start=self.layout.limits.start):
+            kind, i, upper = bound_entry(name)
+            if kind == "u":
+                moving[int(upper), i] = at
+        rate = np.stack([self.rate.du_min, self.rate.du_max]) if self.has_rate_bounds else None
+        return self.model, self.theta_ss, rate, moving if np.any(moving >= 0) else None
 
     @cached_property
     def _laws(self) -> dict[str, PiecewiseAffine]:

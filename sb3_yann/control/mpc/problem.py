@@ -184,6 +184,21 @@ class MPCProblem(ReadOnlyArrays):
         low, high, L, H = self.limit_rows(kind)
         return low + thetas @ L.T, high + thetas @ H.T
 
+    def input_range(self, thetas: Array) -> tuple[Array, Array]:
+        """Return the least and the largest inputs (..., m) at thetas (..., n_theta).
+
+        A bound that changes at run time is reached as fast as the rate allows, and the rate ends at
+        the fixed bounds.
+        """
+        low, high = self.limits_at("u", thetas)
+        high = np.maximum(low, high)
+        if not self.has_rate_bounds:
+            return low, high
+        before = thetas[..., self.layout.previous]
+        sides = self.limits_at("du", thetas)
+        slowest = [np.clip(before + side, self.u_min, self.u_max) for side in sides]
+        return np.clip(low, *slowest), np.clip(high, *slowest)
+
     @property
     def n_theta(self) -> int:
         """Number of parameters of the law."""

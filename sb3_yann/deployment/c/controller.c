@@ -291,13 +291,27 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
         low[i] = input_min[i];
         high[i] = input_max[i];
         law[i] = between(law[i], low[i], high[i]);
-#if RATE
-        const real previous = theta[N_THETA - N_INPUTS + i] * per_input[i] - middle[i];
-        const real lowest = low[i], highest = high[i];
-        low[i] = between(previous + change_min[i], lowest, highest);
-        high[i] = between(previous + change_max[i], lowest, highest);
-        law[i] = between(law[i], low[i], high[i]);
+#if MOVING
+        /* Bounds in theta, the lower one first. */
+        if (moving_min[i] >= 0) {
+            const real shown = theta[moving_min[i]] * per_input[i] - middle[i];
+            low[i] = between(shown, input_min[i], input_max[i]);
+        }
+        if (moving_max[i] >= 0) {
+            const real shown = theta[moving_max[i]] * per_input[i] - middle[i];
+            high[i] = between(shown, input_min[i], input_max[i]);
+        }
+        high[i] = high[i] > low[i] ? high[i] : low[i];
 #endif
+#if RATE
+        /* They are reached as fast as the rate allows. */
+        const real previous = theta[N_THETA - N_INPUTS + i] * per_input[i] - middle[i];
+        const real slowest = between(previous + change_min[i], input_min[i], input_max[i]);
+        const real fastest = between(previous + change_max[i], input_min[i], input_max[i]);
+        low[i] = between(low[i], slowest, fastest);
+        high[i] = between(high[i], slowest, fastest);
+#endif
+        law[i] = between(law[i], low[i], high[i]);
     }
 #if N_NETWORKS > 0
     const real part = part_that_counts(theta);

@@ -138,8 +138,9 @@ def forward(
     scaling : ndarray, shape (3 n + 2 m + 2,)
         One over the half-widths of the box of theta; the middles of the input ranges; one over
         their half-widths; what :func:`_confined` takes, with zeros for half-widths without end.
-    change : ndarray, shape (2, m) or (0, m)
-        By how much an action may differ from the previous input, the last m entries of theta.
+    change : ndarray, shape (2, m), (4, m) or (0, m)
+        By how much an action may differ from the previous input, the last m entries of theta. Then
+        which entries are bounds of the inputs, -1 for none; they are reached as fast as that.
     kept : ndarray, shape (q, n + m + 2)
         Rows ``[a, b, c, margin]``, b of length 1. Where networks add something, actions move onto
         the row ``a theta + b action <= c - margin`` that they are furthest beyond; where the law is
@@ -179,9 +180,18 @@ def forward(
     for row in range(batch):
         part[row] = _confined(theta[row], scaling[n + 2 * m :])
         for k in range(m):
-            for side in range(len(change)):
+            for side in range(len(change) - 2):
+                at = int(change[side + 2, k])
+                if at >= 0:
+                    shown = (theta[row, at] - scaling[n + k]) * scaling[n + m + k]
+                    bounds[side, row, k] = min(max(shown, -1.0), 1.0)
+            bounds[1, row, k] = max(bounds[0, row, k], bounds[1, row, k])
+            if len(change):
                 previous = (theta[row, n - m + k] - scaling[n + k]) * scaling[n + m + k]
-                bounds[side, row, k] = min(max(previous + change[side, k], -1.0), 1.0)
+                slowest = min(max(previous + change[0, k], -1.0), 1.0)
+                fastest = min(max(previous + change[1, k], -1.0), 1.0)
+                for side in range(2):
+                    bounds[side, row, k] = min(max(bounds[side, row, k], slowest), fastest)
             low = bounds[0, row, k]
             high = bounds[1, row, k]
             law = np.float32((u[row, k] - scaling[n + k]) * scaling[n + m + k])

@@ -5,12 +5,14 @@ from __future__ import annotations
 import pickle
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import linalg
+from stable_baselines3 import DDPG
 
 from sb3_yann import (
     DisturbanceBounds,
@@ -23,8 +25,12 @@ from sb3_yann import (
     SoftBounds,
     Terminal,
     Tracking,
+    YannPolicy,
+    export,
 )
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
+from sb3_yann.deployment.controller import Controller
+from sb3_yann.wrappers import PlantEnv
 from sparse_qp import FEATURES, SparseQP, Spec, draw, problem, worst_difference
 
 Array = NDArray[np.float64]
@@ -132,6 +138,39 @@ def test_a_law_takes_bounds_as_they_are_where_the_model_has_no_operating_point()
             assert law.plant_input(theta) == pytest.approx(expected, abs=1e-9)
     np.testing.assert_array_equal(mpc.theta_ss, np.zeros(mpc.n_theta))
     assert mpc.theta_rest.tolist() == [0, 0, 3, -1, 5, 7]
+
+
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
+def test_a_bound_that_moves_in_is_reached_as_fast_as_the_rate_allows(
+    infeasible: str, tmp_path: Path
+) -> None:
+    mpc = cart(
+        parametric_bounds=["u_max"], rate=RateLimits(-0.2, 0.3), horizon=3, infeasible=infeasible,
+        theta_min=[-4, -1], theta_max=[4, 1], x_min=None, x_max=None,
+    )  # fmt: skip
+    rng = np.random.default_rng(1)
+    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (400, 4))
+    contradicts = theta[:, 3] - 0.2 > theta[:, 2] + 1e-9
+    low, high = mpc.input_range(theta)
+    assert 20 < contradicts.sum() < 300
+    np.testing.assert_allclose(low[contradicts], high[contradicts])
+    np.testing.assert_allclose(high[contradicts, 0], theta[contradicts, 3] - 0.2)
+    env = PlantEnv(lambda x, u: mpc.model.B @ u, mpc)
+    model = DDPG(YannPolicy, env, policy_kwargs={"problem": mpc}, device="cpu")
+    wanted = np.clip(mpc.online()(theta), low, high)
+    mpc.explicit()
+    export(mpc, tmp_path / "law.npz")
+    export(mpc.online(), tmp_path / "online.npz")
+    found = {
+        "online": mpc.online().plant_input(theta),
+        "explicit": mpc.explicit().plant_input(theta),
+        "exported": Controller.load(tmp_path / "law.npz").evaluate(theta),
+        "exported law": Controller.load(tmp_path / "online.npz").evaluate(theta),
+        "policy": model.predict(theta.astype(np.float32))[0],
+    }
+    for name, u in found.items():
+        assert np.abs(u - wanted)[contradicts].max() < 3e-6, name
+        assert np.all((u >= low - 3e-6) & (u <= high + 3e-6)), name
 
 
 def test_an_operating_point_moves_bounds_that_change_as_all_else() -> None:
