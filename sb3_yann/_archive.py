@@ -140,8 +140,8 @@ def _array(name: str, content: bytes) -> Any:
         raise ValueError(f"{name} is no array of numbers, truth values or text")
     kind = np.dtype(header[1].decode())
     shape = tuple(int(each) for each in header[3].replace(b",", b" ").split())
-    # An empty array may not be a large one in disguise: its other sides count as they are.
-    if math.prod(max(each, 1) for each in shape) * max(kind.itemsize, 1) > max(len(content), 1):
+    # An empty array may not be a large one in disguise: its other sides count, beyond 64 kB.
+    if math.prod(max(each, 1) for each in shape) * kind.itemsize > max(len(content), 1 << 16):
         raise ValueError(f"{name} is not as large as its header says")
     count = math.prod(shape)
     if len(content) - header.end() != count * kind.itemsize or kind.itemsize == 0:

@@ -19,7 +19,8 @@ from sb3_yann._archive import digest_of, read_arrays, write_arrays
 ARRAYS = {
     "gains": np.arange(6.0).reshape(2, 3), "by columns": np.asfortranarray(np.eye(3)[:, 1:]),
     "count": np.int64(3), "flag": np.bool_(True), "name": "Tank Ä",
-    "names": np.array(["x", "level"]), "none": np.empty((0, 4)), "some": np.float32([np.nan, -0.0]),
+    "names": np.array(["x", "level"]), "none": np.empty((0, 40)),
+    "some": np.float32([np.nan, -0.0]),
 }  # fmt: skip
 
 

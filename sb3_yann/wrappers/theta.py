@@ -310,7 +310,7 @@ class MeasuredDisturbance(Appending):
             raise ValueError(
                 f"info[{self.key!r}] has shape {given.shape}, expected {expected}{ahead}."
             )
-        return d[np.minimum(np.arange(rows), len(d) - 1)].ravel()
+        return np.asarray(d[np.minimum(np.arange(rows), len(d) - 1)].ravel())
 
 
 def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
