@@ -62,15 +62,7 @@ class Plant(Protocol):
 
 
 class TwinPlant:
-    """The members of a twin, one for each start, or their mean.
-
-    Parameters
-    ----------
-    dynamics : Dynamics
-        The twin's.
-    members : sequence of int, optional
-        Which acts after each start; by default the mean of all does.
-    """
+    """The members of a twin, one for each start, or by default the mean of all."""
 
     def __init__(self, dynamics: Dynamics, members: Iterable[int] | None = None) -> None:
         self.dynamics, self.members = dynamics, None if members is None else [*members]
@@ -155,20 +147,10 @@ class Doubt(Protocol):
 class Task:
     """What a trajectory is to minimize: stage costs, the value at the end, what is beyond bounds.
 
-    Attributes
-    ----------
-    problem : LinearMPC
-        Its stage cost; its bounds of states, outputs, inputs and rates, soft ones too.
-    low, high : ndarray, shape (n,)
-        Bounds of the states besides, infinite where there are none.
-    end : ndarray, shape (n_theta, n_theta)
-        ``theta' end theta`` is the cost of what comes after the last step.
-    weight : float
-        What one half-width beyond a bound costs in a step, `WEIGHT` typical stage costs.
-    doubt : Doubt, optional
-        What a plan pays where the members of a model disagree.
-    end_slope : ndarray, shape (n_theta,), optional
-        What that cost is linear in, where there are prices.
+    Bounds are those of the problem, soft ones too, and those of states (n,), ``low`` and ``high``.
+    ``theta' end theta + end_slope' theta`` is the cost of what comes after the last step.
+    ``weight`` is what one half-width beyond a bound costs in a step, `WEIGHT` typical stage costs,
+    and ``doubt`` what a plan pays where the members of a model disagree.
     """
 
     problem: LinearMPC
@@ -214,18 +196,7 @@ def roll_out(
 ) -> tuple[Array, Array]:
     """Return thetas (steps + 1, k, n_theta) and inputs (steps, k, m) of a policy within bounds.
 
-    Parameters
-    ----------
-    plant, task : Plant and Task
-        What is tried, and what it is to cost.
-    policy : callable
-        From the step and thetas (k, n_theta) to inputs (k, m).
-    starts : ndarray, shape (k, n_theta)
-        Where the runs begin.
-    steps : int
-        How long they are.
-    rows : ndarray of int, shape (k,)
-        Numbers of the starts, as the plant knows them.
+    It begins at ``starts`` (k, n_theta); ``rows`` (k,) are their numbers, as the plant knows them.
     """
     thetas = np.empty((steps + 1, *starts.shape))
     inputs = np.empty((steps, len(starts), task.problem.model.n_inputs))
@@ -238,16 +209,10 @@ def roll_out(
 
 @dataclass(frozen=True)
 class Plans:
-    """Trajectories and feedback of k starts.
+    """Trajectories of k starts, with feedback and costs, which hold what is beyond bounds.
 
-    Attributes
-    ----------
-    thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
-    gains : ndarray, shape (T, k, m, n_theta)
-    costs : ndarray, shape (k,)
-        With what is beyond bounds.
-    turn : ndarray, shape (n_theta,), optional
-        A full turn for each entry that is an angle and jumps by it, 0 for the others.
+    thetas (T + 1, k, n_theta), inputs (T, k, m), gains (T, k, m, n_theta). ``turn`` (n_theta,) is a
+    full turn for each entry that is an angle and jumps by it, 0 for the others.
     """
 
     thetas: Array
@@ -280,18 +245,7 @@ def planned(
 ) -> Plans:
     """Return the best plan of each start that the policies' trajectories lead to.
 
-    Parameters
-    ----------
-    plant, task : Plant and Task
-        What is tried, and what it is to cost.
-    policies : list of callables
-        Where the search begins.
-    starts : ndarray, shape (k, n_theta)
-        Where the plans begin.
-    steps : int
-        Length T of the plans.
-    rows : ndarray of int, shape (k,)
-        Numbers of the starts, as the plant knows them.
+    ``starts`` (k, n_theta), whose numbers are ``rows`` (k,), as the plant knows them.
     """
     found, every = [], np.arange(len(starts))
     turn = getattr(plant, "turn", None)
@@ -316,16 +270,7 @@ def planned(
 def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
     """Return plans that no correction improves, or those after so many rounds.
 
-    Parameters
-    ----------
-    plant, task : Plant and Task
-        What is tried, and what it is to cost.
-    plans : Plans
-        Where the search begins.
-    rows : ndarray of int, shape (k,)
-        Numbers of the starts, as the plant knows them.
-    rounds : int
-        How many corrections there are at most.
+    ``rows`` (k,) are the numbers of the starts, as the plant knows them.
     """
     plans = copy.deepcopy(plans)
     k = len(rows)
@@ -428,14 +373,9 @@ def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:
 def _feedback(H: Array, G: Array, at_low: Mask, at_high: Mask, moving: Mask) -> Array:
     """Return the gains (k, m, n_theta) of the minimizers in a box whose sides may move.
 
-    Parameters
-    ----------
-    H, G : ndarray, shapes (k, m, m) and (k, m, n_theta)
-        Curvature; how the gradient changes with theta.
-    at_low, at_high : ndarray of bool, shape (k, m)
-        Inputs on a bound.
-    moving : ndarray of bool, shape (2, k, m)
-        Whether the lower and the upper bound move with the previous input, theta's last entries.
+    H (k, m, m) is the curvature, G (k, m, n_theta) how the gradient changes with theta, and
+    ``moving`` (2, k, m) tells whether the lower and the upper bound move with the previous input,
+    theta's last entries.
     """
     held, m = at_low | at_high, H.shape[1]
     fixed: Array = np.zeros_like(G)
@@ -459,18 +399,7 @@ def initial_guesses(
     Two have inputs on their bounds for a while, then the MPC. The last one is, for each start, the
     cheapest of these and of unconstrained laws with other weights, after such a push or without: an
     MPC that leaves a pendulum hanging shows no plan that it can swing. There is none where the MPC
-    is as cheap.
-
-    Parameters
-    ----------
-    plant, task : Plant and Task
-        What is tried, and what it is to cost.
-    starts : ndarray, shape (k, n_theta)
-        Where the plans begin.
-    steps : int
-        Their length.
-    rows : ndarray of int, shape (k,)
-        Numbers of the starts, as the plant knows them.
+    is as cheap. ``starts`` (k, n_theta) have the numbers ``rows`` (k,).
     """
     problem, until = task.problem, steps // BURSTS
     none = partial(_pushed, problem.deviations.u_min, 0)
@@ -524,26 +453,11 @@ def _gains(problem: LinearMPC) -> Iterator[Array]:
 class Planning:
     """Plans for the rest of the episode, anew where a reference or disturbance changes.
 
-    Nothing is known of changes before they come. Feedback keeps the plant on its plan.
-
-    Parameters
-    ----------
-    plant, task : Plant and Task
-        What the plans are made with.
-    steps : int
-        Length of an episode.
-    pause : int, default 0
-        Steps after a plan for which a disturbance makes no new one: an observer's estimate moves at
-        every step until it has settled.
-    room : float, default inf
-        Half-widths from its plan at which a law takes over, until there is a new plan.
-    law : callable, optional
-        From thetas (k, n_theta) to inputs; by default the MPC.
-
-    Attributes
-    ----------
-    plans : dict of int to (int, Plans, ndarray)
-        The present one of each episode, the step at which it was made, and theta of then.
+    Nothing is known of changes before they come. Feedback keeps the plant on its plan. For
+    ``pause`` steps after a plan a disturbance makes no new one: an observer's estimate moves at
+    every step until it has settled. At ``room`` half-widths from its plan a law, by default the
+    MPC, takes over until there is a new one. ``plans`` holds the present one of each episode, the
+    step at which it was made, and theta of then.
     """
 
     remembers = True

@@ -142,14 +142,8 @@ class Trajectories:
 class EnvPool:
     """Envs that play again and again: making one often takes longer than its episode.
 
-    Parameters
-    ----------
-    source : gymnasium.Env, str or callable
-        As for :func:`evaluate`, which takes a pool in its place.
-    most : int, optional
-        Envs that there are at most: more episodes are played one lot after the other.
-    each : callable, default map
-        Steps the envs: ``each(step, rows, actions)``.
+    :func:`evaluate` takes it in the place of an env. There are at most so many envs: more episodes
+    are played one lot after the other. They are stepped by ``each(step, rows, actions)``.
     """
 
     MAX_KEPT = 200
@@ -619,12 +613,7 @@ def maker(env: Any, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]
 class OneOf(gym.Env[Any, Any]):
     """One env of a Stable-Baselines3 VecEnv: it waits for no other, and begins where it is told to.
 
-    Parameters
-    ----------
-    envs : VecEnv
-        It is not closed.
-    number : int
-        Of the env.
+    The VecEnv is not closed.
     """
 
     def __init__(self, envs: Any, number: int) -> None:

@@ -33,12 +33,9 @@ from sb3_yann.rollout import (
 
 @dataclass
 class Simulated:
-    """How far a model has got, which is saved with it.
+    """How many episodes have been played, and whether another of training has ended since.
 
-    Attributes
-    ----------
-    episodes : int, that have been played
-    due : bool, whether a training episode has ended since
+    It is saved with the model.
     """
 
     episodes: int = 0

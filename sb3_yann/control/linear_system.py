@@ -97,13 +97,7 @@ def combination(factors: Array, labels: Sequence[str], digits: int) -> str:
 
 
 def zero_order_hold(A: Array, B: Array, E: Array, dt: float) -> tuple[Array, Array, Array]:
-    """Return A, B, E of ``dx/dt = A x + B u + E d`` in discrete time, u and d held for ``dt``.
-
-    Parameters
-    ----------
-    A, B, E, dt : ndarray, shapes (n, n), (n, m) and (n, d), and float
-        The matrices in continuous time, and the sampling time.
-    """
+    """Return A, B, E of ``dx/dt = A x + B u + E d`` in discrete time, u and d held for ``dt``."""
     import control  # imports matplotlib: only paid for where it is used
 
     m, driven = B.shape[1], np.hstack([B, E])

@@ -64,12 +64,8 @@ def farthest_point(
 ) -> Array:
     """Return the point (n,) of a bounded polyhedron that is farthest in one direction.
 
-    Parameters
-    ----------
-    A, b, direction, inside : ndarray, shapes (q, n), (q,), (n,) and (n,)
-        The polyhedron, where to, and a point of it.
-    seconds : float, optional
-        Of a large polyhedron: HiGHS is asked, which gives up after so long, and returns any point.
+    ``inside`` (n,) is a point of it. Of a large polyhedron HiGHS is asked, which gives up after so
+    many seconds, and returns any point.
     """
     if seconds is not None or np.any(A @ inside > b):
         return _solve_lp(direction, A, b, None, seconds)
@@ -77,12 +73,9 @@ def farthest_point(
 
 
 def farthest_points(A: Array, b: Array, inside: Array, directions: Array) -> Array:
-    """Return the points (k, n) of a bounded polyhedron that are farthest in each direction.
+    """Return the points (k, n) of a bounded polyhedron that are farthest in directions (k, n).
 
-    Parameters
-    ----------
-    A, b, inside, directions : ndarray, shapes (q, n), (q,), (n,) and (k, n)
-        The polyhedron, a point of it, and where to.
+    ``inside`` (n,) is a point of it.
     """
     from sb3_yann.control._kernels import polyhedra as kernels
 

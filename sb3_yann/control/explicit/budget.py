@@ -41,18 +41,9 @@ class ExplicitLimitError(RuntimeError):
 
 @dataclass(frozen=True)
 class SolveBudget:
-    """How long a search may take.
+    """How long a search may take: in seconds, regions, and effort, see :class:`BudgetTimer`.
 
-    Attributes
-    ----------
-    time_limit : float, optional
-        In seconds.
-    region_limit : int, optional
-        The largest number of regions.
-    progress : bool, default False
-        Show a progress bar that counts regions.
-    effort_limit : float, optional
-        The most effort, by what is counted and not by the clock. See :class:`BudgetTimer`.
+    None is no limit. ``progress`` shows a bar that counts regions.
     """
 
     time_limit: float | None = None

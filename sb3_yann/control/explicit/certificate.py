@@ -61,19 +61,9 @@ class Certificate:
     - QPs at random points of the box agree with the region there, or are infeasible.
     - No region lies in another one.
 
-    Of U only the first input is the law: later ones, which are not played, may be far steeper. A
-    needle that fails is left out if the law of the nearest region is right in its middle.
-
-    Parameters
-    ----------
-    program, regions : ParametricQP, list of Region
-        The scaled program, and what was found.
-    to_inputs : ndarray, shape (m, v)
-        What of U is the law.
-    center, half : ndarray, shape (n,)
-        Take theta to the units of the problem.
-    timer : BudgetTimer
-        Shows how far the check is, and ends it.
+    Of U only the first input, ``to_inputs`` (m, v) of it, is the law: later ones, which are not
+    played, may be far steeper. A needle that fails is left out if the law of the nearest region is
+    right in its middle. ``center`` and ``half`` (n,) take theta to the units of the problem.
     """
 
     def __init__(

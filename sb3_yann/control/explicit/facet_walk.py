@@ -66,20 +66,9 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
 class CandidateRegion:
     """A critical region with what lies across its facets.
 
-    Attributes
-    ----------
-    active : int
-        Its active set.
-    law : ndarray, shape (v, n + 1)
-        ``U = law [theta; 1]``.
-    A, b : ndarray, shapes (q, n) and (q,)
-        Its half-spaces.
-    labels : list of int
-        The constraint of each row, or OUTER or SHARED.
-    inside : ndarray, shape (n,)
-        A point well inside.
-    exchanges : dict
-        The active sets across the rows of constraints that depend on the active ones.
+    There ``A theta <= b`` and ``U = law [theta; 1]``, with law (v, n + 1). ``inside`` (n,) is a
+    point well inside, and ``labels`` hold the constraint of each row, or OUTER or SHARED.
+    ``exchanges`` are the active sets across rows of constraints that depend on the active ones.
     """
 
     active: int

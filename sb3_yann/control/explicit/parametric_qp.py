@@ -263,20 +263,11 @@ def slack_costs(program: ParametricQP) -> tuple[Array, Array]:
 class Optimality:
     """What the Karush-Kuhn-Tucker (KKT) conditions say of one active set.
 
-    Attributes
-    ----------
-    active : tuple of int
-    law : ndarray, shape (v, n + 1)
-        ``U = law [theta; 1]``.
-    rows : ndarray, shape (rows, n + 1)
-        ``rows[:, :n] theta <= rows[:, n]``, of unit length, where constraints and multipliers hold.
-        Those without theta are constants.
-    labels : ndarray of int, shape (rows,)
-        The constraint of each row.
-    factors : ndarray, shape (rows, active)
-        Each constraint's part along the active ones, all of unit length in U.
-    depends : ndarray of bool, shape (rows,)
-        Whether a constraint that is not active has no other part.
+    ``U = law [theta; 1]``, law (v, n + 1). Constraints and multipliers hold where
+    ``rows[:, :n] theta <= rows[:, n]``, of unit length; those without theta are constants.
+    ``labels`` are the constraint of each row. ``factors`` (rows, active) are each constraint's part
+    along the active ones, all of unit length in U, and ``depends`` (rows,) tells whether one that
+    is not active has no other part.
     """
 
     active: tuple[int, ...]
@@ -308,12 +299,8 @@ def optimality(
 ) -> list[Optimality]:
     """Return the KKT conditions of active sets of one size, from LU factors of the KKT matrices.
 
-    Those that hold in all of the unit box are left out, unless ``everywhere``.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the constraints of an active set depend on each other.
+    Those that hold in all of the unit box are left out, unless ``everywhere``. LinAlgError of numpy
+    where the constraints of an active set depend on each other.
     """
     n = program.F.shape[1]
     active = np.array(members, dtype=int).reshape(len(members), len(members[0]))

@@ -31,22 +31,9 @@ def solve_explicit(
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
-    The regions are in the order of their active sets, fewest constraints first.
-
-    Parameters
-    ----------
-    program : ParametricQP
-        In the units of the plant.
-    u_min, u_max : ndarray, shape (m,)
-        The input range, in which tolerances are measured; infinite where there is none.
-    infeasible : {"nearest_region", "zero_input"}
-        See :class:`PiecewiseAffine`.
-    solver : {"walk", "ppopt"}
-        Our walk from facet to facet, or ppopt, tens of times slower.
-    timer : BudgetTimer, optional
-        Gives up at a limit.
-
-    Its errors are those of :meth:`LinearMPC.explicit`.
+    The regions are in the order of their active sets, fewest constraints first. The program is in
+    the units of the plant, and tolerances in those of the input range (m,), infinite where there is
+    none. Its errors are those of :meth:`LinearMPC.explicit`.
     """
     check_choice("solver", solver, ("walk", "ppopt"))
     if not np.all(np.isfinite([program.theta_min, program.theta_max])):
@@ -94,24 +81,9 @@ def load_kernels() -> None:
 class ProgramUnits:
     """A program in units of its box and its input range, where tolerances suit every plant.
 
-    Constraints that always hold with equality are eliminated.
-
-    Parameters
-    ----------
-    program, u_min, u_max
-        As in :func:`solve_explicit`.
-    timer : BudgetTimer, optional
-        Ends the search for equalities.
-
-    Attributes
-    ----------
-    scaled : ParametricQP
-    center, half : ndarray, shape (n,)
-        Theta is ``center + half`` times that of ``scaled``.
-    reach : ndarray, shape (v,)
-        The units of U.
-    to_inputs : ndarray, shape (m, k)
-        What of the variables of ``scaled`` is the first input, in units of its range.
+    Constraints that always hold with equality are eliminated. Theta is ``center + half`` (n,) times
+    that of ``scaled``, and ``reach`` (v,) the units of U. ``to_inputs`` (m, k) is what of the
+    variables of ``scaled`` is the first input, in units of its range.
     """
 
     def __init__(
@@ -184,13 +156,7 @@ class ProgramUnits:
 class Equalities:
     """``U = free y + law [theta; 1]`` for any y: what is left of U by equality constraints.
 
-    Attributes
-    ----------
-    free : ndarray, shape (v, k)
-        Orthonormal.
-    law : ndarray, shape (v, n + 1)
-    rows : ndarray of int
-        The constraints of the program that are these equalities.
+    ``free`` (v, k) is orthonormal, law (v, n + 1), and ``rows`` are the program's equalities.
     """
 
     free: Array
@@ -297,11 +263,6 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Non
 
     Asked for more than 1e8 times their range, inputs are wrong, or feasible sets too thin to be
     found; asked for less than 1e-9 of it, constraints of states are too small beside it.
-
-    Parameters
-    ----------
-    program, u_min, u_max
-        As in :func:`solve_explicit`.
     """
     unit = 1 / np.sqrt(np.maximum(np.diag(program.H), 1e-300))
     for H in (program.H, unit[:, None] * program.H * unit):  # both are factored

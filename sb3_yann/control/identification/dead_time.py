@@ -103,12 +103,7 @@ def _chosen(left: Array, steps: int, n: int) -> int:
 def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]:
     """Return the episodes with the last inputs, newest first, appended to the states.
 
-    Parameters
-    ----------
-    episodes : list of Episode
-        Shorter ones than the longest dead time fall out.
-    delays : sequence of int
-        For each input, how many of its past values are appended.
+    ``delays`` says how many of each input. Episodes shorter than the longest dead time fall out.
     """
     longest, extended = max(delays), []
     for episode in episodes:
@@ -152,10 +147,7 @@ def with_memory_point(
 def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Array, Array]:
     """Return A and B with the rows of the past inputs, which shift, set to what they are.
 
-    Parameters
-    ----------
-    A, B, delays, n : ndarray, shapes (n', n') and (n', m), list of int, and int
-        The matrices as they were fitted, the dead times, and the number of states without memory.
+    They were fitted with the n states and, after these, the inputs on their way.
     """
     A, B, row = A.copy(), B.copy(), n
     for j, delay in enumerate(delays):
@@ -183,16 +175,8 @@ def input_notes(
 ) -> list[str]:
     """Return notes on inputs and disturbances without effect, or with a delay.
 
-    Parameters
-    ----------
-    found : Regression
-        The fit.
-    episodes : list of Episode
-        Those it was fitted to.
-    sizes : tuple of int
-        Numbers of states, inputs and disturbances.
-    log : list of Episode, optional
-        All of them, in which ``delay="auto"`` looks for dead time.
+    ``episodes`` are what the fit was made of, and ``log`` all of them, in which ``delay="auto"``
+    looks for dead time.
     """
     n, m, _ = sizes
     delays, notes = _delays(found, episodes, sizes), []
@@ -283,12 +267,9 @@ def _first(episodes: list[Episode]) -> list[Episode]:
 
 
 def _correlations(known: Array, residuals: Array, past: Array, weights: Array) -> Array:
-    """Return each past input's largest weighted partial correlation with a residual.
+    """Return each past input's largest weighted partial correlation with a residual, (m,).
 
-    Parameters
-    ----------
-    known, residuals, past, weights : ndarray, shapes (k, q), (k, n), (k, m) and (n,)
-        What is taken off first; what is correlated; the weight of each residual.
+    What is known (k, q) is taken off residuals (k, n) and past inputs (k, m) before; weights (n,).
     """
     spread = np.std(known, axis=0)
     moving = spread > 0  # the others would make QR take off a direction of its own choice

@@ -34,16 +34,7 @@ from sb3_yann.log import Episode, Log, split_episodes
 
 @dataclass(frozen=True, eq=False)
 class LogFit:
-    """A system fitted to a log.
-
-    Attributes
-    ----------
-    system, regression : LinearSystem and Regression
-    fits : tuple of ndarray, shapes (n,)
-        One and ten steps ahead.
-    delays : tuple of int
-        Dead time of each input.
-    """
+    """A system fitted to a log, its fits one and ten steps ahead, (n,) each, and the dead times."""
 
     system: LinearSystem
     regression: Regression
@@ -62,15 +53,7 @@ def fit_log(
     held_out: float = 0.2,
     delay: int | str | Sequence[int] = 0,
 ) -> LogFit:
-    """Return the least-squares fit to a log; options as of `identify`.
-
-    Parameters
-    ----------
-    log : Log
-        The measured episodes.
-    x_ss, u_ss, d_ss, offset, ridge, held_out, delay
-        As of `identify`.
-    """
+    """Return the least-squares fit to a log; options as of `identify`."""
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
     episodes, sizes = list(log.episodes), log.sizes
     measured = sizes[2] > 0

@@ -18,15 +18,7 @@ LEAST, TIMES = 10, 10.0
 
 @dataclass(frozen=True)
 class Frozen:
-    """Equal readings in a row of one state.
-
-    Attributes
-    ----------
-    episode, state : int
-        Where they are.
-    first, last : int
-        The rows of the episode from which and to which they reach.
-    """
+    """Equal readings in a row of one state: from the row ``first`` to ``last`` of an episode."""
 
     episode: int
     state: int
@@ -35,24 +27,13 @@ class Frozen:
 
 
 def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen]:
-    """Return where a state reads exactly the same for long though the plant moves.
+    """Return where states (T+1, n) read exactly the same for long though the plant moves.
 
     A sensor that counts in steps repeats itself often: runs count from ten times its usual length
     on. A plant at rest repeats itself while nothing else moves. A state that rests by itself is
     told to rest by a linear model of the other rows. A clipped one rests at an end of its range.
-    None of these is frozen.
-
-    Parameters
-    ----------
-    states : sequence of ndarray, shapes (T+1, n)
-        The readings.
-    driven : sequence of ndarray, shapes (T, k)
-        Inputs and disturbances between them.
-
-    Returns
-    -------
-    list of Frozen
-        Empty where they are less than 5 % of all rows of their state.
+    None of these is frozen, and none is returned where they are less than 5 % of all rows.
+    ``driven`` (T, k) are the inputs and disturbances between the rows.
     """
     rows, found = sum(map(len, states)), list[Frozen]()
     for i in range(states[0].shape[1]):

@@ -64,16 +64,10 @@ class Regression:
 def regress(
     episodes: list[Episode], sizes: tuple[int, int, int], origin: Array | None, ridge: float
 ) -> Regression:
-    """Return the least-squares fit of one step.
+    """Return the least-squares fit of one step, for numbers of states, inputs and disturbances.
 
-    Parameters
-    ----------
-    episodes, sizes : list of Episode, and tuple of int
-        The measured steps, and the numbers of states, inputs and disturbances.
-    origin : ndarray, shape (n+m+d,), optional
-        The fit passes through it. The default is the mean of the data: an offset is fitted.
-    ridge : float
-        Penalty on the squared coefficients, each in units of its regressor's spread.
+    It passes through ``origin`` (n+m+d,), by default the mean of the data: an offset is fitted.
+    ``ridge`` weighs squared coefficients, each in units of its regressor's spread.
     """
     regressors = np.concatenate([episode.regressors for episode in episodes])
     targets = np.concatenate([episode.states[1:] for episode in episodes])
@@ -156,19 +150,8 @@ def regularized(
     """Return the fit, its ridge and notes; a log that is not weak has none.
 
     What a weak log says along the direction that moved least is noise or curvature, and one-step
-    predictions do not show it. Free runs do.
-
-    Parameters
-    ----------
-    found, fitted, tested : Regression and lists of Episode
-        The fit without ridge, what it was fitted to, and what was held out.
-    sizes, origin : tuple of int, and ndarray (n+m+d,) or None
-        As of `regress`.
-
-    Raises
-    ------
-    ValueError
-        If a weak log leaves free runs as blind as the mean, with any ridge.
+    predictions do not show it. Free runs over what was held out, ``tested``, do. ValueError if a
+    weak log leaves them as blind as the mean, with any ridge.
     """
     if found.excitation >= WEAK:
         return found, 0.0, []
@@ -265,15 +248,8 @@ def operating_point(
 ) -> Array:
     """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant.
 
-    Parameters
-    ----------
-    found, sizes : Regression, and (n, m, d)
-        The fit.
-    given : sequence of ndarray, shapes (n,), (m,) and (d,)
-        What is known of the point, None where nothing is.
-    delays : sequence of int, length m
-        So many of the last states are each input on its way: at rest these are the inputs, however
-        far from the data.
+    ``given`` holds what is known of x, u and d, None where nothing is. So many of the last states
+    are each input on its way: at rest these are the inputs, however far from the data.
     """
     n, m, _ = sizes
     means = zip(given, np.split(found.center, [n, n + m]), strict=True)

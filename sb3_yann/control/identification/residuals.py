@@ -80,15 +80,9 @@ ORDERS = (1, 2, 4, 6)
 class Leftover(NamedTuple):
     """Mean squares (n,) of what each set of regressors leaves of held-out rows.
 
-    All of them hold the present states and inputs. A log that is too short has zeros throughout:
-    nothing can be told then.
-
-    Attributes
-    ----------
-    linear, squares, lags, both : ndarray, shape (n,)
-        With nothing else; with squares and products; with earlier states and inputs; with both.
-    late : ndarray, shape (n,)
-        With squares, products and the inputs of the dead time, but no earlier states.
+    All of them hold the present states and inputs: with nothing else; with squares and products;
+    with earlier states and inputs; with both; with squares, products and the inputs of the dead
+    time. A log that is too short has zeros throughout: nothing can be told then.
     """
 
     linear: Array
@@ -130,13 +124,7 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
 
     The rows of a log depend on their neighbors, which an F test does not know: by chance, slow
     inputs square to what a hidden state adds. A part of the log that was held out tells them apart.
-
-    Parameters
-    ----------
-    episodes : list of Episode
-        The first `ENOUGH` steps count.
-    delays : sequence of int, optional
-        Dead time of each input.
+    The first `ENOUGH` steps count. ``delays`` are the dead times of the inputs.
     """
     n, lags = episodes[0].states.shape[1], max(ORDERS[-1], *delays, 0)
     longer = [episode for episode in episodes if len(episode) > lags]
@@ -202,13 +190,8 @@ def quality_notes(
 ) -> list[str]:
     """Return notes on residuals, fit, excitation, bias and poles.
 
-    Parameters
-    ----------
-    found, fitted, tested : Regression and lists of Episode
-        The fit, what it was fitted to, and what was held out.
-    fits, ridge, memory : pair of ndarray (n,), float and int
-        The fits one and more steps ahead in percent, the penalty, and how many of the last states
-        are inputs on their way, of which nothing is in doubt.
+    ``fits`` (n,) are those one and more steps ahead in percent, and ``memory`` is how many of the
+    last states are inputs on their way, of which nothing is in doubt.
     """
     n = found.reached.size - memory
     fits = fits[0][:n], fits[1][:n]

@@ -53,26 +53,13 @@ def jacobian(
     noise: Array,
     actual: Callable[[Array], Array] = lambda z: z,
 ) -> Jacobian:
-    """Return the derivatives of f at a point by Richardson extrapolation.
+    """Return the derivatives of f, from points (c,) to values (r,), by Richardson extrapolation.
 
     Each entry takes the extrapolation that agrees best with its neighbor over shorter steps:
-    Ridders (1982), *Advances in Engineering Software* 4, 75-76.
-
-    Parameters
-    ----------
-    f : callable
-        Takes an array of shape (c,), returns one of shape (r,), NaN where it has no value.
-    point, steps : ndarray, shape (c,)
-        The point, and the longest step in each coordinate.
-    noise : ndarray, shape (r,)
-        The error of each value of f (rounding).
-    actual : callable, optional
-        The point at which f is evaluated for a given one, e.g. its float32 rounding.
-
-    Raises
-    ------
-    NotSmoothError
-        If f has a kink or a jump at the point, or no value next to it.
+    Ridders (1982), *Advances in Engineering Software* 4, 75-76. ``steps`` (c,) are the longest,
+    ``noise`` (r,) is the error of each value, and ``actual`` the point at which f is evaluated for
+    a given one, e.g. its float32 rounding. f is NaN where it has no value. NotSmoothError where it
+    has a kink or a jump at the point, or no value next to it.
     """
     begin = actual(point)
     center = f(begin)
@@ -146,15 +133,7 @@ def differences(
     labels: list[str],
     actual: Callable[[Array], Array] = lambda z: z,
 ) -> Jacobian:
-    """Return the Jacobian; name the coordinate where there is none.
-
-    Parameters
-    ----------
-    f, point, steps, rounding, actual : callable, ndarray (c,) twice, ndarray (r,), callable
-        As of `jacobian`, which calls the rounding noise.
-    labels : list of str
-        The names of the coordinates.
-    """
+    """Return the `jacobian` with shorter steps where f has no value; name a coordinate without."""
     shortest, steps = steps / SHORTER**2, steps.copy()
     while True:
         try:

@@ -19,14 +19,9 @@ CALLING = (IndexError, TypeError, ValueError)
 
 
 class Rate:
-    """``dx/dt`` (n,) at a point ``[x, u, d]``; f takes and returns vectors or columns.
+    """``dx/dt`` (n,) at a point ``[x, u, d]``, of an f of vectors or columns of these sizes.
 
-    Parameters
-    ----------
-    f : callable
-        Takes x, u and perhaps d; returns dx/dt of shape (n,), (n, 1) or (1, n), or a list.
-    sizes : sequence of int
-        The sizes of what f takes; n is the first.
+    f returns dx/dt of shape (n,), (n, 1) or (1, n), or a list.
 
     Examples
     --------
@@ -49,10 +44,7 @@ class Rate:
     def choose(self, point: Array) -> None:
         """Find out at a point whether f takes vectors (n,) or columns (n, 1).
 
-        Raises
-        ------
-        ValueError
-            If f returns no n numbers for either; or what f itself raises for vectors.
+        ValueError if it returns no n numbers for either, or what f itself raises for vectors.
         """
         self.columns = False
         try:
@@ -102,16 +94,7 @@ def linearize_dynamics(
     d_ss: ArrayLike | None,
     scale: ArrayLike | None = None,
 ) -> LinearSystem:
-    """Return the sampled linearization of `LinearModel.from_dynamics`.
-
-    Parameters
-    ----------
-    f, dt : callable, and float
-        Returns dx/dt (n,) for x and u, with ``d_ss`` also d; the sampling time.
-    x_ss, u_ss, d_ss, scale : array_like, shapes (n,), (m,), (d,), and (n,) or (n + m + d,)
-        A steady state of f, NaN where it is solved for, and the range of each entry. d_ss and scale
-        may be None.
-    """
+    """Return the sampled linearization of `LinearModel.from_dynamics`, which documents the rest."""
     x, u = _partly_known("x_ss", x_ss), _partly_known("u_ss", u_ss)
     d = check_array("d_ss", [] if d_ss is None else d_ss, ("d",))
     dt = check_positive("dt", dt)

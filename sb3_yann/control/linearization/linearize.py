@@ -39,18 +39,10 @@ SETTLES = 2_000  # steps in which a plant may come to rest by itself
 def steady_state(
     simulator: Simulator, start: Array, free: NDArray[np.bool_], scale: Array
 ) -> Array:
-    """Return the steady state and its action, shape (n+m,).
+    """Return the steady state and its action, shape (n+m,), with the free entries solved for.
 
-    Parameters
-    ----------
-    simulator : Simulator
-        Put in a state, and stepped, many times.
-    start : ndarray, shape (n+m,)
-        The known entries, and a guess for the free ones.
-    free : ndarray of bool, shape (n+m,)
-        The entries to solve for.
-    scale : ndarray, shape (n+m,)
-        Range in which each entry moves in use.
+    ``start`` (n+m,) holds the known entries, and a guess for the free ones. ``scale`` (n+m,) is the
+    range in which each moves in use.
     """
     if not np.any(free):
         return start
@@ -117,14 +109,8 @@ def _at_bounds(simulator: Simulator, u: Array, scale: Array) -> str:
 def require_steady_state(simulator: Simulator, point: Array, jacobian: Array, scale: Array) -> None:
     """Raise ValueError if a given operating point is far from the linear model's steady states.
 
-    Its motion alone tells little: in a short sample a plant hardly moves from anywhere.
-
-    Parameters
-    ----------
-    simulator, jacobian : Simulator, and ndarray, shape (n, n+m)
-        What is stepped, and the derivatives of its next state at the point.
-    point, scale : ndarray, shape (n+m,)
-        State and action, and the range in which each moves in use.
+    Its motion alone tells little: in a short sample a plant hardly moves from anywhere. The
+    ``jacobian`` (n, n+m) is that of the next state at the point (n+m,).
     """
     moved = residual(simulator, point, scale)
     n = moved.size
@@ -181,14 +167,8 @@ SECONDS = 1.0  # after which a slow one does
 def episode_faults(env: Any, action: Array) -> list[str]:
     """Return what is wrong with the episodes of an env, each with the wrapper that cures it.
 
-    The env is reset and stepped; pass a copy. What it raises meanwhile ends the search.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        With a Box of actions.
-    action : ndarray, shape (m,)
-        An action to play.
+    The env is reset and stepped with an action (m,); pass a copy. What it raises meanwhile ends the
+    search.
 
     Examples
     --------
@@ -261,15 +241,7 @@ def linearize_env(
     get_state: Callable[[Any], ArrayLike] | None,
     scale: ArrayLike | None,
 ) -> LinearSystem:
-    """Return the linearized step of `LinearModel.from_env`, which documents what None stands for.
-
-    Parameters
-    ----------
-    env, dt, set_state, get_state : Maker, float or None, callable or None
-        The simulator, the time of one step, and what sets and returns the state (n,).
-    x_ss, u_ss, scale : array_like, shapes (n,), (m,) and (n,), or None
-        The operating point, NaN where it is to be solved for, and the range of each state.
-    """
+    """Return the linearized step of `LinearModel.from_env`, which says what None stands for."""
     with contextlib.closing(borrow(env)) as borrowed:
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)

@@ -41,13 +41,9 @@ READERS: dict[str, Reader] = {
 
 @dataclass
 class Borrowed:
-    """An environment for experiments: `private` to them, or `owned` and so closed afterwards.
+    """An environment for experiments, and where it comes from.
 
-    Attributes
-    ----------
-    env, note : gymnasium.Env and str
-        The environment, and where it comes from.
-    private, owned : bool
+    It is `private` to them, or not; one that is `owned` is closed afterwards.
     """
 
     env: Any
@@ -252,17 +248,11 @@ MOST = 1e-3  # largest noise, relative to the scale, that differences can cope w
 
 
 def noise_of(f: Callable[[Array], Array], point: Array, scale: Array) -> Array:
-    """Return the standard deviation of each value's noise, zeros where there is a kink instead.
+    """Return the deviation of each value's noise (r,), zeros where there is a kink instead.
 
     High differences of a smooth function vanish. What they show is noise where it does not shrink
-    with the spacing: Hamming's table, as in Moré & Wild (2011), *SIAM J. Sci. Comput.* 33.
-
-    Parameters
-    ----------
-    f : callable
-        Takes an array of shape (c,), returns one of shape (r,).
-    point, scale : ndarray, shape (c,)
-        Where noise is measured, and the range of each coordinate.
+    with the spacing: Hamming's table, as in Moré & Wild (2011), *SIAM J. Sci. Comput.* 33. f takes
+    points (c,) and returns values (r,); ``scale`` (c,) is the range of each coordinate.
 
     Examples
     --------
@@ -302,16 +292,8 @@ def connect(
 ) -> tuple[Array, Array]:
     """Choose how the state is set and read, by trial; return the state tried and its scale.
 
-    Parameters
-    ----------
-    simulator : Simulator
-        Its ``setter`` and ``reader`` are set to the first pair that passes.
-    x : ndarray, shape (n,), optional
-        A state to try, NaN where it is not known. The default is that of the reset.
-    u : ndarray, shape (m,)
-        An action to try.
-    scale : array_like, shape (n,), optional
-        Range in which each state moves in use.
+    The simulator's ``setter`` and ``reader`` are the first pair that passes. A state x (n,) may
+    hold NaN where it is not known, and is by default that of the reset; u (m,) is tried.
     """
     begun = {name: simulator.read(name) for name in simulator.readers}
     tried = []

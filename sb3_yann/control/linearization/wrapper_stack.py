@@ -27,22 +27,12 @@ def layers_of(env: Any) -> Iterator[Any]:
 
 
 def require_state_shown(env: Any, observation_given: bool) -> None:
-    """Raise unless an observation means the same state at any time.
+    """Raise ValueError unless an observation means the same state at any time.
 
-    Unknown wrappers pass. Where states are late or inputs are not applied, it warns.
-
-    Parameters
-    ----------
-    env : gymnasium.Env, VecEnv or gymnasium.vector.VectorEnv
-        Also one whose wrappers are in other processes. A `VecNormalize` is not looked at.
-    observation_given : bool
-        Whether the user said what is shown. Else it must be the parameter of the law.
-
-    Raises
-    ------
-    ValueError
-        If a wrapper scales observations or actions by statistics of its own. Unless
-        ``observation_given``, also if one rescales or stacks observations.
+    Not so where a wrapper scales by statistics of its own. Unless the user said what is shown,
+    ``observation_given``, it must be the parameter of the law: neither rescaled nor stacked.
+    Unknown wrappers pass, and a `VecNormalize` is not looked at. Where states are late or inputs
+    are not applied, it warns. Wrappers may be in other processes.
     """
     for layer in layers_of(env):
         name = type(layer).__name__

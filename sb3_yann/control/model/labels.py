@@ -43,12 +43,7 @@ def require_different(labels: Sequence[str]) -> None:
 def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
     """Return the unit of each state and input, "" where there is none.
 
-    Parameters
-    ----------
-    given : mapping from name to unit, or sequence of str
-        Names are those of states and inputs, ``x[0]`` where there are no others.
-    labels : sequence of str
-        The names.
+    Labels are the names of both, ``x[0]`` where there are no others.
 
     Examples
     --------
@@ -102,16 +97,7 @@ def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
 
 
 def name_of(model: LinearSystem, kind: str, index: int) -> str:
-    """Return the name of a state or input, else ``state 0`` or ``input 0``.
-
-    Parameters
-    ----------
-    model : LinearModel
-        With or without names.
-    kind : {"state", "input"}
-        What it is.
-    index : int
-        Which one.
+    """Return the name of a "state" or "input" by its number, else ``state 0`` or ``input 0``.
 
     Examples
     --------
@@ -180,14 +166,7 @@ def completed(
 ) -> tuple[Sequence[str], Units]:
     """Return names of states and units with those of inputs on their way, where they are left out.
 
-    Parameters
-    ----------
-    model : LinearModel
-        With dead time.
-    past : sequence of (int, str)
-        Its last states: numbers of inputs, and lags.
-    state_names, input_names, units : sequence of str, units a mapping too
-        As they are given: of all states, or of all but these.
+    ``past`` are the last states of a model with dead time: numbers of inputs, and lags.
     """
     own, m = model.n_states - len(past), model.n_inputs
     named = len(input_names) == m
