@@ -578,36 +578,19 @@ def make_env(source: Source) -> gym.Env[Any, Any]:
 
 def maker(env: Any, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]]:
     """Return a function that makes envs like the one that is given, by this name, or made."""
-    if isinstance(env, str):
-        env = as_source(env)  # "module:function" is a function
-    if isinstance(env, str):
-        return partial(gym.make, env, disable_env_checker=True)
     if is_vec_env(env):
         return itertools.cycle([OneOf(env, i) for i in range(env.num_envs)]).__next__
-    if isinstance(env, gym.Env):
-        try:
-            copy.deepcopy(env)
-        except Exception as error:  # whatever a simulator raises that cannot be copied
-            raise TypeError(
-                f"{name} = {env!r} cannot be copied ({error}). Pass a function that makes "
-                "such an env: the starts are played side by side."
-            ) from error
-        return partial(copy.deepcopy, env)
-    if not callable(env):
+    source = as_source(env)
+    if not isinstance(source, gym.Env):
+        return partial(make_env, source)
+    try:
+        copy.deepcopy(source)
+    except Exception as error:  # whatever a simulator raises that cannot be copied
         raise TypeError(
-            f"{name} = {env!r} must be a single gymnasium.Env, its id, a function that makes "
-            "one, or a PlantTwin."
-        )
-
-    require_makes(env)
-
-    def made() -> gym.Env[Any, Any]:
-        found = env()
-        if not isinstance(found, gym.Env):
-            raise TypeError(f"{name} = {env!r} made {found!r}. It must return a gymnasium.Env.")
-        return found
-
-    return made
+            f"{name} = {env!r} cannot be copied ({error}). Pass a function that makes such an env: "
+            "the starts are played side by side."
+        ) from error
+    return partial(copy.deepcopy, source)
 
 
 class OneOf(gym.Env[Any, Any]):

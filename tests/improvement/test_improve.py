@@ -368,9 +368,9 @@ def test_what_is_no_simulator_or_no_model_is_refused() -> None:
     with pytest.raises(TypeError, match="or a function that makes one"):
         improve(model, [Spring(), Spring()])
     with closing(gym.make_vec("CSTR-v0", num_envs=2)) as several:
-        with pytest.raises(TypeError, match="a single gymnasium"):
+        with pytest.raises(TypeError, match="or a function that makes one"):
             improve(model, several)
-    with pytest.raises(TypeError, match=r"made None. It must return a gymnasium.Env"):
+    with pytest.raises(TypeError, match=r"makes envs returned None, not a gymnasium"):
         improve(model, lambda: None)
     with pytest.raises(TypeError, match="twin = 3 must be a PlantTwin; or a simulator"):
         improve(model, 3)

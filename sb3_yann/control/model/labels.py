@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from sb3_yann._validation import is_text
 from sb3_yann.control.linear_system import LinearSystem, names
@@ -127,16 +126,6 @@ def missing_observer(model: LinearSystem) -> str:
         f"{', '.join(which)} {verb} estimated: the DisturbanceObserver is no part of the law or "
         "the policy. Whoever calls it runs the observer, and passes its x_hat and d_hat."
     )
-
-
-def short_repr(model: Any) -> str:
-    """Return the sizes, names and operating point of a model, for one line."""
-    states, inputs = with_units(model)
-    sizes = f"states={states}, inputs={inputs}, disturbances={model.n_disturbances}"
-    if model.estimated:
-        sizes += f", estimated={[*model.estimated]}"
-    point = f"x_ss={model.x_ss.tolist()}, u_ss={model.u_ss.tolist()}"
-    return f"{type(model).__name__}({sizes}, dt={model.step_length}, {point})"
 
 
 def past_inputs(model: LinearSystem) -> list[tuple[int, str]]:

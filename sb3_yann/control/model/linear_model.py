@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -19,20 +18,30 @@ from sb3_yann._validation import (
     to_float,
 )
 from sb3_yann.control.identification.fit import fit_log
-from sb3_yann.control.linear_system import names, zero_order_hold
+from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.linearization.dynamics import linearize_dynamics
 from sb3_yann.control.linearization.linearize import linearize_env
-from sb3_yann.control.model.labels import Units, as_names, as_unit, as_units, require_different
-from sb3_yann.control.model.plant import Plant
-from sb3_yann.control.model.statespace import from_control
+from sb3_yann.control.model.labels import (
+    Units,
+    as_names,
+    as_unit,
+    as_units,
+    completed,
+    past_inputs,
+    require_different,
+    with_units,
+)
+from sb3_yann.control.model.report import describe
+from sb3_yann.control.model.statespace import from_control, to_control
 from sb3_yann.log import Arrays, Log
 
 if TYPE_CHECKING:
     import gymnasium
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class LinearModel(Plant):
+class LinearModel(LinearSystem):
     """The plant near an operating point: ``x[k+1] = A x[k] + B u[k] + E d[k]``, every ``dt``.
 
     ``x``, ``u`` and the disturbances ``d`` are deviations from the operating point
@@ -225,8 +234,6 @@ class LinearModel(Plant):
         set_state: Callable[[Any, Array], object] | None = None,
         get_state: Callable[[Any], ArrayLike] | None = None,
         scale: ArrayLike | None = None,
-        state: ArrayLike | None = None,
-        action: ArrayLike | None = None,
     ) -> LinearModel:
         """Linearize one step of a simulator and its wrappers by central differences.
 
@@ -258,8 +265,6 @@ class LinearModel(Plant):
             Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
             states; a given steady state may be 1 % off. The default is half the width of the
             observation space, or the size of the state, at least 1.
-        state, action : array_like, optional
-            What ``x_ss`` and ``u_ss`` were called before 0.2; deprecated.
 
         Raises
         ------
@@ -273,16 +278,6 @@ class LinearModel(Plant):
         >>> pendulum.dt, pendulum.A.shape, pendulum.B.shape
         (0.05, (2, 2), (2, 1))
         """
-        if state is not None or action is not None:
-            if x_ss is not None or u_ss is not None:
-                raise TypeError("Pass x_ss and u_ss, not state and action too: they are the same.")
-            warnings.warn(
-                "state= and action= of LinearModel.from_env are called x_ss= and u_ss= now.",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            x_ss = state
-            u_ss = action
         return cls(**vars(linearize_env(env, x_ss, u_ss, dt, set_state, get_state, scale)))
 
     @classmethod
@@ -356,3 +351,63 @@ class LinearModel(Plant):
         """
         A, B, E, C, step, notes = from_control(system, dt, disturbances)
         return cls(A, B, step, x_ss, u_ss, E, d_ss, notes=notes, C=C)
+
+    def step(self, x: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> Array:
+        """Return ``A x + B u + E d``; each is a vector or a batch of them, (batch, size)."""
+        moved = np.asarray(x) @ self.A.T + np.asarray(u) @ self.B.T
+        return moved if d is None else moved + np.asarray(d) @ self.E.T
+
+    def named(
+        self,
+        state_names: Sequence[str] = (),
+        input_names: Sequence[str] = (),
+        units: Units = (),
+        time_unit: str | None = None,
+    ) -> Self:
+        """Return the model with names and units; notes and drift stay, as does a unit of time.
+
+        Inputs on their way, the last states of a model with dead time, are named after the inputs
+        where names and units are given of the others only.
+        """
+        if past := past_inputs(self):
+            state_names, units = completed(self, past, state_names, input_names, units)
+        given: dict[str, Any] = {
+            "state_names": state_names,
+            "input_names": input_names,
+            "units": units,
+        }
+        if time_unit is not None:
+            given["time_unit"] = time_unit
+        return type(self)(**{**vars(self), **given})
+
+    def about_zero(self) -> Self:
+        """Return the model without an operating point: what it describes are deviations."""
+        return type(self)(**{**vars(self), "x_ss": None, "u_ss": None, "d_ss": None})
+
+    def to_statespace(self) -> Any:
+        """Return a discrete `control.StateSpace` from [u, d] to x, all in deviations.
+
+        Examples
+        --------
+        >>> from sb3_yann.control import LinearModel
+        >>> LinearModel([[0.5]], [[2.0]], dt=0.1).to_statespace().dt
+        0.1
+        """
+        return to_control(self)
+
+    def report(self) -> str:
+        """Return an account in words: poles, controllability, scaling, sampling and notes."""
+        return describe(self)
+
+    def __hash__(self) -> int:
+        """Return a hash that equal models share."""
+        return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))
+
+    def __repr__(self) -> str:
+        """Name the states, the inputs and the operating point."""
+        states, inputs = with_units(self)
+        sizes = f"states={states}, inputs={inputs}, disturbances={self.n_disturbances}"
+        if self.estimated:
+            sizes += f", estimated={[*self.estimated]}"
+        point = f"x_ss={self.x_ss.tolist()}, u_ss={self.u_ss.tolist()}"
+        return f"LinearModel({sizes}, dt={self.step_length}, {point})"

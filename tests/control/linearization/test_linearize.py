@@ -292,12 +292,3 @@ def test_missing_sampling_time_is_asked_for_and_render_fps_is_none() -> None:
 def test_what_is_no_environment_of_a_plant_is_named(env: Any, message: str) -> None:
     with pytest.raises(TypeError, match=message):
         LinearModel.from_env(env)
-
-
-def test_the_former_names_of_the_operating_point_are_taken_with_a_warning() -> None:
-    plant = Plant(lambda x, u: 0.5 * x + u)
-    with pytest.warns(DeprecationWarning, match="x_ss= and u_ss= now"):
-        former = LinearModel.from_env(plant, state=[0.0], action=[0.0])
-    assert former == LinearModel.from_env(plant, x_ss=[0.0], u_ss=[0.0])
-    with pytest.raises(TypeError, match="they are the same"):
-        LinearModel.from_env(plant, x_ss=[0.0], action=[0.0])
