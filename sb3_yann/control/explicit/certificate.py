@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import NoReturn
 
@@ -32,9 +31,6 @@ INSIDE_TOL = 1e-8
 """How far a point may lie from a region that holds it, in half-widths of the box."""
 IMPLIED_TOL = 1e-9
 """How far a region may reach beyond its conditions, and equal half-spaces may differ."""
-NEEDLE = 1e-7
-"""A region that holds no ball of this radius, in half-widths of the box, may be left to its
-neighbors where its conditions are rounding: such regions crowd at the border of a feasible set."""
 
 
 class ExplicitSolutionError(RuntimeError):
@@ -62,8 +58,7 @@ class Certificate:
     - No region lies in another one.
 
     Of U only the first input, ``to_inputs`` (m, v) of it, is the law: later ones, which are not
-    played, may be far steeper. A needle that fails is left out if the law of the nearest region is
-    right in its middle. ``center`` and ``half`` (n,) take theta to the units of the problem.
+    played, may be far steeper. ``center`` and ``half`` (n,) take theta to the units of the problem.
     """
 
     def __init__(
@@ -83,7 +78,6 @@ class Certificate:
         self.timer = timer
         self.outer = np.column_stack(program.theta_rows())
         self.qp_effort = effort_of_qp(*program.G.shape)
-        self.dropped: set[int] = set()
 
     def check(self) -> list[Region]:
         """Return the regions, with the laws of steep ones more exact, and trimmed by 1e-8 at most.
@@ -97,25 +91,13 @@ class Certificate:
         # Two looks at each region.
         self.timer.stage("Checked", "and not all were checked", 2 * len(self.balls))
         for i, (middle, _) in enumerate(self.balls):
-            with self._needles_may_fail(i):
-                if not self._is_right(i, middle):
-                    self._fail(f"the law of region {i} is not optimal inside it", middle)
+            if not self._is_right(i, middle):
+                self._fail(f"the law of region {i} is not optimal inside it", middle)
             self.timer.advance()
         refined = list(self.regions)
         for i, conditions in self._conditions():
-            with self._needles_may_fail(i):
-                refined[i] = self._checked(i, conditions)
+            refined[i] = self._checked(i, conditions)
             self.timer.advance()
-        if self.dropped:
-            kept = [i for i in range(len(self.balls)) if i not in self.dropped]
-            self.regions = [self.regions[i] for i in kept]
-            self._collect()
-            for i in sorted(self.dropped):
-                U = self.program.solve(self.balls[i][0])
-                if U is not None:
-                    self._require_held(self.balls[i][0], U, 2 * NEEDLE)
-            refined = [refined[i] for i in kept]
-            self.balls = [self.balls[i] for i in kept]
         self._require_agreement()
         self._require_no_doubles()
         return refined
@@ -129,16 +111,6 @@ class Certificate:
         self.gains = np.array([self.to_inputs @ region.gain for region in regions])
         self.offsets = np.array([self.to_inputs @ region.offset for region in regions])
         self.starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
-
-    @contextmanager
-    def _needles_may_fail(self, i: int) -> Iterator[None]:
-        """Leave region i out if it is a needle that fails a check."""
-        try:
-            yield
-        except ExplicitSolutionError:
-            if self.balls[i][1] >= NEEDLE:
-                raise
-            self.dropped.add(i)
 
     def _is_right(self, i: int, point: Array) -> bool:
         """Tell whether a QP at a point has the law of region i for an answer."""
@@ -159,9 +131,8 @@ class Certificate:
         )
 
     def _conditions(self) -> Iterator[tuple[int, Optimality]]:
-        """Yield the KKT conditions of each region that is left."""
-        left = [i for i in range(len(self.regions)) if i not in self.dropped]
-        sets = [self.regions[i].active_set for i in left]
+        """Yield the KKT conditions of each region."""
+        sets = [region.active_set for region in self.regions]
         v, n = self.program.F.shape
         rows = len(self.program.w)
 
@@ -171,20 +142,8 @@ class Certificate:
         for size, members in batches(map(len, sets), numbers):
             effort = effort_of_conditions(rows + n, v + size, v + size)
             self.timer.tick(len(members) * effort)
-            try:
-                found = optimality(self.program, [sets[k] for k in members])
-                yield from zip([left[k] for k in members], found, strict=True)
-            except np.linalg.LinAlgError:  # one of them at least has dependent constraints
-                for k in members:
-                    with self._needles_may_fail(left[k]):
-                        yield left[k], self._conditions_of(left[k])
-
-    def _conditions_of(self, i: int) -> Optimality:
-        try:
-            return optimality(self.program, [self.regions[i].active_set])[0]
-        except np.linalg.LinAlgError:
-            what = "the active constraints of a region depend on each other"
-            self._fail(what, self.balls[i][0])
+            found = optimality(self.program, [sets[k] for k in members])
+            yield from zip(members, found, strict=True)
 
     def _checked(self, i: int, kkt: Optimality) -> Region:
         """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
@@ -213,8 +172,7 @@ class Certificate:
         """Return which conditions the half-spaces of region i just do not imply.
 
         They are left out where they seem to touch the region alone. Raise if it lies farther
-        beyond one, and a QP there disagrees; ``known`` marks the conditions that are among the
-        half-spaces.
+        beyond one; ``known`` marks the conditions that are among the half-spaces.
         """
         region = self.regions[i]
         inside, radius = self.balls[i]
@@ -228,10 +186,9 @@ class Certificate:
         self.timer.tick(len(rows) * effort_of_lp(*region.A.shape) / 2)
         points = farthest_points(region.A, region.b, inside, rows[:, :n])
         beyond = np.sum(rows[:, :n] * points, axis=1) - rows[:, n]
-        for k in np.flatnonzero(beyond > INSIDE_TOL):
-            # The half-spaces of a thin region are rounding: what counts is the law beyond them.
-            if beyond[k] > NEEDLE or not self._is_right(i, points[k]):
-                self._fail(f"the law of region {i} violates the KKT conditions", points[k])
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > INSIDE_TOL:
+            self._fail(f"the law of region {i} violates the KKT conditions", points[worst])
         return np.asarray(others[beyond > IMPLIED_TOL])
 
     def _beyond(self, candidates: Iterable[int]) -> tuple[int, ...] | None:
@@ -303,11 +260,11 @@ class Certificate:
         for k in np.flatnonzero(~held):
             self._require_held(points[k], inputs[k])
 
-    def _require_held(self, point: Array, U: Array, distance: float = INSIDE_TOL) -> None:
-        """Raise unless the nearest region, at most so far from a point, has the right law there."""
+    def _require_held(self, point: Array, U: Array) -> None:
+        """Raise unless the nearest region holds a point, and has the right law there."""
         slacks = self._slacks(point)
         nearest = int(np.argmax(slacks))
-        if slacks[nearest] < -distance:
+        if slacks[nearest] < -INSIDE_TOL:
             self._fail("no region covers a feasible parameter", point)
         if self._error(np.array([nearest]), point[None], U[None])[0] > LAW_TOL:
             self._fail(f"the law of region {nearest} violates the KKT conditions", point)

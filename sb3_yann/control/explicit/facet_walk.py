@@ -124,16 +124,9 @@ class _Walk:
         for one in self.found.values():
             known |= np.all(points @ one.A.T <= one.b, axis=1)
         for point in points[~known]:
-            active = self._active_at(point)
+            active = self.conditions.active_at(point)
             if active is not None:
                 yield active
-
-    def _active_at(self, point: Array) -> int | None:
-        """Return the active set at a point, if there are several one that is not ruled out."""
-        active = self.conditions.active_at(point)
-        if active in self.visited and active not in self.found:
-            return self.conditions.active_at(point, apart=1e-9)
-        return active
 
     def explore(self, wave: Iterable[int]) -> None:
         """Add all regions that are connected with those of some active sets."""
@@ -170,7 +163,7 @@ class _Walk:
         # The shortest step that gives an answer: a longer one may cross a thin region.
         for step in (1e-7, 1e-6, 1e-5):
             point = middle + min(step, distance) * one.A[row]
-            active = self._active_at(point)
+            active = self.conditions.active_at(point)
             if active is None:
                 return None
             if active not in self.visited:
@@ -261,8 +254,8 @@ class Conditions:
             alive[k] = rows[k] @ farthest(alive, relaxed, rows[k]) > b[k] + 1e-10
         self.kept = moving[np.flatnonzero(alive[: len(moving)])]
 
-    def active_at(self, theta: Array, apart: float = 0.0) -> int | None:
-        """Return DAQP's working set at theta with constraints moved apart, None if infeasible."""
+    def active_at(self, theta: Array) -> int | None:
+        """Return DAQP's working set at theta, None if infeasible."""
         if np.any(self.outer_A @ theta > self.outer_b + 1e-11):
             return None
         rows = len(self.kept)
@@ -270,13 +263,12 @@ class Conditions:
             return 0
         self.timer.tick(effort_of_qp(*self.N.shape))
         if self.steep is not None:
-            moved = replace(self.steep, w=self.steep.w + apart * self.apart)
-            U, found = (moved if apart else self.steep).solve_with_multipliers(theta)
+            U, found = self.steep.solve_with_multipliers(theta)
             return None if U is None else as_bits(np.flatnonzero(found > 0))
         import daqp
 
         n = len(theta)
-        upper = (self.D[:, :n] @ theta + self.D[:, n] + apart * self.apart) * self.units
+        upper = (self.D[:, :n] @ theta + self.D[:, n]) * self.units
         lower = np.full(rows, -1e30)
         sense = np.zeros(rows, dtype=np.intc)
         _, _, status, info = daqp.solve(*self.least_distance, upper, lower, sense, primal_tol=1e-11)

@@ -14,50 +14,21 @@ from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.linearization.differences import curvature, differences, idle_inputs
 from sb3_yann.control.lqr import unreached
 
-CALLING = (IndexError, TypeError, ValueError)
-"""What a function of columns (n, 1) raises where it gets vectors (n,)."""
-
 
 class Rate:
-    """``dx/dt`` (n,) at a point ``[x, u, d]``, of an f of vectors or columns of these sizes.
+    """``dx/dt`` (n,) at a point ``[x, u, d]``, of an f of vectors of these sizes; n is the first.
 
     f returns dx/dt of shape (n,), (n, 1) or (1, n), or a list.
-
-    Examples
-    --------
-    >>> rate = Rate(lambda x, u: [[x[1, 0]], [u[0, 0]]], (2, 1))
-    >>> rate.choose(np.ones(3))  # it takes columns
-    >>> rate(np.array([1.0, 2.0, 3.0]))
-    array([2., 3.])
     """
 
     def __init__(self, f: Callable[..., ArrayLike], sizes: Sequence[int]) -> None:
-        self.f, self.sizes, self.columns = f, tuple(sizes), False
+        self.f = f
+        self.sizes = tuple(sizes)
 
     def __call__(self, point: Array) -> Array:
         """Return dx/dt (n,) at ``[x, u, d]``."""
         parts = np.split(point, np.cumsum(self.sizes[:-1]))
-        if self.columns:
-            parts = [part[:, None] for part in parts]
         return _vector(self.f(*parts), self.sizes[0])
-
-    def choose(self, point: Array) -> None:
-        """Find out at a point whether f takes vectors (n,) or columns (n, 1).
-
-        ValueError if it returns no n numbers for either, or what f itself raises for vectors.
-        """
-        self.columns = False
-        try:
-            self(point)
-        except CALLING as error:
-            self.columns = True
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # of a trial that may be no use
-                    self(point)
-            except CALLING:
-                self.columns = False
-                raise error from None
 
 
 def _vector(value: Any, size: int) -> Array:
@@ -106,7 +77,6 @@ def linearize_dynamics(
     size = _scale(given, x.size, scale)
     free = np.isnan(given)
     point, notes = _solve(rate, given, size, dt) if np.any(free) else (given, [])
-    rate.choose(point)
     size = _scale(point, x.size, scale)
     check_array(f"f({', '.join(f'{name}_ss' for name in labels)})", rate(point), (x.size,))
     _require_steady(rate, point, size, dt, scale is not None)
@@ -168,7 +138,6 @@ def _is_lost(rate: Rate, point: Array, size: Array, dt: float) -> bool:
     """Tell whether a mode that does not decay is out of reach of the inputs at a steady state."""
     steps = np.diag(1e-4 * size)
     try:
-        rate.choose(point)
         slopes = np.array([(rate(point + h) - rate(point - h)) / (2 * h.max()) for h in steps]).T
         A, B, E = _parts(slopes, rate.sizes)
         A, B, _ = zero_order_hold(A, B, E, dt)
@@ -197,8 +166,6 @@ def _solved_from(
         return np.asarray(np.nan_to_num(step, nan=1e3, posinf=1e3, neginf=-1e3))
 
     try:
-        with np.errstate(all="ignore"):
-            rate.choose(start)
         result = least_squares(moved, start[free] / scale[free], xtol=1e-14, ftol=1e-15, gtol=1e-15)
     except (ArithmeticError, ValueError):  # math functions raise where numpy's return NaN
         return start, np.inf

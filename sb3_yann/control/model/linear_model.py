@@ -197,8 +197,7 @@ class LinearModel(LinearSystem):
         Parameters
         ----------
         f : callable
-            Takes x (n,) and u (m,), with ``d_ss`` also d (d,); returns dx/dt (n,). Functions of
-            columns (n, 1) are called with such.
+            Takes x (n,) and u (m,), with ``d_ss`` also d (d,); returns dx/dt (n,).
         x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,)
             The operating point, a steady state of ``f``; d_ss is optional. Entries of x_ss and u_ss
             that are NaN are solved for; the notes name other solutions that were met.

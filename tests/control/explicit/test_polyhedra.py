@@ -27,24 +27,6 @@ def test_the_largest_ball_of_a_triangle_of_3_4_and_5() -> None:
     assert middle[0] == pytest.approx(0) and 0 < half <= 1.5
 
 
-@pytest.mark.parametrize("lengths", LENGTHS)
-@pytest.mark.parametrize(
-    ("direction", "corner"), [([1, 0], [4, 0]), ([0, 1], [0, 3]), ([-1, -1], [0, 0])]
-)
-def test_the_farthest_point_is_a_corner(lengths, direction, corner) -> None:
-    A, b = lengths[:, None] * TRIANGLE, lengths * ROOM
-    inside = np.array([0.5, 0.5])
-    assert farthest_point(A, b, np.array(direction, float), inside) == pytest.approx(corner)
-    both = farthest_points(A, b, np.array([0.5, 0.5]), np.array([direction, direction], float))
-    assert both == pytest.approx(np.array([corner, corner]))
-
-
-def test_rows_that_do_not_touch_are_no_facets() -> None:
-    A = np.vstack([TRIANGLE, [[1.0, 0.0]]])
-    for room, expected in ((5.0, [0, 1, 2]), (3.0, [0, 1, 2, 3])):
-        assert bounded_region(A, np.append(ROOM, room), 0.0)[2].tolist() == expected
-
-
 def polygon(seed: int, rows: int = 9) -> tuple[np.ndarray, np.ndarray]:
     """Return a bounded polyhedron of unit rows about a point near the origin."""
     rng = np.random.default_rng(seed)

@@ -29,7 +29,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 @pytest.mark.slow
-@examples(12)
+@examples(8)
 @given(problems(), SEEDS)
 def test_regions_cover_what_is_feasible_and_nothing_else(mpc: LinearMPC, seed: int) -> None:
     law, online = mpc.explicit(), mpc.online()
@@ -45,7 +45,7 @@ def test_regions_cover_what_is_feasible_and_nothing_else(mpc: LinearMPC, seed: i
             assert online.in_domain(theta) == (free > 0)
 
 
-@examples(15)
+@examples(8)
 @given(problems(), SEEDS)
 def test_no_two_regions_overlap(mpc: LinearMPC, seed: int) -> None:
     law, rng = mpc.explicit(), np.random.default_rng(seed)
@@ -60,7 +60,7 @@ def test_no_two_regions_overlap(mpc: LinearMPC, seed: int) -> None:
 
 
 @pytest.mark.slow
-@examples(15)
+@examples(8)
 @given(problems(), SEEDS, st.sampled_from([1e-9, 1e-6, 1e-3]))
 def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: float) -> None:
     law = mpc.explicit()
@@ -73,7 +73,7 @@ def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: fl
         assert np.all(change <= 2 * step * steepest(law) + 1e-9)
 
 
-@examples(15)
+@examples(8)
 @given(problems(), SEEDS)
 def test_online_law_is_the_explicit_law(mpc: LinearMPC, seed: int) -> None:
     law, online, points = mpc.explicit(), mpc.online(), in_box(mpc, 300, seed=seed)
@@ -83,7 +83,7 @@ def test_online_law_is_the_explicit_law(mpc: LinearMPC, seed: int) -> None:
 
 
 @pytest.mark.slow
-@examples(15)
+@examples(8)
 @given(problems(), SEEDS)
 def test_order_of_the_regions_changes_nothing(mpc: LinearMPC, seed: int) -> None:
     law, points = mpc.explicit(), mixture(mpc, seed)
@@ -99,7 +99,7 @@ def test_order_of_the_regions_changes_nothing(mpc: LinearMPC, seed: int) -> None
     assert np.all(as_range(law, law(points) - other(points))[inside] <= 1e-8)
 
 
-@examples(15)
+@examples(8)
 @given(problems(), SEEDS)
 def test_size_and_order_of_a_batch_change_no_bit(mpc: LinearMPC, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -115,7 +115,7 @@ def test_size_and_order_of_a_batch_change_no_bit(mpc: LinearMPC, seed: int) -> N
         np.testing.assert_array_equal(law.in_domain(points[order]), law.in_domain(points)[order])
 
 
-@examples(15)
+@examples(8)
 @given(problems(), st.data(), st.sampled_from([np.float32, np.float64]))
 def test_every_number_has_an_input_within_its_bounds(mpc: LinearMPC, data, dtype) -> None:
     width = 8 * np.dtype(dtype).itemsize

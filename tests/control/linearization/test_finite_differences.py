@@ -13,7 +13,6 @@ from sb3_yann.control.linearization.differences import (
     curvature,
     jacobian,
 )
-from sb3_yann.control.linearization.simulator import noise_of
 
 EPS = np.finfo(float).eps
 ONE = np.ones(1)
@@ -37,13 +36,6 @@ def test_derivatives_are_exact_beside_rounding_in_every_coordinate() -> None:
     np.testing.assert_array_equal(found.value == 0, np.array(expected) == 0)
     np.testing.assert_array_equal(found.steps, [0.1, 0.2, 0.3])
     assert found.doubt < 1e-10 and found.dropped < 1e-13
-
-
-def test_a_slope_below_its_rounding_is_zero_and_told() -> None:
-    found = of(lambda z: 1.0 + 1e-12 * z, noise=1e-10)
-    assert found.value[0, 0] == 0.0 and found.dropped == pytest.approx(1e-12, rel=0.01)
-    kept = of(lambda z: 1e-12 * z, noise=1e-30)
-    assert kept.value[0, 0] == pytest.approx(1e-12) and kept.dropped == 0.0
 
 
 @pytest.mark.parametrize(("k", "smooth"), [(0.0049, True), (0.0052, False), (-0.0052, False)])
@@ -92,14 +84,3 @@ def test_the_notes_tell_what_is_dropped_what_bends_and_what_has_no_effect() -> N
     )
     assert told([0.0, 0.0], [[0.0, 0.0]]) == ["x[0] has no effect on the next state."]
     assert "(at most 1.5e-09) were set to zero" in told([0.0, 0.0], plain, 1.5e-9)[0]
-
-
-def test_the_noise_of_a_function_is_its_standard_deviation() -> None:
-    rng = np.random.default_rng(0)
-    sizes = np.array([1e-6, 3e-8])
-    found = noise_of(
-        lambda z: np.array([np.sin(z[0]), z[0] ** 3]) + sizes * rng.standard_normal(2), ONE, ONE
-    )
-    assert np.all((found > 0.4 * sizes) & (found < 2.5 * sizes))
-    smooth = noise_of(lambda z: np.array([np.sin(z[0]), np.nan]), ONE, ONE)
-    np.testing.assert_array_equal(smooth, 0)  # where it has no value nothing is known

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.control.linearization.simulator import noise_of, to_vector
+from sb3_yann.control.linearization.simulator import noise_of
 from sb3_yann.wrappers import SeededGlobals, TruncateAtTimeLimit
 from sb3_yann_envs import cstr
 
@@ -223,27 +223,6 @@ def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
     with pytest.warns(UserWarning, match=r"after 30 steps whatever.*AtTimeLimit\(env, 30\)"):
         LinearModel.from_env(Careless(limit=30))
     LinearModel.from_env(TruncateAtTimeLimit(Careless(limit=30), 30))  # nothing warns
-
-
-@pytest.mark.parametrize("limits", [(30, 20), (20, 30)])
-def test_episodes_that_terminate_after_other_numbers_of_steps_are_not_named(limits) -> None:
-    class Fails(Careless):
-        def reset(self, *, seed=None, options=None):
-            self.limit = limits[(seed or 0) % 2]
-            return super().reset(seed=seed, options=options)
-
-    LinearModel.from_env(Fails())  # nothing warns
-
-
-@pytest.mark.parametrize(
-    ("value", "is_a_vector"),
-    [([1.0, 2.0], True), ([], False), ([[1.0, 2.0]], False), (3.0, False), ([np.nan], False),
-     ("12", False), ({"x": 1}, False), (None, False), ([object()], False)],
-)  # fmt: skip
-def test_a_state_is_a_vector_of_finite_numbers(value, is_a_vector) -> None:
-    found = to_vector(value)
-    assert (found is not None) == is_a_vector
-    assert found is None or found.tolist() == value
 
 
 class Cone(gym.Env):

@@ -83,13 +83,3 @@ def test_a_rate_must_let_the_input_rest() -> None:
     for low, high in ((0.1, 1), (-1, -0.1)):
         with pytest.raises(ValueError, match=r"make u\[0\] change in every sample"):
             RateLimits(low, high)
-
-
-@pytest.mark.parametrize("value", [0, -1, 2.0, True, "3", None])
-def test_a_horizon_is_a_whole_number_of_at_least_one(value: Any) -> None:
-    with pytest.raises((TypeError, ValueError), match="horizon"):
-        LinearMPC(PLANT, **(WEIGHTS | {"horizon": value}), theta_min=-5, theta_max=5)
-    assert (
-        LinearMPC(PLANT, **(WEIGHTS | {"horizon": np.int64(1)}), theta_min=-5, theta_max=5).horizon
-        == 1
-    )

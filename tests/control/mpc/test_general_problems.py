@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from general_problems import PROBLEMS, RATED, THERMAL, TWO_TANKS, servo, solved
+from general_problems import PROBLEMS, THERMAL, TWO_TANKS, servo, solved
 from online_mpc import OnlineMPC
 from random_problems import examples, problems
 from reference_answers import online_answers, relative_error
@@ -40,7 +40,7 @@ def test_law_and_domain_are_those_of_an_online_qp(name: str) -> None:
     assert relative_error(mpc, mpc.explicit()(points[feasible]), inputs) <= 1e-9
 
 
-@examples(25)
+@examples(12)
 @given(problems())
 def test_law_and_domain_of_random_problems_are_those_of_an_online_qp(mpc: LinearMPC) -> None:
     law, points = mpc.explicit(), box_points(mpc, 200)
@@ -293,47 +293,12 @@ BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
         "SoftBounds.penalty is missing, and nothing tells",
     ),
     (
-        lambda: servo(soft=SoftBounds(penalty=1)),
-        ValueError,
-        "SoftBounds.penalty = 1.0, but nothing is soft",
-    ),
-    (
         lambda: SoftBounds(1, penalty=-1),
         ValueError,
         "SoftBounds.penalty = -1 must be a finite number",
     ),
     (lambda: Terminal(set="invariants"), TypeError, "a pair .* or 'invariant', got 'invariants'"),
     (lambda: Tracking(0), ValueError, r"Tracking.C = 0 must be a list of indices of states: \[0\]"),
-    (
-        lambda: {"soft": SoftBounds(1, penalty=1), "x_min": None, "x_max": None},
-        ValueError,
-        "SoftBounds.x = 1.0, but there is no bound to soften: pass x_min",
-    ),
-    (
-        lambda: {"soft": SoftBounds(y=[1], penalty=1), "outputs": OutputBounds([0])},
-        ValueError,
-        "SoftBounds.y = .* no bound to soft",
-    ),
-    (
-        lambda: {
-            "soft": SoftBounds([1, 1], penalty=1),
-            "x_max": [5, np.inf],
-            "x_min": [-5, -np.inf],
-        },
-        ValueError,
-        r"SoftBounds.x = \[1.0, 1.0\] softens entry 1, which has no bound",
-    ),
-    (lambda: RateLimits(0.1, 0.5), ValueError, r"du_min = 0.1 .* make u\[0\] change in every"),
-    (
-        lambda: {"theta_min": [-5, -5, -0.5]},
-        ValueError,
-        r"theta_min has -0.5 for r\[0\], but r_min is -1",
-    ),
-    (
-        lambda: {"theta_max": [5, 5, 1, 1], **RATED},
-        ValueError,
-        r"1 for u_prev\[0\], but u_max is 2",
-    ),
 ]
 
 

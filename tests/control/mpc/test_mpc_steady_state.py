@@ -45,12 +45,12 @@ def test_a_hundred_reachable_references_are_reached_without_offset(name: str) ->
 @pytest.mark.slow
 @pytest.mark.parametrize("measured", [None, [0]], ids=["all states", "the tracked output"])
 @pytest.mark.parametrize("name", ["servo with a disturbance", "servo with all of it"])
-def test_a_hundred_references_are_reached_under_a_disturbance_nobody_measures(
+def test_references_are_reached_under_a_disturbance_nobody_measures(
     name: str, measured: list[int] | None
 ) -> None:
     mpc = solved(name)
     observer, law, parts = DisturbanceObserver(mpc.model, measured), mpc.explicit(), mpc.layout
-    r, d = reachable_constants(mpc, 100)
+    r, d = reachable_constants(mpc, 25)
     worst = 0.0
     for reference, disturbance in zip(r, d, strict=True):
         x, u = np.zeros(2), np.zeros(1)
@@ -159,15 +159,3 @@ def test_a_reference_of_another_shape_is_named() -> None:
 def test_a_regulator_rests_at_the_origin() -> None:
     x, u = servo(tracking=None).steady_state()
     assert (x.tolist(), u.tolist()) == ([0, 0], [0])
-
-
-def test_of_all_inputs_that_hold_a_reference_the_cheapest_is_taken() -> None:
-    B, R = np.array([[1.0, 2.0, -1.0]]), np.diag([1.0, 10.0, 0.1])
-    mpc = LinearMPC(
-        LinearModel([[0.5]], B, 1.0), Q=[[1]], R=R, horizon=2, u_min=-9, u_max=9,
-        theta_min=-5, theta_max=5, tracking=Tracking([0], -1, 1),
-    )  # fmt: skip
-    price = np.linalg.solve(R, B.T)
-    cheapest = price @ np.linalg.solve(B @ price, [0.5])
-    x, u = mpc.steady_state([1.0])
-    assert x == pytest.approx([1]) and u == pytest.approx(cheapest)
