@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, to_float
 
 LEVELS, RATIO = 6, 4.0
 """Number of steps that approach a point, and how much shorter each is than the one before."""
@@ -148,6 +149,17 @@ def differences(
         f"steps up to {steps[i]:.3g}. Clipping, dry friction, angles that wrap and too long steps "
         "do this: pass scale=..., move the operating point, or use LinearModel.from_data."
     )
+
+
+def partly_known(name: str, value: ArrayLike) -> Array:
+    """Return a vector in which NaN stands for what is to be solved for."""
+    array = to_float(name, value)
+    if array.ndim != 1 or not array.size or np.any(np.isinf(array)):
+        raise ValueError(
+            f"{name} has shape {array.shape} and the entries {array.tolist()}; expected a vector "
+            "of finite numbers, or NaN where the steady state is to be solved for; one at least."
+        )
+    return array
 
 
 def idle_inputs(B: Array, stacklevel: int) -> list[str]:

@@ -11,7 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, check_array, check_positive, check_positive_vector, to_float
 from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
-from sb3_yann.control.linearization.differences import curvature, differences, idle_inputs
+from sb3_yann.control.linearization.differences import (
+    curvature,
+    differences,
+    idle_inputs,
+    partly_known,
+)
 from sb3_yann.control.lqr import unreached
 
 
@@ -66,7 +71,7 @@ def linearize_dynamics(
     scale: ArrayLike | None = None,
 ) -> LinearSystem:
     """Return the sampled linearization of `LinearModel.from_dynamics`, which documents the rest."""
-    x, u = _partly_known("x_ss", x_ss), _partly_known("u_ss", u_ss)
+    x, u = partly_known("x_ss", x_ss), partly_known("u_ss", u_ss)
     d = check_array("d_ss", [] if d_ss is None else d_ss, ("d",))
     dt = check_positive("dt", dt)
     labels = ["x", "u"] if d_ss is None else ["x", "u", "d"]
@@ -87,17 +92,6 @@ def linearize_dynamics(
     x, u, d = np.split(point, np.cumsum(sizes[:2]))
     notes += [*idle_inputs(B, 4), *curvature(found, names(sizes))]
     return LinearSystem(A, B, dt, x, u, E, d, tuple(notes))
-
-
-def _partly_known(name: str, value: ArrayLike) -> Array:
-    """Return a vector in which NaN stands for what is to be solved for."""
-    array = to_float(name, value)
-    if array.ndim != 1 or not array.size or np.any(np.isinf(array)):
-        raise ValueError(
-            f"{name} has shape {array.shape} and the entries {array.tolist()}; expected a vector "
-            "of finite numbers, or NaN where the steady state is to be solved for; one at least."
-        )
-    return array
 
 
 def _solve(rate: Rate, given: Array, scale: Array, dt: float) -> tuple[Array, list[str]]:

@@ -12,9 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, to_float
+from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import LinearSystem, names
-from sb3_yann.control.linearization.differences import Jacobian, curvature, differences, idle_inputs
+from sb3_yann.control.linearization.differences import (
+    Jacobian,
+    curvature,
+    differences,
+    idle_inputs,
+    partly_known,
+)
 from sb3_yann.control.linearization.simulator import (
     MOST,
     Simulator,
@@ -164,53 +170,36 @@ LONGEST_EPISODE = 400  # steps after which an episode counts as one without an e
 SECONDS = 1.0  # after which a slow one does
 
 
-def episode_faults(env: Any, action: Array) -> list[str]:
-    """Return what is wrong with the episodes of an env, each with the wrapper that cures it.
+def time_limit_fault(env: Any, action: Array) -> str:
+    """Return that every episode terminates after the same number of steps, empty if it does not.
 
-    The env is reset and stepped with an action (m,); pass a copy. What it raises meanwhile ends the
-    search.
+    The env is reset and stepped with an action (m,) and another one; pass a copy. What it raises
+    meanwhile ends the search.
 
     Examples
     --------
     >>> import gymnasium
-    >>> episode_faults(gymnasium.make("CSTR-v0"), np.zeros(1))
-    []
+    >>> time_limit_fault(gymnasium.make("CSTR-v0"), np.zeros(1))
+    ''
     """
-    try:
-        return [*_unseeded(env), *_ends_at_its_limit(env, action)]
-    except Exception:  # whatever a simulator raises away from its operating point
-        return []
-
-
-def _unseeded(env: Any) -> list[str]:
-    """Return that one seed leads to two starts."""
-    first, second = (np.array(env.reset(seed=0)[0]) for _ in range(2))
-    if first.shape == second.shape and np.array_equal(first, second, equal_nan=True):
-        return []
-    return [
-        f"reset(seed=0) starts at {first.tolist()} and then at {second.tolist()}: the environment "
-        "ignores its seed, and no two policies can be compared from the same starts. If it draws "
-        "from numpy's global generator, wrap it in sb3_yann.wrappers.SeededGlobals."
-    ]
-
-
-def _ends_at_its_limit(env: Any, action: Array) -> list[str]:
-    """Return that every episode terminates after the same number of steps, whatever happens."""
     low, high = env.action_space.low, env.action_space.high
     other = np.clip(action + 0.25 * np.minimum(high - low, 4.0), low, high)
     ends = []
     for seed, u in enumerate((action, other)):
-        ends.append(_termination(env, seed, u.astype(env.action_space.dtype)))
+        try:
+            ends.append(_termination(env, seed, u.astype(env.action_space.dtype)))
+        except Exception:  # whatever a simulator raises away from its operating point
+            return ""
         if ends[0] is None or ends[0] < 2:
-            return []
+            return ""
     if ends[0] != ends[1]:
-        return []
-    return [
+        return ""
+    return (
         f"Episodes terminate after {ends[0]} steps whatever happens: that is a time limit, but "
         "terminated=True tells the learner that nothing costs anything afterwards. Return "
         "truncated=True there, or wrap the environment in "
         f"sb3_yann.wrappers.TruncateAtTimeLimit(env, {ends[0]})."
-    ]
+    )
 
 
 def _termination(env: Any, seed: int, action: Array) -> int | None:
@@ -245,12 +234,14 @@ def linearize_env(
     with contextlib.closing(borrow(env)) as borrowed:
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
-        x, u = _partly_known("x_ss", x_ss), _partly_known("u_ss", u_ss)
+        x = None if x_ss is None else partly_known("x_ss", x_ss)
+        u = None if u_ss is None else partly_known("u_ss", u_ss)
         found = _linearize(simulator, x, u, step_time, scale)
-        faults = episode_faults(borrowed.env, found.u_ss) if borrowed.private else []
-        for fault in faults:
-            warnings.warn(fault, stacklevel=3)
-        return replace(found, notes=(*found.notes, *faults))
+        fault = time_limit_fault(borrowed.env, found.u_ss) if borrowed.private else ""
+        if not fault:
+            return found
+        warnings.warn(fault, stacklevel=3)
+        return replace(found, notes=(*found.notes, fault))
 
 
 def _linearize(
@@ -293,16 +284,6 @@ def _actions(space: Any) -> tuple[Array, Array]:
     bounded = (low > -1e6) & (high < 1e6)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     return (low + high) / 2, (high - low) / 2
-
-
-def _partly_known(name: str, value: ArrayLike | None) -> Array | None:
-    """Return ``value`` as an array of shape (n,) in which NaN stands for unknown entries."""
-    if value is None:
-        return None
-    array = to_float(name, value)
-    if array.ndim != 1 or np.any(np.isinf(array)):
-        raise ValueError(f"{name} = {value!r} must be a vector of finite numbers, or NaN to solve.")
-    return array
 
 
 def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Jacobian, float]:

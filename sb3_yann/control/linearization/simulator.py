@@ -7,23 +7,19 @@ import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise, product
+from math import factorial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, check_positive, to_float
+from sb3_yann._validation import Array, check_positive, check_positive_vector, to_float
 
 if TYPE_CHECKING:
     import gymnasium
 
     Maker = gymnasium.Env[Any, Any] | str | Callable[[], gymnasium.Env[Any, Any]]
-from collections.abc import Callable
-from itertools import pairwise, product
-from math import factorial
-
-from sb3_yann._validation import check_positive_vector
-
 Reader = Callable[[Any, Any, dict[str, Any]], Any]  # of an environment, observation and info
 
 RESET = 'reset(options={"state": x})'

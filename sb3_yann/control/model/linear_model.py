@@ -238,7 +238,7 @@ class LinearModel(LinearSystem):
 
         An environment is deep-copied. One that cannot be copied is used itself and needs a reset
         afterwards; the notes then say so. Noise of an adaptive integrator lengthens the steps. An
-        env that ignores seeds, or terminates at a time limit, is warned of.
+        env that terminates at a time limit is warned of.
 
         Parameters
         ----------

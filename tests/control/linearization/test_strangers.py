@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control.linearization.simulator import noise_of
-from sb3_yann.wrappers import SeededGlobals, TruncateAtTimeLimit
+from sb3_yann.wrappers import TruncateAtTimeLimit
 from sb3_yann_envs import cstr
 
 
@@ -193,30 +193,20 @@ def test_a_plant_without_a_value_there_turns_the_search_for_a_steady_state_back(
 
 
 class Careless(Forgets):
-    """Draws its start from the global generator, and calls its time limit a termination."""
+    """Calls its time limit a termination."""
 
-    def __init__(self, globals_: bool = False, limit: int = 10**6) -> None:
+    def __init__(self, limit: int) -> None:
         super().__init__(0.5)
-        self.globals_, self.limit = globals_, limit
+        self.limit = limit
 
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
         self.steps = 0
-        if self.globals_:
-            self.state = np.random.normal(size=1)  # noqa: NPY002 (the fault that is tested)
-        return self.state.copy(), {}
+        return super().reset(seed=seed)
 
     def step(self, action):
         observation, *_ = super().step(action)
         self.steps += 1
         return observation, 0.0, self.steps >= self.limit, False, {}
-
-
-def test_an_environment_that_ignores_its_seed_is_named_and_cured() -> None:
-    with pytest.warns(UserWarning, match=r"ignores its seed.*wrappers\.SeededGlobals"):
-        model = LinearModel.from_env(Careless(globals_=True))
-    assert "ignores its seed" in model.notes[-1]
-    LinearModel.from_env(SeededGlobals(Careless(globals_=True)))  # nothing warns
 
 
 def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
