@@ -24,14 +24,6 @@ class ExplicitLimitError(RuntimeError):
     ----------
     n_regions : int
         How many regions were found until then, where the solver tells.
-
-    Examples
-    --------
-    >>> try:
-    ...     raise ExplicitLimitError("The law has too many regions.", 100)
-    ... except ExplicitLimitError as error:
-    ...     error.n_regions
-    100
     """
 
     def __init__(self, message: str, n_regions: int) -> None:

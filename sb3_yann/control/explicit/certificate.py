@@ -34,13 +34,7 @@ IMPLIED_TOL = 1e-9
 
 
 class ExplicitSolutionError(RuntimeError):
-    """An explicit solution failed its check: it does not solve the program it came from.
-
-    Examples
-    --------
-    >>> issubclass(ExplicitSolutionError, RuntimeError)
-    True
-    """
+    """An explicit solution failed its check: it does not solve the program it came from."""
 
 
 class Certificate:

@@ -175,12 +175,6 @@ def time_limit_fault(env: Any, action: Array) -> str:
 
     The env is reset and stepped with an action (m,) and another one; pass a copy. What it raises
     meanwhile ends the search.
-
-    Examples
-    --------
-    >>> import gymnasium
-    >>> time_limit_fault(gymnasium.make("CSTR-v0"), np.zeros(1))
-    ''
     """
     low, high = env.action_space.low, env.action_space.high
     other = np.clip(action + 0.25 * np.minimum(high - low, 4.0), low, high)

@@ -43,11 +43,6 @@ def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
     """Return the unit of each state and input, "" where there is none.
 
     Labels are the names of both, ``x[0]`` where there are no others.
-
-    Examples
-    --------
-    >>> as_units({"T": "K"}, ["T", "u[0]"])
-    ('K', '')
     """
     if isinstance(given, Mapping):
         if unknown := [each for each in given if each not in labels]:
@@ -71,14 +66,7 @@ def as_unit(what: str, given: str) -> str:
 
 
 def labels_of(model: LinearSystem) -> tuple[list[str], list[str]]:
-    """Return the names of the states and of the inputs, ``x[0]`` and ``u[0]`` where none is given.
-
-    Examples
-    --------
-    >>> from sb3_yann.control import LinearModel
-    >>> labels_of(LinearModel([[1]], [[1]], dt=1, state_names=["level"]))
-    (['level'], ['u[0]'])
-    """
+    """Return the names of states and of inputs, ``x[0]`` and ``u[0]`` where none is given."""
     plain = names((model.n_states, model.n_inputs))
     n = model.n_states
     return list(model.state_names) or plain[:n], list(model.input_names) or plain[n:]
@@ -96,28 +84,13 @@ def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
 
 
 def name_of(model: LinearSystem, kind: str, index: int) -> str:
-    """Return the name of a "state" or "input" by its number, else ``state 0`` or ``input 0``.
-
-    Examples
-    --------
-    >>> from sb3_yann.control import LinearModel
-    >>> model = LinearModel([[1]], [[1]], dt=1, state_names=["level"])
-    >>> name_of(model, "state", 0), name_of(model, "input", 0)
-    ('level', 'input 0')
-    """
+    """Return the name of a "state" or "input" by its number, else ``state 0`` or ``input 0``."""
     given = model.state_names if kind == "state" else model.input_names
     return given[index] if given else f"{kind} {index}"
 
 
 def missing_observer(model: LinearSystem) -> str:
-    """Return what a law or a policy of this model lacks; empty where nothing is estimated.
-
-    Examples
-    --------
-    >>> from sb3_yann.control import LinearModel
-    >>> missing_observer(LinearModel([[1]], [[1]], dt=1, E=[[1]], estimated=[0])).partition(":")[0]
-    'd[0] is estimated'
-    """
+    """Return what a law or a policy of this model lacks; empty where nothing is estimated."""
     if not model.estimated:
         return ""
     which = [f"d[{i}]" for i in model.estimated]
@@ -129,14 +102,7 @@ def missing_observer(model: LinearSystem) -> str:
 
 
 def past_inputs(model: LinearSystem) -> list[tuple[int, str]]:
-    """Return the number of the input, and the lag as in ``(k-1)``, of each last state named so.
-
-    Examples
-    --------
-    >>> from sb3_yann.control import LinearModel
-    >>> past_inputs(LinearModel([[1, 1], [0, 0]], [[0], [1]], 1, state_names=["T", "u[0](k-1)"]))
-    [(0, '(k-1)')]
-    """
+    """Return the number of the input, and the lag as in ``(k-1)``, of each last state named so."""
     inputs, found = labels_of(model)[1], list[tuple[int, str]]()
     for label in reversed(model.state_names):
         name, lag, rest = label.partition("(k-")
