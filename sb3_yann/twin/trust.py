@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.identification.frozen import frozen_rows, words_for
-from sb3_yann.control.model.labels import labels_of, name_of
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.alignment import objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
 from sb3_yann.twin.log import Episode, records
@@ -174,7 +174,7 @@ def spikes(problem: LinearMPC, episodes: tuple[Episode, ...], left: list[Array])
     row = int(np.argmax(np.abs(left[episode][:, state]))) + 1
     reading = episodes[int(episode)].thetas[row, problem.layout.state]
     read = problem.units.to_plant(reading)[state]
-    name = name_of(problem.model, "state", int(state))
+    name = labels_of(problem.model)[0][int(state)]
     return [f"Look at where {name} is about {read:.6g}: no other step has moved it so far."]
 
 

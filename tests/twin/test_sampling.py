@@ -186,5 +186,5 @@ def test_a_spike_is_named_where_a_log_is_not_trusted() -> None:
     episodes = log(4)
     episodes[2][0][17, 1] += 50.0
     found = PlantTwin.fit(problem(), episodes)
-    said = f"Look at where state 1 is about {episodes[2][0][17, 1]:.6g}:"
+    said = f"Look at where x[1] is about {episodes[2][0][17, 1]:.6g}:"
     assert not found.trusted and said in found.report()

@@ -211,7 +211,7 @@ def test_a_reading_a_thousand_times_as_far_off_as_most_is_named_with_its_value()
         left[2][11, 1] = -size
         said = trusts.spikes(mpc, logs, left)
         value = logs[2].thetas[12, 1] + 20.0
-        assert said == ([f"Look at where state 1 is about {value:.6g}: no other step has moved it "
+        assert said == ([f"Look at where x[1] is about {value:.6g}: no other step has moved it "
                          "so far."] if named else [])  # fmt: skip
     # Where all else fits to the last bit, rounding is what it is compared with.
     quiet = [np.zeros((30, 2)) for _ in logs]

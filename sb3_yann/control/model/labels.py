@@ -83,12 +83,6 @@ def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
     return whole[: len(states)], whole[len(states) :]
 
 
-def name_of(model: LinearSystem, kind: str, index: int) -> str:
-    """Return the name of a "state" or "input" by its number, else ``state 0`` or ``input 0``."""
-    given = model.state_names if kind == "state" else model.input_names
-    return given[index] if given else f"{kind} {index}"
-
-
 def missing_observer(model: LinearSystem) -> str:
     """Return what a law or a policy of this model lacks; empty where nothing is estimated."""
     if not model.estimated:
