@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_array
-from sb3_yann.control.model.labels import name_of
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.log import pieces
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -328,7 +328,7 @@ class Watchdog:
             return None
         at_once = ratios[:1] if ratios[0].max() > 1.0 else ratios
         gain, i = np.unravel_index(int(np.argmax(at_once)), at_once.shape)
-        name = name_of(self.dynamics.problem.model, "state", int(i))
+        name = labels_of(self.dynamics.problem.model)[0][int(i)]
         said = f"{name} is off the twin's prediction by {episode.charts.means[gain, i]:.3g}"
         if GAINS[gain] < 1.0:
             said += f" on an average of {1 / GAINS[gain]:.0f} samples"

@@ -121,7 +121,7 @@ def test_a_leap_is_outside_the_band_at_once() -> None:
     theta, u, after = drive(2)[0]
     found = barks(watchdog(), [(theta, u, after + np.array([0.2, 0.0]))])
     assert found == (0, watchdog().alarm) and found[1].kind == "outside the band"
-    assert "state 0" in found[1].message
+    assert "x[0]" in found[1].message
 
 
 def test_the_first_alarm_of_an_episode_stays_until_the_next_begins() -> None:
