@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, lqr
-from sb3_yann.control.mpc.bound_excess import Bounds
+from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond, mixed_half
 from sb3_yann.control.mpc.value import Value
 from sb3_yann.rollout import Rows
 from sb3_yann.twin.dynamics import Dynamics, law_of
@@ -171,6 +171,7 @@ class Task:
             stage = self.problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0)
             end = np.sum((thetas[-1] @ self.end + self.end_slope) * thetas[-1], axis=-1)
             outside = np.sum(self._bounds.beyond(thetas[1:], -INSIDE) ** 2, axis=(0, 2))
+            outside += np.sum(self._mixed_beyond(thetas[:-1], inputs) ** 2, axis=(0, 2))
             total = stage + end + self.weight * outside
             if self.doubt is not None:
                 total = total + self.doubt.costs(thetas[:-1], inputs).sum(axis=0)
@@ -184,11 +185,27 @@ class Task:
 
     def penalty(self, thetas: Array) -> tuple[Array, Array]:
         """Return gradient (..., n) and curvature (..., n, n) of what is beyond bounds."""
-        over, weight = self._bounds.beyond(thetas, -INSIDE), 2 * self.weight
         scaled = self._bounds.C / self._bounds.half[:, None]
-        active = (over != 0).astype(float)
-        curvature = np.einsum("ki,...k,kj->...ij", scaled, active, scaled)
-        return weight * over @ scaled, weight * curvature
+        return self._squares(self._bounds.beyond(thetas, -INSIDE), scaled)
+
+    def mixed_penalty(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
+        """Return the same by theta and u (..., n_theta + m) of what is beyond MixedBounds."""
+        problem = self.problem
+        rows = np.zeros((len(problem.mixed.F), problem.n_theta + problem.model.n_inputs))
+        rows[:, problem.layout.state] = problem.mixed.F
+        rows[:, problem.n_theta :] = problem.mixed.G
+        return self._squares(
+            self._mixed_beyond(thetas, inputs), rows / mixed_half(problem)[:, None]
+        )
+
+    def _mixed_beyond(self, thetas: Array, inputs: Array) -> Array:
+        return mixed_beyond(self.problem.deviations, thetas, inputs, -INSIDE)
+
+    def _squares(self, over: Array, rows: Array) -> tuple[Array, Array]:
+        """Return gradient and curvature of the price of what is over (..., k), of rows (k, n)."""
+        weight, active = 2 * self.weight, (over != 0).astype(float)
+        curvature = np.einsum("ki,...k,kj->...ij", rows, active, rows)
+        return weight * over @ rows, weight * curvature
 
 
 def roll_out(
@@ -320,18 +337,18 @@ def _backward(
     W = 2 * problem.stage_matrix
     slopes = np.concatenate([thetas[:-1], inputs], axis=-1) @ W + problem.stage_slope
     curved = np.broadcast_to(W, (len(inputs), len(rows), *W.shape))
-    if task.doubt is not None:
-        slope, more = task.doubt.slopes(thetas[:-1], inputs)
+    prices = [task.mixed_penalty] if len(problem.mixed.F) else []
+    prices += [task.doubt.slopes] if task.doubt is not None else []
+    for price in prices:
+        slope, more = price(thetas[:-1], inputs)
         slopes = slopes + slope
         curved = curved + more
     gradient, curvature = task.penalty(thetas[1:])
     limits = task.limits(thetas[:-1])
     low, high = (each - inputs for each in limits)
     # A bound of the rate moves with the previous input.
-    moving = np.stack(
-        [limits[0] > problem.deviations.u_min, limits[1] < problem.deviations.u_max], axis=1
-    )
-    moving &= problem.has_rate_bounds
+    still = problem.deviations.limits_at("u", thetas[:-1])
+    moving = np.stack([a != b for a, b in zip(limits, still, strict=True)], axis=1)
     v, V = 2 * thetas[-1] @ task.end + task.end_slope, np.tile(2 * task.end, (len(rows), 1, 1))
     corrections, gains = np.empty_like(inputs), np.empty_like(plans.gains)
     damped = damping[:, None, None] * W[size:, size:]

@@ -7,7 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sb3_yann import LinearCost, LinearModel, LinearMPC, RateLimits, Terminal, Tracking
+from sb3_yann import (
+    LinearCost,
+    LinearModel,
+    LinearMPC,
+    MixedBounds,
+    RateLimits,
+    Terminal,
+    Tracking,
+)
 from sb3_yann.plan import WEIGHT, Task, planned, value_at_end
 
 STEPS = 30
@@ -32,11 +40,12 @@ def cart(**changes) -> LinearMPC:
     return LinearMPC(model, Q=np.diag([1, 0.01]), **{**weights, **bounds, **changes})
 
 
-def plan(mpc: LinearMPC, starts: np.ndarray):
-    mpc.explicit()  # some take more effort than "auto" spends
+def plan(mpc: LinearMPC, starts: np.ndarray, unit: float = 1.0):
+    if not len(mpc.mixed.F):
+        mpc.explicit()  # some take more effort than "auto" spends
     free = np.full(mpc.model.n_states, np.inf)
     end = value_at_end(mpc)
-    task = Task(mpc, -free, free, end.P, WEIGHT, end_slope=end.slope)
+    task = Task(mpc, -free, free, end.P, WEIGHT * unit, end_slope=end.slope)
     rows = np.arange(len(starts))
     return planned(
         Exact(mpc), task, [lambda _, x: np.zeros((len(x), len(mpc.R)))], starts, STEPS, rows
@@ -79,6 +88,23 @@ def test_two_inputs_of_which_one_is_on_its_bound() -> None:
     for start, reached in zip(starts, cost, strict=True):
         thetas, inputs = simulated(mpc, start)
         assert reached == pytest.approx(mpc.stage_cost(thetas[:-1], inputs).sum(), rel=1e-3)
+
+
+@pytest.mark.parametrize("rows", [{"G": [[1, 1]]}, {"F": [[0, -0.5]], "G": [[1, 1]]}])
+def test_bounds_of_combinations_are_kept_at_no_more_than_the_cost_of_a_long_horizon(rows) -> None:
+    model = LinearModel([[1.0, 0.1], [0.0, 0.9]], [[0.2, 0.1], [0.1, 0.3]], 1.0)
+    box = {"u_min": -1, "u_max": 1, "theta_min": -5, "theta_max": 5}
+    mixed = MixedBounds(**rows, low=-0.7, high=0.7)
+    mpc = LinearMPC(model, Q=np.eye(2), R=0.1 * np.eye(2), horizon=20, mixed=mixed, **box)
+    mpc.law("online")
+    starts = np.array([[3.0, -2.0], [-4.0, 1.0]])
+    found = plan(mpc, starts, unit=float(mpc.stage_cost(starts, np.zeros((2, 2))).mean()))
+    made = found.thetas[:-1] @ mixed.sized(2, 2).F.T + found.inputs @ mixed.G.T
+    assert 0.69 < np.abs(made).max() <= 0.7
+    cost = mpc.stage_cost(found.thetas[:-1], found.inputs).sum(axis=0)
+    for start, reached in zip(starts, cost, strict=True):
+        thetas, inputs = simulated(mpc, start)
+        assert reached <= 1.005 * mpc.stage_cost(thetas[:-1], inputs).sum()
 
 
 def test_a_price_is_planned_with() -> None:

@@ -100,6 +100,18 @@ def mixed_half(problem: MPCProblem) -> Array:
     return np.asarray(np.abs(mixed.F) @ size + np.abs(mixed.G) @ problem.u_half)
 
 
+def mixed_beyond(problem: MPCProblem, thetas: Array, inputs: Array, room: float = 0.0) -> Array:
+    """Return by how much MixedBounds that are moved out by some room are exceeded (..., k).
+
+    As `Bounds.beyond`, at thetas (..., n_theta) and inputs (..., m) of the same samples.
+    """
+    mixed, half = problem.mixed, mixed_half(problem)
+    low, high = problem.limits_at("mixed", thetas)
+    made = thetas[..., problem.layout.state] @ mixed.F.T + inputs @ mixed.G.T
+    above = np.maximum((made - high) / half - room, 0)
+    return np.asarray(above - np.maximum((low - made) / half - room, 0))
+
+
 class BoundNames(NamedTuple):
     """What the bounds of a problem are called: of `Bounds`, of inputs, of rates, and mixed ones.
 
@@ -212,13 +224,10 @@ def bound_excess(
         if problem.layout.n_previous:
             moved = inputs - thetas[:-1][..., problem.layout.previous]
             groups.append(("du", moved, problem.u_half))
-        if len(problem.mixed.F):
-            x = thetas[:-1][..., problem.layout.state]
-            made = x @ problem.mixed.F.T + inputs @ problem.mixed.G.T
-            groups.append(("mixed", made, mixed_half(problem)))
         for kind, values, half in groups:
             low, high = problem.limits_at(kind, thetas[:-1])
             parts.append(np.maximum(values - high, low - values) / half)
+        parts.append(np.abs(mixed_beyond(problem, thetas[:-1], inputs)))
         over = np.concatenate(parts, axis=-1)
     counts = ~(over <= ROUNDING) & np.asarray(taken)[..., None]
     nothing = np.zeros(thetas.shape[1:-1])
