@@ -190,13 +190,14 @@ class MPCProblem(ReadOnlyArrays):
         A bound that changes at run time is reached as fast as the rate allows, and the rate ends at
         the fixed bounds.
         """
-        low, high = self.limits_at("u", thetas)
+        fixed = self.u_min, self.u_max
+        low, high = (np.clip(side, *fixed) for side in self.limits_at("u", thetas))
         high = np.maximum(low, high)
         if not self.has_rate_bounds:
             return low, high
         before = thetas[..., self.layout.previous]
         sides = self.limits_at("du", thetas)
-        slowest = [np.clip(before + side, self.u_min, self.u_max) for side in sides]
+        slowest = [np.clip(before + side, *fixed) for side in sides]
         return np.clip(low, *slowest), np.clip(high, *slowest)
 
     @property
