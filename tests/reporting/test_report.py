@@ -36,6 +36,7 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement.improving import Improvement
 from sb3_yann.improvement.trial import Check
 from sb3_yann.reporting import assemble, evidence_parts, loop_parts, problem_parts
+from sb3_yann.wrappers import PlantEnv
 from sb3_yann_envs import problems
 from weights import last_layer, unpin
 
@@ -233,6 +234,29 @@ def test_violations_of_the_policy_alone_fail(tmp_path) -> None:
     assert re.search(r"\d+ of 8 episodes violate a limit", worse)
     alike = Outline(report(model, tmp_path / "b.html", env=env, seeds=SEEDS)).text
     assert "passed Episodes in which the policy violates more than the MPC" in alike
+
+
+def test_inputs_beyond_a_bound_at_run_time_fail() -> None:
+    tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
+    mpc = LinearMPC(
+        tank, Q=[[1]], R=[[1]], horizon=3, x_min=0, x_max=20, u_min=0, u_max=10,
+        parametric_bounds=["u_max"],
+    )  # fmt: skip
+    env = PlantEnv(lambda x, u: 0.1 * (15 - x) + 0.5 * (u - 3) - 0.3, mpc, max_episode_steps=20)
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": mpc, "keep_bounds": False})
+    layer = model.actor.mu
+    text = "Inputs leave their bounds at random points of the box of parameters."
+    for keeps in (True, False):
+        subject = subject_of(model, env=env)
+        part = loop_parts.distance_part(subject)
+        register = problem_parts.constraints_part(subject)
+        assert (text in [each.text for each in part.findings]) is not keeps
+        beyond = re.findall(r"<td[^>]*>(\d+)</td>", str(register.content).split("</tr>")[1])
+        assert (beyond[-1] == "0") is keeps  # of the input, in closed loops
+        layer.moving, layer.rated = None, False  # a layer without them, and with another law
+        layer.constants = (layer.constants[0], np.empty((0, 1)), *layer.constants[2:])
+        with th.no_grad():
+            last_layer(model)[..., -1] = 0.5
 
 
 def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
