@@ -77,21 +77,6 @@ def test_what_is_stored_is_what_the_simulator_did() -> None:
     assert at == buffer.size() - 1 and 0 < sum(buffer.timeouts[:at, 0]) < 8
 
 
-@pytest.mark.parametrize("source", [Slide, "Slide-v0", Slide()], ids=["function", "id", "env"])
-def test_it_is_the_same_whatever_makes_the_simulator_and_draws_no_other_numbers(source) -> None:
-    model, other = build(learning_rate=0.0), build(learning_rate=0.0)
-    learnt(model, STEPS + 1, SimulatedEpisodes(source, **FEW))
-    learnt(other, STEPS + 1, SimulatedEpisodes(Slide, **FEW))
-    for name in ("observations", "actions", "rewards"):
-        ours, theirs = (getattr(each.replay_buffer, name) for each in (model, other))
-        np.testing.assert_array_equal(ours[rows(model)], theirs[rows(model)])
-    plain = learnt(build(learning_rate=0.0), STEPS + 1)
-    own = ~model.replay_buffer.simulated[: model.replay_buffer.size(), 0]
-    np.testing.assert_array_equal(
-        model.replay_buffer.observations[rows(model)][own], plain.replay_buffer.observations[:5]
-    )
-
-
 def test_a_run_that_is_cut_off_goes_on_where_it_was() -> None:
     simulated = partial(SimulatedEpisodes, Slide, **FEW)
     whole = learnt(build(), 3 * STEPS, simulated())
@@ -132,19 +117,6 @@ def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> No
     np.testing.assert_allclose(taken, MPC.explicit()(shown), atol=1e-5)
 
 
-def test_noise_stays_within_the_action_space() -> None:
-    seen: list[np.ndarray] = []
-
-    class Strict(Slide):
-        def step(self, action):
-            assert action in self.action_space
-            seen.append(action)
-            return super().step(action)
-
-    learnt(build(), 1, SimulatedEpisodes(Strict, per_episode=3, noise=5.0))
-    assert len(seen) == 3 * STEPS and np.abs(seen).max() == 1
-
-
 def test_step_tests_hold_an_action_from_all_of_the_space_for_one_to_so_many_samples() -> None:
     rng = np.random.default_rng(0)
     explore = _Exploration(
@@ -158,22 +130,6 @@ def test_step_tests_hold_an_action_from_all_of_the_space_for_one_to_so_many_samp
     assert set(lengths[lengths > 1]) == {2, 3, 4}
     assert np.abs(acted[tested].mean(0)).max() < 0.1 and acted[tested].min() < -0.99
     assert acted[~tested].std(0) == pytest.approx([0.01, 0.01], rel=0.15)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"per_episode": 0}, ValueError, "per_episode = 0 must be"),
-        ({"step_tests": 1.5}, ValueError, "step_tests = 1.5 must be"),
-        ({"max_hold_steps": 0}, ValueError, "max_hold_steps = 0 must be"),
-        ({"noise": -1}, ValueError, "noise = -1 must be"),
-        ({"noise": np.nan}, ValueError, "noise = nan must be"),
-        ({"seed": -1}, ValueError, "seed = -1 must be"),
-    ],
-)
-def test_bad_settings_are_named(arguments, error, message) -> None:
-    with pytest.raises(error, match=message):
-        SimulatedEpisodes(Slide, **arguments)
 
 
 def test_the_training_env_itself_and_another_plant_are_refused() -> None:

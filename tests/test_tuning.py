@@ -2,37 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 optuna = pytest.importorskip("optuna")
 pytest.importorskip("rl_zoo3")
 
-import sb3_yann  # noqa: E402
-import sb3_yann_envs  # noqa: E402
 from sb3_yann import tuning  # noqa: E402
-
-ENTRY = """
-ClippedPendulum-v0:
-  n_timesteps: 250
-  policy: "YannPolicy"
-  learning_starts: 100
-  policy_kwargs:
-    problem: "my_problem:mpc"
-    max_correction: 0.25
-  callback: [sb3_yann.NoActionNoise]
-"""
-PROBLEM = """
-from pathlib import Path
-from sb3_yann_envs import problems
-def mpc():
-    Path("asked").touch()  # the trial's model was built with the entry's problem
-    return problems.clipped_pendulum()
-"""
 
 
 def test_every_draw_builds_a_policy_that_is_the_mpc(monkeypatch):
@@ -60,36 +35,3 @@ def test_other_policies_keep_the_zoos_space():
     trial = study.ask()
     HYPERPARAMS_SAMPLER["td3"](trial, 1, 1, extra)
     assert "one_minus_gamma" in trial.params and "critic_widths" not in trial.params
-
-
-@pytest.mark.nightly
-def test_two_workers_on_one_study_keep_the_entrys_problem(tmp_path):
-    (tmp_path / "my_problem.py").write_text(PROBLEM)
-    (tmp_path / "entry.yml").write_text(ENTRY)
-    packages = {Path(each.__file__).parents[1] for each in (sb3_yann, sb3_yann_envs)}
-    path = os.pathsep.join([str(tmp_path), *map(str, packages)])
-    command = [
-        sys.executable, "-m", "rl_zoo3.train", "--algo", "ddpg", "--env", "ClippedPendulum-v0",
-        "--gym-packages", "sb3_yann", "sb3_yann.tuning", "--conf-file", "entry.yml",
-        "-f", "logs", "-optimize", "--storage", "study.log", "--study-name", "swing",
-        "--max-total-trials", "4", "--n-evaluations", "1", "--eval-episodes", "1",
-        "--no-optim-plots", "--num-threads", "1", "--seed",
-    ]  # fmt: skip
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
-    workers = [
-        subprocess.Popen(
-            [*command, str(seed)],
-            cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for seed in (0, 1)
-    ]  # fmt: skip
-    printed = [worker.communicate(timeout=300)[0] for worker in workers]
-    assert all(worker.returncode == 0 for worker in workers), printed
-    storage = optuna.storages.journal.JournalFileBackend(str(tmp_path / "study.log"))
-    study = optuna.load_study(study_name="swing", storage=optuna.storages.JournalStorage(storage))
-    states = [trial.state.name for trial in study.trials]
-    assert 4 <= len(states) <= 5 and set(states) <= {"COMPLETE", "PRUNED"}, (states, printed)
-    assert "COMPLETE" in states
-    assert (tmp_path / "asked").exists()
-    assert "critic_widths" in study.best_trial.params

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import sb3_yann_envs  # noqa: F401 (registers)
-from sb3_yann_envs import cstr
 
 IDS = {"CSTR-v0": 400, "ClippedPendulum-v0": 200}
 
@@ -61,13 +60,6 @@ def test_a_seed_of_numpy_is_a_seed() -> None:
     np.testing.assert_array_equal(env.reset(seed=np.int64(7))[0], env.reset(seed=7)[0])
 
 
-def test_to_advance_arrays_leaves_them_as_they_are() -> None:
-    before = np.full((4, 3), 0.01)
-    after = np.empty_like(before)
-    cstr.advance_all(before, np.full(3, 50.0), after)
-    assert (before == 0.01).all() and not np.array_equal(after, before)
-
-
 @pytest.mark.parametrize("env_id", IDS)
 def test_observations_are_in_the_space_and_the_time_limit_is_the_registered_one(env_id) -> None:
     env = gymnasium.make_vec(env_id, num_envs=3)
@@ -96,12 +88,6 @@ def test_an_episode_that_is_over_starts_again_at_the_next_step() -> None:
     fresh.reset(seed=0, options={"state": [0, 0, 0, 4.9]})
     np.testing.assert_array_equal(after[0], fresh.reset()[0])  # the next start of seed 0
     assert not np.array_equal(after[1], last[1]) and reward[1] != 0
-
-
-def test_a_single_seed_counts_on() -> None:
-    env = gymnasium.make_vec("ClippedPendulum-v0", num_envs=3)
-    np.testing.assert_array_equal(env.reset(seed=7)[0], env.reset(seed=[7, 8, 9])[0])
-    assert not np.array_equal(env.reset()[0], env.reset()[0])
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -7,7 +7,6 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 from stable_baselines3 import DDPG
 
 import unit_samples as units
@@ -85,20 +84,6 @@ def test_an_episode_of_a_vectorized_env_stops_where_it_ends() -> None:
     assert together.violations.tolist() == alone.violations.tolist() == [1, 1]
     np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-9)
     assert [len(each) for each in together.observations] == [k + 1 for k in lengths]
-
-
-def test_a_policy_that_has_learnt_does_the_same_side_by_side_to_rounding() -> None:
-    model = DDPG(YannPolicy, "ClippedPendulum-v0", seed=0)
-    with th.no_grad():
-        for parameter in model.actor.parameters():
-            parameter += 0.1 * th.randn_like(parameter)
-    together = evaluate(model, "ClippedPendulum-v0", SEEDS)
-    alone = evaluate(model, gym.make("ClippedPendulum-v0"), SEEDS)
-    law = evaluate(model.policy.problem.explicit(), "ClippedPendulum-v0", SEEDS)
-    assert np.abs(together.costs - law.costs).max() > 1e-3  # it is another policy
-    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-4)
-    for one, other in zip(together.observations, alone.observations, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-4)
 
 
 def assert_equal(one: Trajectories, other: Trajectories) -> None:
@@ -182,17 +167,6 @@ def test_envs_made_for_the_episodes_are_closed() -> None:
     assert Countdown.open == before
 
 
-def test_envs_are_closed_where_the_policy_fails() -> None:
-    def fails(observation):
-        assert Countdown.open == before + 3
-        raise RuntimeError("this policy fails")
-
-    before = Countdown.open
-    with pytest.raises(RuntimeError, match="this policy fails"):
-        evaluate(fails, Countdown, [3, 1, 4])
-    assert Countdown.open == before
-
-
 def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> None:
     made: list[Countdown] = []
 
@@ -215,11 +189,6 @@ def test_an_env_that_is_given_stays_open() -> None:
     before = Countdown.open
     evaluate(Tenth(), env, [3, 1])
     assert Countdown.open == before
-
-
-def test_something_that_is_no_policy_is_named() -> None:
-    with pytest.raises(TypeError, match="predict"):
-        evaluate(3, "CSTR-v0", SEEDS)  # type: ignore[arg-type]
 
 
 def test_a_law_is_played_in_plant_units() -> None:

@@ -78,20 +78,6 @@ def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_
     np.testing.assert_allclose(one, after[0], rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["ddpg", "residual", "cloned"])
-def test_equal_seeds_give_equal_results(name, quick_cloning) -> None:
-    def trained(seed: int) -> np.ndarray:
-        env = recorder("ClippedPendulum-v0")
-        learner = BUILDERS[name](lambda: env, seed)
-        learner.model.learn(120, callback=learner.callbacks)
-        return np.concatenate([env.recorded()[1], learner.policy.predict(random_states(env))[0]])
-
-    first = trained(1)
-    np.testing.assert_array_equal(first, trained(1))
-    assert np.any(first != trained(2))
-
-
 @pytest.mark.parametrize("env_id", ENVS)
 def test_the_residual_policy_is_the_mpc_before_training(env_id) -> None:
     env = gym.make(env_id)
@@ -113,20 +99,6 @@ def test_without_noise_the_residual_executes_the_mpc_until_the_actor_moves(env_i
     expected = law_of(env)(observations).astype(np.float32)
     np.testing.assert_array_equal(executed[:100], expected[:100])
     assert np.any(executed[101:] != expected[101:])
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("env_id", ENVS)
-def test_residual_noise_is_a_fraction_of_half_the_input_range(env_id) -> None:
-    env = recorder(env_id)
-    learner = residual_rl(lambda: env, 0, noise=0.01)
-    learner.model.learn(150, callback=learner.callbacks)  # within the burn-in
-    observations, executed = env.recorded()
-    high = env.action_space.high
-    inside = np.abs(executed) < high
-    noise = ((executed - law_of(env)(observations)) / high)[inside]
-    assert len(noise) > 50
-    assert 0.007 < noise.std() < 0.013
 
 
 def test_the_residual_reaches_every_input_from_any_other() -> None:
@@ -175,13 +147,6 @@ def test_networks_see_the_pendulum_as_gymnasium_shows_it() -> None:
     np.testing.assert_allclose(seen, [np.cos(angle), np.sin(angle), speed], rtol=1e-6)
     plain = info["state"].astype(np.float32)
     np.testing.assert_array_equal(learner.policy.predict(plain)[0], learner.model.predict(seen)[0])
-
-
-def test_networks_see_the_reactor_as_it_is() -> None:
-    learner = sb3_ddpg(lambda: gym.make("CSTR-v0"), 0)
-    seen, info = learner.model.env.envs[0].reset(seed=3)
-    np.testing.assert_array_equal(seen, info["state"].astype(np.float32))
-    np.testing.assert_array_equal(learner.policy.predict(seen)[0], learner.model.predict(seen)[0])
 
 
 @pytest.mark.parametrize("problem", [problems.clipped_pendulum(), problems.cstr()], ids=ENVS[::-1])

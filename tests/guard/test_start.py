@@ -31,7 +31,6 @@ from guard_samples import (
     build,
     correct,
     make_guard,
-    random_states,
     train,
     tried,
     verdicts,
@@ -43,7 +42,6 @@ from sb3_yann import (
     NoActionNoise,
     restore_accepted,
 )
-from sb3_yann.rollout import evaluate
 from weights import is_mpc, last_layer
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
@@ -226,28 +224,6 @@ def test_another_simulator_of_the_same_name_begins_afresh_and_says_so() -> None:
     assert second.state.settings == first.settings.of_evidence
 
 
-class Legacy(Slide):
-    """Seeds the global generator, and draws from it."""
-
-    def reset(self, *, seed=None, options=None):
-        if seed is not None:
-            np.random.seed(seed)  # noqa: NPY002
-        _, info = super().reset(seed=seed)
-        self.x = np.random.uniform(-4, 4, 1)  # noqa: NPY002
-        return self.x.astype(np.float32), info
-
-
-def test_a_simulator_that_seeds_the_global_generator_does_not_seed_it_for_others() -> None:
-    states = []
-    for callbacks in ([], [make_guard(Legacy, n_new_starts=5)]):
-        model = build(gradient_steps=0)
-        moves = [At([1], better), At([STEPS + 1], partial(correct, region=RIGHT, value=0.4))]
-        train(model, 3 * STEPS, *moves, *callbacks)
-        states.append(random_states())
-    assert len(callbacks[0].decisions) >= 2
-    assert states[0] == states[1]
-
-
 @pytest.mark.parametrize("together", [lambda a, b: [a, b], lambda a, b: [CallbackList([a]), b]])
 def test_two_guards_at_once_are_refused(together) -> None:
     guards = together(make_guard(), make_guard())
@@ -327,20 +303,6 @@ def test_a_guard_says_nothing_of_a_reward_that_is_the_cost() -> None:
     assert guard._audit is not None and guard._audit.finding.matches
 
 
-class InPlace(Slide):
-    """Returns its own state, which the next step overwrites."""
-
-    def reset(self, *, seed=None, options=None):
-        observation, info = super().reset(seed=seed)
-        self.observation = observation
-        return self.observation, info
-
-    def step(self, action):
-        observation, *rest = super().step(action)
-        self.observation[:] = observation
-        return self.observation, *rest
-
-
 class Door(gym.Env):
     """x runs away; the env ends the episode beyond 3, whatever the MPC does there."""
 
@@ -389,16 +351,6 @@ class Endless(Slide):
         return observation, reward, False, False, {}
 
 
-def test_an_env_that_overwrites_its_observation_gives_the_same_episodes() -> None:
-    seeds, policy = range(3), build().policy
-    for ours, theirs in zip(
-        evaluate(policy, InPlace, seeds).observations,
-        evaluate(policy, Slide, seeds).observations,
-        strict=True,
-    ):
-        np.testing.assert_array_equal(ours, theirs)
-
-
 def test_one_env_for_all_starts_is_refused() -> None:
     env = Slide()
     with pytest.raises(ValueError, match="returned the same one twice"):
@@ -422,11 +374,6 @@ def test_envs_are_made_for_the_first_trial_kept_for_the_others_and_closed_at_the
     assert trials > 1
     # One more, whose spaces are looked at before.
     assert counts["made"] == counts["closed"] <= len(guard.state.evidence.starts.seeds) + 1
-
-
-def test_a_function_that_makes_no_env_is_named() -> None:
-    with pytest.raises(TypeError, match=r"returned None, not a gymnasium\.Env"):
-        train(build(), 4, make_guard(lambda: None))
 
 
 def test_an_episode_that_is_long_is_told_before_memory_is_full(monkeypatch) -> None:

@@ -195,13 +195,6 @@ def test_what_does_not_concern_the_evidence_may_change_in_between() -> None:
     assert len(second.decisions) == 3
 
 
-def test_a_simulator_made_by_a_partial_is_known_again_in_another_process() -> None:
-    one, other = (make_guard(partial(partial(Slide, low=0.0), high=2.0)) for _ in range(2))
-    assert one.settings.of_evidence == other.settings.of_evidence
-    assert "0x" not in str(one.settings.of_evidence)
-    assert one.settings.of_evidence != make_guard(partial(Slide, low=0.5)).settings.of_evidence
-
-
 def saved(folder: Path) -> Any:
     return DDPG.load(folder / "accepted_model.zip", device="cpu")
 

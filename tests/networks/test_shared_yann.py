@@ -139,8 +139,3 @@ def test_inputs_without_bounds_are_refused() -> None:
     )
     with pytest.raises(ValueError, match="finite bounds on every input"):
         SharedYannLayer(mpc.online())
-
-
-def test_a_theta_of_another_size_is_named() -> None:
-    with pytest.raises(ValueError, match="theta has shape"):
-        layer_of(reactor(), "online")(th.zeros(2, 3))

@@ -14,7 +14,7 @@ from sample_laws import (
     solved,
     to_action,
 )
-from sample_layers import EVERY_LAW, INFEASIBLE, region_of, scrambled, train
+from sample_layers import EVERY_LAW, INFEASIBLE, region_of, scrambled
 from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
@@ -145,24 +145,7 @@ def test_descent_returns_from_saturation(start: float) -> None:
     assert x.item() == pytest.approx(0.25, abs=1e-4)
 
 
-def test_saturated_region_learns_to_leave_its_bound() -> None:
-    law = law_of("pendulum")
-    layer = YannLayer(law)
-    theta = box_points(law, 4000)
-    theta = theta[(layer(theta) == 1).all(1)]
-    train(layer, theta, target=0.0, steps=100)
-    assert layer(theta).abs().mean() < 0.2
-
-
 # --- the bound on the correction ---------------------------------------------------------------
-
-
-@EVERY_LAW
-@pytest.mark.parametrize("bound", [0, 1e-8])
-def test_bound_of_zero_is_the_law_bit_for_bit(name: str, bound: float) -> None:
-    layer = scrambled(YannLayer(law_of(name), max_correction=bound), 1e3)
-    theta = box_points(law_of(name), 5000, stretch=3)
-    assert th.equal(layer(theta), layer.law(theta))
 
 
 @pytest.mark.parametrize("side", [-1, 1])

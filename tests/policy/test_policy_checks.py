@@ -20,7 +20,7 @@ from policy_samples import (
     unbounded,
 )
 from sample_plants import LinearPlant
-from sb3_yann import AffineObservation, LinearModel, LinearMPC, YannPolicy
+from sb3_yann import LinearModel, LinearMPC, YannPolicy
 
 
 @pytest.mark.parametrize(
@@ -170,33 +170,6 @@ def test_a_policy_that_finds_no_algorithm_says_so_and_takes_a_discount() -> None
 
     with pytest.raises(ValueError, match="in the same thread"):
         DDPG(in_a_thread, "CSTR-v0", gamma=0.9, device="cpu")
-
-
-def test_numbers_of_another_type_are_refused_and_the_default_type_does_not_matter() -> None:
-    model = DDPG("YannPolicy", "CSTR-v0", device="cpu", learning_starts=0, batch_size=4)
-    for module in (model.policy, model.actor, model.critic):
-        for change in ("double", "float", "half"):
-            with pytest.raises(TypeError, match=r"cannot become torch\.float"):
-                getattr(module, change)()
-    model.policy.to("cpu")
-    th.set_default_dtype(th.float64)
-    try:
-        wide = DDPG("YannPolicy", "CSTR-v0", device="cpu", learning_starts=0, batch_size=4)
-        wide.learn(10)
-    finally:
-        th.set_default_dtype(th.float32)
-    for ours, theirs in zip(wide.actor.parameters(), model.actor.parameters(), strict=True):
-        assert ours.dtype == theirs.dtype
-
-
-def test_whole_numbers_are_no_state_unless_the_user_says_what_they_mean() -> None:
-    box = spaces.Box(-9, 9, (4,), np.int32)
-    act = gym.make("CSTR-v0").action_space
-    with pytest.raises(TypeError, match="observation_space has dtype int32"):
-        make_policy(box, act, problem="CSTR-v0")
-    seen = AffineObservation(0.01 * np.eye(4))
-    policy = make_policy(box, act, problem="CSTR-v0", observation=seen)
-    np.testing.assert_allclose(policy.theta([[3, -1, 2, 5]]), [[0.03, -0.01, 0.02, 0.05]])
 
 
 def test_a_discount_that_is_set_after_the_policy_was_built_is_refused(tmp_path) -> None:

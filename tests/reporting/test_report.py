@@ -28,7 +28,6 @@ from sb3_yann import (
     LinearMPC,
     NoActionNoise,
     PlantTwin,
-    improve,
     offset_free,
     report,
 )
@@ -320,20 +319,23 @@ def test_a_wrong_law_fails(tmp_path, monkeypatch) -> None:
 
 @pytest.fixture(scope="module")
 def improved(tmp_path_factory):
-    """A saved and loaded model that `improve` has made better in a twin, the twin, and its page."""
-    twin, problem = twin_samples.twin(), twin_samples.problem()
-    model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": problem}, device="cpu", seed=0)
-    found = improve(model, twin, updates=1000, n_starts=7)
-    assert found.accepted
+    """A saved and loaded model with what `improve` leaves in one that it has made better."""
+    model = moved(0.1)
+    settings = {"n_starts": 7, "updates": 1000}
+    weights = evidence_parts.fingerprint(model.policy.actor.state_dict())
+    check = Check(1, True, "", -0.1, 0.01, True)
+    found = Improvement(
+        (check,), -0.1, True, source="a log", episodes=5, settings=settings, policy=weights
+    )
+    model.improvements = (found,)
     folder = tmp_path_factory.mktemp("improved")
     model.save(folder / "model.zip")
     loaded = DDPG.load(folder / "model.zip")
-    given = {"env": twin.env, "twin": twin, "seeds": range(40, 43)}
-    return loaded, twin, report(loaded, folder / "page.html", **given, title="Of today")
+    return loaded, report(loaded, folder / "page.html", env=Slide, seeds=range(40, 43))
 
 
 def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) -> None:
-    model, _, page = improved
+    model, page = improved
     text, (found,) = Outline(page).text, model.improvements
     for said in (
         "The policy is the one that improve accepted last, in the twin (5 episodes",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
+from improvement_samples import quick
 from sb3_yann import (
     CostAudit,
     DisturbanceBounds,
@@ -93,6 +94,7 @@ def test_an_observer_takes_the_offset_of_another_plant() -> None:
 
 
 def test_plans_are_made_in_its_own_states(monkeypatch) -> None:
+    quick(monkeypatch)
     monkeypatch.setattr(PlantTwin, "fit", None)  # no twin is needed
     found = headroom(full(), lambda: PlantEnv(slope, full(), max_episode_steps=30), n_starts=2)
     assert found.total >= 0
