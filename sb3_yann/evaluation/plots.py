@@ -542,7 +542,7 @@ def _draw_rows(axes: Axes, rows: Array, dt: float, style: dict[str, Any], name: 
             axes.plot(time, row, linewidth=1.1, alpha=0.85, label=label, **style)
         return
     low, middle, high = np.nanpercentile(rows, [10, 50, 90], axis=0)
-    step = "post" if style["drawstyle"] == "steps-post" else None
+    step: Any = "post" if style["drawstyle"] == "steps-post" else None
     axes.fill_between(time, low, high, alpha=0.2, color=style["color"], linewidth=0, step=step)
     hidden = name.startswith("_")
     label = name if hidden else f"{name}, median of {len(rows)}, and 80 % of them"

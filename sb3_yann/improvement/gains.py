@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.offset import CURE
 from sb3_yann.control import LinearMPC
 
 LITTLE = 0.005
@@ -16,6 +15,10 @@ WORTH = 0.02
 """A gain below this is not worth learning, which finds a part of it."""
 ROUNDING = 1e-9
 """Of an episode's cost: so much more is the same."""
+CURE = (
+    "mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, observer, "
+    "mpc.disturbances.d_min, mpc.disturbances.d_max)."
+)
 ADVICE = {
     "do not bother": "there is little to gain over the MPC.",
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
@@ -53,8 +56,6 @@ class Headroom:
     lost : float, optional
         By how much plans cost more than the MPC when they were first played, relative to it, where
         the model of the env's episodes is poor.
-    rest : str, optional
-        How far from its set-points the MPC comes to rest though an observer gains nothing, and why.
     observer_played, reidentified_played : ndarray, shape (starts,), optional
         What the MPC with an observer and the re-identified one cost when they were played, losses
         included; None where they were not.
@@ -86,7 +87,6 @@ class Headroom:
     source: str
     d_max: Array | None = None
     lost: float | None = None
-    rest: str = ""
     observer_played: Array | None = None
     reidentified_played: Array | None = None
     steps: int = 0
@@ -124,7 +124,6 @@ class Headroom:
             f"An MPC with a disturbance observer{self._as_played(self.observer_played)}",
             f"An MPC with a re-identified model{self._as_played(self.reidentified_played)}",
             f"Verdict: {self.verdict}; {self._advice()}",
-            *([self._with_d_max(self.rest)] if self.rest else []),
             *([f"{self.steps:,} steps of the env. {self.note}".strip()] if self.steps else []),
         ]
         return "\n".join(lines)

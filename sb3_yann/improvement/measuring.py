@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_bool, check_int
-from sb3_yann.audit.offset import remaining_offset
 from sb3_yann.compare import less_safe
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.offset_free import SHARE
-from sb3_yann.improvement.gains import LITTLE, UNKNOWN, Headroom, gain, verdict_of
+from sb3_yann.improvement.gains import UNKNOWN, Headroom, gain, verdict_of
 from sb3_yann.improvement.model import SimulatorModel, task_of
 from sb3_yann.improvement.simulator import OutOfStepsError, Simulator, of_law
 from sb3_yann.plan import PAUSE, Planning, TwinPlant
@@ -158,7 +157,6 @@ class _Search:
         self.played: dict[str, Array] = {}  # costs of each controller, losses included
         self.fair: dict[str, Array] = {}  # the MPC's where a bound is broken by more
         self.reidentified: LinearMPC | None = None
-        self.runs: list[Array] | None = None  # of the MPC with an observer
 
     def found(self) -> Headroom:
         """Play all of it, and return the figures."""
@@ -227,9 +225,7 @@ class _Search:
             return
         if np.any(largest > SHARE * unit):  # the default would cut off what was found here
             self.d_max = np.maximum(largest, SHARE * unit)
-        loops = self.simulator.play(Observing(mpc, *pair), self.seeds)
-        self.runs = [x for x, _ in loops.pairs]
-        self.add("observer", loops)
+        self.add("observer", self.simulator.play(Observing(mpc, *pair), self.seeds))
         self.say("the MPC with a disturbance observer")
 
     def reidentify(self) -> None:
@@ -315,7 +311,6 @@ class _Search:
             whole,
             verdict=verdict,
             lost=lost if lost > 0 else None,
-            rest=self._rest() if offset < LITTLE else "",
             observer_played=self.played.get("observer"),
             reidentified_played=self.played.get("model"),
             steps=self.simulator.steps,
@@ -323,14 +318,6 @@ class _Search:
             reidentified=self.reidentified,
             budget=EPISODES_OF_IMPROVE * int(self.base.lengths.max()) if self.twin is None else 0,
         )
-
-    def _rest(self) -> str:
-        """Return what is said of an offset that remains though an observer gains nothing."""
-        runs = [x for x, _ in self.base.pairs]
-        if self.runs is None:
-            return remaining_offset(self.mpc, runs, None)
-        dearer = -gain(self.base.costs, self.played["observer"])
-        return remaining_offset(self.mpc, runs, self.runs, dearer)
 
 
 def _whole(costs: Array | None, ours: Array) -> Array:

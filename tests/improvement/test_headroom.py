@@ -134,20 +134,6 @@ def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
     assert abs(without[-1, 0] - without[-1, 1]) > 0.02
 
 
-def test_an_offset_that_the_stage_cost_wants_is_named_with_what_to_do() -> None:
-    found = headroom(heater(R=[[3.0]]), partial(Heater, load=0.2), n_starts=4, max_steps=NO_PLANS)
-    assert found.offset < 0.005 and found.d_max is not None
-    assert "With the MPC, x[0] came to rest 0.619 beside its set-point, 8 times." in found.rest
-    assert "leave it out" in found.rest
-    assert "offset_free(" not in str(found)
-
-
-def test_no_offset_is_named_where_the_observer_is_advised_or_the_model_is_the_plant() -> None:
-    first = headroom(heater(), partial(Heater, load=0.2), n_starts=4, max_steps=NO_PLANS)
-    assert first.verdict == "add ObserveDisturbance first" and first.rest == ""
-    assert headroom(heater(), Heater(), n_starts=4, max_steps=NO_PLANS).rest == ""
-
-
 def test_a_disturbance_beyond_the_default_is_told() -> None:
     plant = partial(Heater, load=0.6)
     found = headroom(heater(), plant, n_starts=3, max_steps=NO_PLANS)
