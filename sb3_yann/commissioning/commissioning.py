@@ -117,8 +117,8 @@ class Commissioning:
         seed: int = 0,
         verbose: int = 0,
     ) -> None:
-        self.incumbent = AcceptedPolicy(model)
-        self.policy = self.incumbent.policy
+        self.accepted = AcceptedPolicy(model)
+        self.policy = self.accepted.policy
         if not (isinstance(plant_env, str | gym.Env) or callable(plant_env)):
             raise TypeError(
                 f"plant_env = {plant_env!r} must be the id of an environment, a gymnasium.Env or a "
@@ -141,7 +141,7 @@ class Commissioning:
         self.largest: float = record.events[0].get("largest", bound) if record.events else bound
         begin = {**self._settings, "largest": self.largest}
         self.journal = Journal(record, begin, CommissioningState(self._first_bound))
-        self._restore(self.journal.outlook)
+        self._restore(self.journal.state)
 
     @property
     def batches(self) -> list[Batch]:
@@ -179,7 +179,7 @@ class Commissioning:
                         self._play(plant)
                     self._decide(plant)
             finally:
-                self.incumbent.show()
+                self.accepted.show()
         return self.batches
 
     def report(self) -> str:
@@ -195,7 +195,7 @@ class Commissioning:
         turn = np.random.default_rng([self.seed, len(journal.batches), number // 2]).integers(2)
         acts = trial and not doubted and turn == number % 2
         excites = self.excite > 0 and not trial and not journal.doubted and number % 2
-        self.incumbent.restore()
+        self.accepted.restore()
         # A simulator gives both of a pair the same start, but not after an alarm: an odd start
         # would look like a changed plant.
         again = number % 2 if trial and not journal.doubted else 0
@@ -214,7 +214,7 @@ class Commissioning:
 
     def _batch_is_over(self) -> bool:
         journal = self.journal
-        count = self.batch * 2 ** (len(journal.batches) - journal.outlook.anew)
+        count = self.batch * 2 ** (len(journal.batches) - journal.state.anew)
         return len(journal.batch) >= count or self._changed
 
     @property
@@ -223,39 +223,39 @@ class Commissioning:
 
     def _decide(self, plant: Plant) -> None:
         """Learn from the plant, compare it with what was predicted, and say who acts from here."""
-        journal, number, before = self.journal, len(self.batches) + 1, self.journal.outlook
+        journal, number, before = self.journal, len(self.batches) + 1, self.journal.state
         by_policy = any(each for _, each in journal.batch)
         who, within = (before.policy, before.max_correction) if by_policy else ("MPC", 0.0)
         alarms = sum(each.alarm is not None for each, _ in journal.batch)
-        self.incumbent.restore()
+        self.accepted.restore()
         with self._unless_cut_off():
             if self._changed:
                 costs = compare(journal, plant, self.twin, None)
                 self.twin = self.watchdog = None
                 first = len(journal.episodes)
-                outlook = CommissioningState(
+                state = CommissioningState(
                     self._first_bound, first=first, anew=number, tried=before.tried
                 )
-                self.incumbent.give_back()
+                self.accepted.give_back()
                 verdict: Verdict = "begins anew"
                 reason = "Two episodes in a row had an alarm."
             else:
-                costs, outlook, verdict, reason = self._learn(plant, number)
+                costs, state, verdict, reason = self._learn(plant, number)
             if verdict == "accepted":
                 saved = journal.record.save(self.model, number)
                 digest = journal.record.digest_of(saved)
                 policy = f"batch {number}"
-                outlook = replace(
-                    outlook, policy=policy, model=saved, model_digest=digest, since=number
+                state = replace(
+                    state, policy=policy, model=saved, model_digest=digest, since=number
                 )
             elif verdict != "stays":
-                self.incumbent.keep(False)
-                outlook = outlook.with_mpc()
-            self.incumbent.limit(outlook.max_correction)
+                self.accepted.keep(False)
+                state = state.with_mpc()
+            self.accepted.limit(state.max_correction)
             shown = costs.actual, costs.predicted, costs.mpc
             sizes = number, len(journal.batch), alarms
             journal.close(
-                Batch(*sizes, who, within, *shown, costs.difference.pairs, verdict, reason), outlook
+                Batch(*sizes, who, within, *shown, costs.difference.pairs, verdict, reason), state
             )
         if self.verbose:
             print(self.report().splitlines()[-1])
@@ -266,60 +266,60 @@ class Commissioning:
         twin = self._fit(numbers, seed) if len(numbers) > 1 else None
         known = twin if twin is not None and twin.trusted else None
         costs = compare(self.journal, plant, before, known or before)
-        outlook, said = self.journal.outlook, ""
+        state, said = self.journal.state, ""
         if known is not None:
             self.twin, self.watchdog = known, Watchdog.of(known)
-            outlook = replace(outlook, twin=numbers, twin_seed=seed)
+            state = replace(state, twin=numbers, twin_seed=seed)
         if why := why_taken_back(self.journal, costs):
-            return costs, *self._take_back(outlook, number, why)
-        if self.journal.accepted and not outlook.is_kept:
+            return costs, *self._take_back(state, number, why)
+        if self.journal.accepted and not state.is_kept:
             if not is_kept(costs):
-                return costs, outlook, "stays", f"{costs.difference.pairs} pairs are not enough."
-            self.incumbent.keep(True)
-            outlook = outlook.with_kept()
+                return costs, state, "stays", f"{costs.difference.pairs} pairs are not enough."
+            self.accepted.keep(True)
+            state = state.with_kept()
             said = f"{costs.difference.pairs} pairs show that it costs less. "
         if known is None:
             why = f"There are {len(numbers)} episodes to learn from."
             if twin is not None:
                 why = " ".join(["The twin is not trusted.", *twin.trust.problems])
-            verdict: Verdict = "stays" if outlook.is_kept else "the MPC acts"
-            return costs, outlook, verdict, f"{said}{why}"
-        outlook, verdict, found = self._improve(known, outlook, seed)
-        return costs, outlook, verdict, f"{said}{found}"
+            verdict: Verdict = "stays" if state.is_kept else "the MPC acts"
+            return costs, state, verdict, f"{said}{why}"
+        state, verdict, found = self._improve(known, state, seed)
+        return costs, state, verdict, f"{said}{found}"
 
     def _take_back(
-        self, outlook: CommissioningState, number: int, why: str
+        self, state: CommissioningState, number: int, why: str
     ) -> tuple[CommissioningState, Verdict, str]:
         """Go back to what the plant has confirmed before, else to the MPC."""
         said = f"The policy was taken back: {why}."
-        if outlook.kept_policy not in ("MPC", outlook.policy):
-            self.incumbent.return_to_kept()
-            return outlook.back_to_kept(number), "stays", said
-        self.incumbent.give_back()
-        return replace(outlook, max_correction=self._first_bound), "the MPC acts", said
+        if state.kept_policy not in ("MPC", state.policy):
+            self.accepted.return_to_kept()
+            return state.back_to_kept(number), "stays", said
+        self.accepted.give_back()
+        return replace(state, max_correction=self._first_bound), "the MPC acts", said
 
     def _improve(
-        self, twin: PlantTwin, outlook: CommissioningState, seed: int
+        self, twin: PlantTwin, state: CommissioningState, seed: int
     ) -> tuple[CommissioningState, Verdict, str]:
         """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
-        wider = outlook
-        if outlook.is_kept:  # the plant has confirmed it: the next one may leave the MPC farther
-            wider = replace(outlook, max_correction=min(2 * outlook.max_correction, self.largest))
-        self.incumbent.take_candidate()
+        wider = state
+        if state.is_kept:  # the plant has confirmed it: the next one may leave the MPC farther
+            wider = replace(state, max_correction=min(2 * state.max_correction, self.largest))
+        self.accepted.take_candidate()
         held = ActorCheckpoint.of(self.policy)
-        self.incumbent.limit(wider.max_correction)
+        self.accepted.limit(wider.max_correction)
         found = improve(self.model, twin, rounds=self.rounds, updates=self.updates, seed=seed)
         before = found.before
-        known = before is not None and before.accepted and not outlook.is_kept
+        known = before is not None and before.accepted and not state.is_kept
         if found.accepted or known:
             said = f"{100 * found.change:+.2f} % in the twin."
             return replace(wider, tried=True), "accepted", said
-        if outlook.is_kept:
+        if state.is_kept:
             held.restore(self.policy)
-            self.incumbent.limit(outlook.max_correction)
-            return replace(outlook, tried=True), "stays", found.reason
-        self.incumbent.give_back()
-        return replace(outlook, tried=True), "the MPC acts", found.reason
+            self.accepted.limit(state.max_correction)
+            return replace(state, tried=True), "stays", found.reason
+        self.accepted.give_back()
+        return replace(state, tried=True), "the MPC acts", found.reason
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
@@ -337,7 +337,7 @@ class Commissioning:
     def _unless_cut_off(self) -> Iterator[None]:
         before = self.twin, self.watchdog
         try:
-            with self.incumbent.unless_cut_off():
+            with self.accepted.unless_cut_off():
                 yield
         except BaseException:
             self.twin, self.watchdog = before
@@ -366,26 +366,26 @@ class Commissioning:
             "problem": hashlib.sha256(numbers).hexdigest()[:16],
         }
 
-    def _restore(self, outlook: CommissioningState) -> None:
+    def _restore(self, state: CommissioningState) -> None:
         """Restore the accepted policy, the twin and its watchdog as a record left them."""
         if not self.journal.batches:
             return
-        self.incumbent.limit(outlook.max_correction)
-        if outlook.model is None:
-            self.incumbent.give_back()
+        self.accepted.limit(state.max_correction)
+        if state.model is None:
+            self.accepted.give_back()
         else:
-            self.journal.record.load(outlook.model, outlook.model_digest, self.model)
-        if outlook.tried:
-            self.incumbent.candidate = None
-        self.incumbent.hold()
-        if outlook.kept is not None and outlook.model is not None:
+            self.journal.record.load(state.model, state.model_digest, self.model)
+        if state.tried:
+            self.accepted.candidate = None
+        self.accepted.hold()
+        if state.kept is not None and state.model is not None:
             whole = self.policy.max_correction
-            self.journal.record.load(outlook.kept, outlook.kept_digest, self.model)
-            self.incumbent.limit(outlook.kept_bound)
-            self.incumbent.keep(True)
-            self.incumbent.limit(whole)
-            self.journal.record.load(outlook.model, outlook.model_digest, self.model)
-        self.incumbent.show()
-        if outlook.twin is not None:
-            self.twin = self._fit(outlook.twin, outlook.twin_seed)
+            self.journal.record.load(state.kept, state.kept_digest, self.model)
+            self.accepted.limit(state.kept_bound)
+            self.accepted.keep(True)
+            self.accepted.limit(whole)
+            self.journal.record.load(state.model, state.model_digest, self.model)
+        self.accepted.show()
+        if state.twin is not None:
+            self.twin = self._fit(state.twin, state.twin_seed)
             self.watchdog = Watchdog.of(self.twin)

@@ -150,14 +150,12 @@ class Journal:
     record : Record
     settings : dict
         What must be the same to go on.
-    outlook : CommissioningState
+    state : CommissioningState
         What holds before the first batch.
     """
 
-    def __init__(
-        self, record: Record, settings: dict[str, Any], outlook: CommissioningState
-    ) -> None:
-        self.record, self.outlook = record, outlook
+    def __init__(self, record: Record, settings: dict[str, Any], state: CommissioningState) -> None:
+        self.record, self.state = record, state
         self.episodes: list[PlantEpisode] = []
         self.by_policy: list[bool] = []
         self.batches: list[Batch] = []
@@ -185,7 +183,7 @@ class Journal:
     @property
     def accepted(self) -> bool:
         """Whether a policy other than the MPC is accepted."""
-        return self.outlook.policy != "MPC"
+        return self.state.policy != "MPC"
 
     @property
     def batch(self) -> list[tuple[PlantEpisode, bool]]:
@@ -197,7 +195,7 @@ class Journal:
     def trial(self) -> list[range]:
         """The numbers of the episodes of each batch since the policy is on trial."""
         ends = np.cumsum([0, *(each.episodes for each in self.batches)])
-        ends = np.append(ends[self.outlook.since :], len(self.episodes))
+        ends = np.append(ends[self.state.since :], len(self.episodes))
         return [range(a, b) for a, b in pairwise(ends.tolist()) if b > a]
 
     @property
@@ -217,7 +215,7 @@ class Journal:
         """The numbers of the episodes that show the plant as it is now."""
         return [
             number
-            for number in range(self.outlook.first, len(self.episodes))
+            for number in range(self.state.first, len(self.episodes))
             if self.episodes[number].tells and len(self.episodes[number].actions) >= SHORTEST
         ]
 
@@ -242,7 +240,7 @@ class Journal:
 
     def begin(self, by_policy: bool) -> None:
         """Note that an episode begins: if it never ends, that is evidence too."""
-        acts = self.outlook.policy if by_policy else "MPC"
+        acts = self.state.policy if by_policy else "MPC"
         self.record.append({"event": "start", "number": len(self.episodes), "acts": acts})
         self._begin(acts)
 
@@ -256,20 +254,20 @@ class Journal:
         about = {
             "event": "episode",
             "number": len(self.episodes),
-            "acts": self.outlook.policy if by_policy else "MPC",
-            "max_correction": self.outlook.max_correction if by_policy else 0.0,
+            "acts": self.state.policy if by_policy else "MPC",
+            "max_correction": self.state.max_correction if by_policy else 0.0,
         }
         self.record.append({**about, **as_event(played)})
         self._add(played, by_policy)
 
-    def close(self, batch: Batch, outlook: CommissioningState) -> None:
+    def close(self, batch: Batch, state: CommissioningState) -> None:
         """Add the decision that ends a batch."""
         said = {  # NaN is not JSON
             k: None if isinstance(v, float) and not math.isfinite(v) else v
             for k, v in asdict(batch).items()
         }
-        self.record.append({"event": "batch", **said, "from_here": asdict(outlook)})
-        self._close(batch, outlook)
+        self.record.append({"event": "batch", **said, "from_here": asdict(state)})
+        self._close(batch, state)
 
     def _take(self, event: Event) -> None:
         """Do again what an event of the record tells."""
@@ -283,8 +281,8 @@ class Journal:
             named = {each.name: event[each.name] for each in fields(Batch)}
             costs = {k: math.nan for k, each in named.items() if each is None}
             # Records of before there was `tried`: nothing waited where they went on.
-            outlook = CommissioningState(**{"tried": True, **event["from_here"]})
-            self._close(Batch(**{**named, **costs}), outlook)
+            state = CommissioningState(**{"tried": True, **event["from_here"]})
+            self._close(Batch(**{**named, **costs}), state)
 
     def _begin(self, acts: str) -> None:
         self._cut_off, self._open = self.cut_off, acts
@@ -294,9 +292,9 @@ class Journal:
         self.episodes.append(played)
         self.by_policy.append(by_policy)
 
-    def _close(self, batch: Batch, outlook: CommissioningState) -> None:
+    def _close(self, batch: Batch, state: CommissioningState) -> None:
         self.batches.append(batch)
-        self.outlook, self._first_of_batch, self._cut_off = outlook, len(self.episodes), 0
+        self.state, self._first_of_batch, self._cut_off = state, len(self.episodes), 0
 
     def report(self) -> str:
         """Return the batches as a table."""

@@ -213,11 +213,11 @@ def test_a_violation_takes_the_policy_back() -> None:
 def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:
     run = commission(max_correction=1.0)
     run.run(1)
-    run.incumbent.restore()
+    run.accepted.restore()
     with th.no_grad():  # what was accepted turns out to be bad: the plant says so
         for each in run.policy.actor.parameters():
             each.add_(0.5 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
-    run.incumbent.hold()
+    run.accepted.hold()
     monkeypatch.setattr(commissioning, "improve", lambda *_, **__: found)
     found = Improvement((Check(1, False, "nothing", 0.0, 0.0, True),), 0.0, False)
     last = run.run(2)[-1]
@@ -229,7 +229,7 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     run = commission()
     run.run(1)
     assert is_mpc(run.model)  # until the plant has confirmed it
-    run.incumbent.restore()
+    run.accepted.restore()
     bound = run.policy.max_correction
     before = [each.clone() for each in run.policy.actor.parameters()]
     refused = Check(0, False, "start 3 violates a limit", 0.0, 0.0, False)
@@ -246,7 +246,7 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
 def test_weights_that_nobody_accepted_never_act() -> None:
     run = commission()
     run.run(1)
-    run.incumbent.restore()
+    run.accepted.restore()
     accepted = [each.clone() for each in run.policy.actor.parameters()]
     with th.no_grad():
         for each in run.policy.actor.parameters():
@@ -264,7 +264,7 @@ def test_what_the_model_had_learnt_before_waits_for_its_test() -> None:
         for each in model.policy.actor.parameters():
             each.add_(0.01)
     run = Commissioning(model, Cart, batch=3, updates=1)
-    assert is_mpc(model) and run.incumbent.candidate is not None
+    assert is_mpc(model) and run.accepted.candidate is not None
 
 
 def test_a_plant_that_trips_under_the_policy_gets_the_mpc(tmp_path) -> None:
@@ -357,7 +357,7 @@ def test_pairs_of_all_batches_of_a_trial_decide_together() -> None:
     assert second.verdict == "stays" and (second.pairs, third.pairs) == (5, 15)
     assert sum(journal.by_policy) == 15
     assert third.verdict == "accepted" and "15 pairs show that it costs less" in third.reason
-    assert third.max_correction == 0.1 < run.journal.outlook.max_correction == 0.2
+    assert third.max_correction == 0.1 < run.journal.state.max_correction == 0.2
 
 
 def test_a_policy_that_is_taken_back_gives_way_to_the_one_that_was_kept(monkeypatch) -> None:
@@ -367,7 +367,7 @@ def test_a_policy_that_is_taken_back_gives_way_to_the_one_that_was_kept(monkeypa
     monkeypatch.setattr(commissioning, "why_taken_back", lambda *_: "a test")
     last = run.run(4)[-1]
     assert last.acted == "batch 3" and last.verdict == "stays" and "taken back" in last.reason
-    assert run.journal.outlook.policy == "batch 1" and run.policy.max_correction == 0.1
+    assert run.journal.state.policy == "batch 1" and run.policy.max_correction == 0.1
     for ours, theirs in zip(run.policy.actor.parameters(), kept, strict=True):
         assert th.equal(ours, theirs)
 

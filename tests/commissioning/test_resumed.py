@@ -122,8 +122,8 @@ def test_what_the_model_had_learnt_before_still_waits_after_a_stop(tmp_path, mon
     first = commission(tmp_path, learnt())
     first.run(1)
     again = commission(tmp_path, learnt())
-    assert all_bits(again.incumbent.candidate) == all_bits(first.incumbent.candidate)
-    assert again.incumbent.candidate is not None
+    assert all_bits(again.accepted.candidate) == all_bits(first.accepted.candidate)
+    assert again.accepted.candidate is not None
     monkeypatch.setattr(commissioning, "why_taken_back", why_taken_back)
     again.run(2)
-    assert commission(tmp_path, learnt()).incumbent.candidate is None  # it has been tried
+    assert commission(tmp_path, learnt()).accepted.candidate is None  # it has been tried
