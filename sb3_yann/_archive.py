@@ -66,12 +66,8 @@ def atomic_write(path: str | PathLike[str]) -> Iterator[Path]:
 def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
     """Write arrays and their digest as a whole: a reader never sees half of a file.
 
-    Raises
-    ------
-    OSError
-        If it cannot be written; what was there before stays.
-    ValueError
-        If it would be larger than what is read.
+    OSError if it cannot be written, and what was there before stays; ValueError if it would be
+    larger than what is read.
     """
     size = sum(np.asarray(each).nbytes for each in arrays.values())
     if size > 0.99 * MOST:
@@ -83,14 +79,8 @@ def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
 def read_arrays(path: str | PathLike[str]) -> dict[str, Any]:
     """Return the arrays of a file by name, after a check that they are those that were written.
 
-    It takes a few times the memory that the file takes on the disk, whatever is in it.
-
-    Raises
-    ------
-    OSError
-        If there is no such file, or it cannot be read.
-    ValueError
-        If anything else is wrong with it.
+    It takes a few times the memory that the file takes on the disk, whatever is in it. OSError if
+    it cannot be read, ValueError if anything else is wrong with it.
     """
     found = os.stat(path)
     if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):

@@ -159,20 +159,11 @@ def check_discount(value: Any) -> float:
 def check_range(
     name: str, value: Any, low: float, high: float, ends: str = "[]", hint: str = ""
 ) -> float:
-    """Return ``value`` as a finite float between ``low`` and ``high``.
+    """Return ``value`` as a finite float between ``low`` and ``high``, infinite for no limit.
 
-    Parameters
-    ----------
-    name : str
-        The argument's name, for the message.
-    value : Any
-        A real number, of Python or numpy. Bools and strings are none (TypeError).
-    low, high : float
-        Limits (ValueError beyond), infinite for none.
-    ends : {"[]", "(]", "[)", "()"}
-        Round where the limit itself is refused.
-    hint : str, optional
-        What to do: a sentence that ends the message.
+    It is a real number of Python or numpy: bools and strings are a TypeError, what lies beyond a
+    ValueError. ``ends`` is round where the limit itself is refused: "[]", "(]", "[)", "()". The
+    ``hint`` says what to do: a sentence that ends the message.
     """
     value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     kinds = (int, float, np.integer, np.floating)

@@ -123,18 +123,10 @@ class AcceptanceRule:
 class Verdict(NamedTuple):
     """Whether a policy is no worse, and whether more starts would change that.
 
-    Attributes
-    ----------
-    reason : str
-        Why it is refused, empty where it is accepted.
-    breaks_limit : bool
-        Whether it breaks a limit that the policy before does not: then there is no patience.
-    above_mpc : bool
-        Whether its mean cost is above the MPC's.
-    is_sure : bool
-        Whether its mean cost is surely lower, at the level that was asked for.
-    is_hopeless : bool
-        Whether more starts would hardly show a gain that counts.
+    The reason is empty where it is accepted. ``breaks_limit`` tells that it breaks a limit that the
+    policy before does not: then there is no patience. ``above_mpc``: its mean cost is above the
+    MPC's. ``is_sure``: its mean cost is surely lower, at the level that was asked for.
+    ``is_hopeless``: more starts would hardly show a gain that counts.
     """
 
     reason: str = ""
@@ -152,14 +144,9 @@ class Verdict(NamedTuple):
 class Scores(NamedTuple):
     """What a policy's episodes cost and break, in the order of their seeds.
 
-    Attributes
-    ----------
-    costs : ndarray, shape (episodes,)
-        With the penalty of soft bounds.
-    unsafe : ndarray, shape (episodes, 9)
-        As :func:`unsafe_columns` returns it.
-    visits : ndarray of bool, shape (episodes, regions)
-        Which regions the episodes come through: other networks have no effect on them.
+    ``costs`` (episodes,) hold the penalty of soft bounds, ``unsafe`` (episodes, 9) is that of
+    :func:`unsafe_columns`, and ``visits`` (episodes, regions) tells which regions the episodes come
+    through: other networks have no effect on them.
     """
 
     costs: Array
@@ -184,18 +171,11 @@ class Scores(NamedTuple):
 class Tolerance:
     """What starts may cost more than with the MPC.
 
-    Attributes
-    ----------
-    margin : float
-        In units of cost: what a start may cost more; with a CVaR, what the worst of them may on
-        average.
-    cvar_alpha : float, share of all starts that the average is over; 0 is the worst single start
-        With a CVaR, a start that costs the MPC more than ``typical`` may cost more in proportion,
-        and no start may cost more than ``worst_start`` times as much as the average may.
-    typical : float, the MPC's median cost
-    excess_room : float, half-widths by which an excess over bounds may be larger
-    bounds : BoundNames, which reasons name
-    worst_start : float, how many times as much as on average a single start may cost more
+    ``margin`` is in units of cost: what a start may cost more; with a CVaR, what the worst of them
+    may on average, the share ``cvar_alpha``. Then a start that costs the MPC more than ``typical``,
+    its median cost, may cost more in proportion, and none more than ``worst_start`` times as much
+    as the average may. ``excess_room`` is by how many half-widths an excess over the ``bounds`` may
+    be larger.
     """
 
     margin: float
@@ -247,14 +227,9 @@ class Tolerance:
         return bool(special.bdtrc(count - 1, len(excess), self.cvar_alpha) <= 0.1)
 
     def objection(self, excess: Array, standard_errors: float = 0.0) -> str:
-        """Return what speaks against such an excess over the MPC, empty where nothing does.
+        """Return what speaks against such an excess over the MPC (starts,), empty for nothing.
 
-        Parameters
-        ----------
-        excess : ndarray, shape (starts,)
-            As :meth:`excess` returns it.
-        standard_errors : float, default 0
-            How many standard errors of the tail's average count as well.
+        So many ``standard_errors`` of the tail's average count as well.
         """
         worst = int(np.argmax(excess))
         if not excess[worst] > 1.0:
@@ -269,17 +244,10 @@ class Tolerance:
 
 
 class Difference(NamedTuple):
-    """The mean difference of pairs of episodes.
+    """The mean difference of pairs of episodes, and its standard error.
 
-    Attributes
-    ----------
-    mean : float
-    error : float
-        Its standard error.
-    pairs : int
-    chance : float, default 0
-        Of few pairs in turns: how often the order that was drawn for each alone brings a mean as
-        low, which is exact under any drift. Of more than `FEW_PAIRS` the error counts a drift.
+    Of few pairs in turns ``chance`` is how often the order that was drawn for each alone brings a
+    mean as low, which is exact under any drift. Of more than `FEW_PAIRS` the error counts a drift.
     """
 
     mean: float
@@ -351,24 +319,11 @@ def no_worse(
 ) -> Verdict:
     """Compare a policy with the accepted one and the MPC, from the same starts.
 
-    Comparisons are written so that a cost that is not a number is refused.
-
-    Parameters
-    ----------
-    policy, accepted, mpc : Scores
-        Of the three.
-    tolerance : Tolerance
-        What starts may cost more than with the MPC.
-    names : sequence of int, optional
-        What the starts are called in a reason: their seeds.
-    n_hard : int, default 0
-        So many of the first starts were chosen since a policy lost them: they count in no mean.
-    level : float, default 0.05
-        One-sided, of what is sure.
-    least_gain : float, default 0
-        As a fraction of the MPC's mean cost: what gains surely less is hopeless.
-    tail_errors : float, default 0
-        How many standard errors of the worst starts' average count as well.
+    Comparisons are written so that a cost that is not a number is refused. ``names``, the seeds,
+    are what a reason calls the starts. The first ``n_hard`` of these were chosen since a policy
+    lost them: they count in no mean. ``level`` is one-sided, of what is sure. What surely gains
+    less than ``least_gain``, a fraction of the MPC's mean cost, is hopeless. So many
+    ``tail_errors``, standard errors of the worst starts' average, count as well.
     """
     names = range(len(mpc.costs)) if names is None else names
     breaks = policy.breaks_more_than(accepted, tolerance.excess_room)
@@ -418,12 +373,7 @@ def no_worse(
 class Starts:
     """Seeded starts, and what came of the MPC there.
 
-    Attributes
-    ----------
-    seeds, mpc : tuple of int and Scores
-    tolerance : Tolerance, what they may cost more than with the MPC
-    n_hard : int
-        So many of the first ones are starts that a policy has lost.
+    The first ``n_hard`` are starts that a policy has lost.
     """
 
     seeds: tuple[int, ...]
@@ -491,14 +441,9 @@ def unsafe_columns(
 ) -> Array:
     """Return what :func:`less_safe` compares, (episodes, 9).
 
-    Parameters
-    ----------
-    violations, ended, lost, far, lengths : array_like, shape (episodes,)
-        Steps in which the env reports a violation; whether the env ends an episode itself, -1 where
-        its end is a success; whether its cost or an observation is not finite; steps in which an
-        input moves too far; all steps.
-    excess : BoundExcess
-        Over the bounds of the problem.
+    It is steps in which the env reports a violation; whether the env ends an episode itself, -1
+    where its end is a success; whether its cost or an observation is not finite; steps in which an
+    input moves too far; the excess over the problem's bounds; all steps.
     """
     size = np.shape(excess.largest)
     columns = [violations, ended, lost, far, excess.largest, excess.summed, excess.any_bound]
@@ -509,20 +454,15 @@ def unsafe_columns(
 def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[np.bool_]:
     """Tell which episodes are less safe than before, and in what (episodes, 6).
 
-    - The largest excess of an episode may be larger by ``room`` and by ``EXCESS_SHARE`` of what it
-      was. So may the summed one, and by one step of the largest besides. It counts where it is
-      larger on average over all episodes, too.
+    - The largest excess of an episode may be larger by ``room`` half-widths and by ``EXCESS_SHARE``
+      of what it was. So may the summed one, and by one step of the largest besides. It counts where
+      it is larger on average over all episodes, too.
     - Where the env reported violations before, and the problem's bounds tell their size, a tenth
       more steps of them, or one, count only where they are larger.
     - An episode may be shorter where its end is a success.
     - Of all else nothing may be more.
 
-    Parameters
-    ----------
-    now, before : ndarray, shape (episodes, 9)
-        As :func:`unsafe_columns` returns them, of the same starts.
-    room : float
-        Half-widths of a bound by which an excess may be larger.
+    Both are columns (episodes, 9) of :func:`unsafe_columns`, of the same starts.
     """
     more = now[:, : len(UNSAFE)] > before[:, : len(UNSAFE)]
     larger = ~(now <= allowed_excess(before, room))

@@ -20,16 +20,10 @@ Arrays = ArrayLike | Sequence[ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One episode without gaps.
+    """One episode without gaps: states (T + 1, n), inputs (T, m) and disturbances (T, d).
 
-    Attributes
-    ----------
-    states : ndarray, shape (T + 1, n)
-        Before every input, and after the last one.
-    inputs : ndarray, shape (T, m)
-        As they were executed.
-    disturbances : ndarray, shape (T, d)
-        Measured with the inputs; without entries where nothing was.
+    States are before every input and after the last one, inputs as they were executed, and
+    disturbances measured with them; without entries where nothing was.
     """
 
     states: Array

@@ -21,15 +21,9 @@ def riccati(
 ) -> Array:
     """Return P (n, n) with ``x' P x`` the smallest discounted cost from x, without constraints.
 
-    It solves ``P = Q + g A'PA - (g A'PB + N) (R + g B'PB)^-1 (g B'PA + N')`` for ``g = gamma``.
-    A model without a stabilizing solution raises ValueError with the reason.
-
-    Parameters
-    ----------
-    model, gamma : LinearSystem, and float
-        A (n, n) and B (n, m), and the discount in (0, 1].
-    Q, R, cross : ndarray, shapes (n, n), (m, m) and (n, m)
-        Weights Q, R and N of the cost; N is 0 by default.
+    It solves ``P = Q + g A'PA - (g A'PB + N) (R + g B'PB)^-1 (g B'PA + N')`` for ``g = gamma`` in
+    (0, 1] and the weights Q (n, n), R (m, m) and N (n, m), ``cross``. A model without a stabilizing
+    solution raises ValueError with the reason.
     """
     A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
@@ -49,12 +43,7 @@ def gain(
 ) -> Array:
     """Return K (m, n): ``u = -K x`` minimizes ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``.
 
-    Parameters
-    ----------
-    model, gamma : LinearSystem, and float
-        A (n, n) and B (n, m), and the discount in (0, 1].
-    R, P, cross : ndarray, shapes (m, m), (n, n) and (n, m)
-        Weights of the input and of the state after one step, and N, 0 by default.
+    R (m, m) weighs the input, P (n, n) the state after one step, and N (n, m) is ``cross``.
     """
     PB = P @ model.B
     factor = linalg.cho_factor(R + gamma * model.B.T @ PB)
@@ -67,17 +56,11 @@ def policy_value(
 ) -> Array:
     """Return P (n, n) with ``x' P x`` the discounted cost of the law ``u = -K x``, for any K.
 
-    It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation. Only
-    this P makes the value ``x'Qx + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)`` of Braniff & Tian, Section
-    4.2, satisfy Bellman's equation along the law; theirs, without a discount, does for gamma = 1.
-    An unstable discounted closed loop, of infinite cost, raises ValueError.
-
-    Parameters
-    ----------
-    model, gamma : LinearSystem, and float
-        A (n, n) and B (n, m), and the discount in (0, 1].
-    Q, R, K, cross : ndarray, shapes (n, n), (m, m), (m, n) and (n, m)
-        Weights Q and R of the cost, the gain of the law, and N, 0 by default.
+    It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation, with
+    N ``cross``. Only this P makes the value ``x'Qx + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)`` of
+    Braniff & Tian, Section 4.2, satisfy Bellman's equation along the law; theirs, without a
+    discount, does for gamma = 1. An unstable discounted closed loop, of infinite cost, raises
+    ValueError.
     """
     closed = np.sqrt(gamma) * (model.A - model.B @ K)
     radius = spectral_radius(closed)
