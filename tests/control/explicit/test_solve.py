@@ -107,16 +107,6 @@ def test_units_of_states_and_input_change_nothing(units: list[float]) -> None:
     np.testing.assert_allclose(two(wide * units) / 1e6, one(wide), rtol=0, atol=1e-9)
 
 
-def test_law_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sb3_yann.control.mpc import linear_mpc as module
-
-    calls, solve = [], module.solve_explicit
-    monkeypatch.setattr(module, "solve_explicit", lambda *args: calls.append(args) or solve(*args))
-    mpc = small_mpc()
-    assert mpc.explicit() is mpc.explicit()
-    assert len(calls) == 1
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
 def test_copies_of_a_problem_bring_the_solved_law(
     copied: Any, monkeypatch: pytest.MonkeyPatch

@@ -48,11 +48,6 @@ def test_naming_a_model_keeps_its_notes_and_drift() -> None:
     assert (model.notes, model.drift.tolist()) == (("from a log",), [0.1, 0])
 
 
-def test_a_direction_that_nothing_moves_is_named() -> None:
-    model = LinearModel(np.diag([0.5, 0.6]), [[1], [0]], dt=1, state_names=["level", "heat"])
-    assert "Nothing moves heat." in model.report()
-
-
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [

@@ -202,11 +202,6 @@ def test_a_disturbance_enters_by_its_matrix() -> None:
     assert (model.n_disturbances, LinearModel(MODEL.A, MODEL.B, MODEL.dt).n_disturbances) == (1, 0)
 
 
-def test_a_disturbance_matrix_of_another_shape_is_named() -> None:
-    with pytest.raises(ValueError, match=r"E has shape \(1, 1\), expected \(2, d\)"):
-        LinearModel(MODEL.A, MODEL.B, MODEL.dt, E=[[1]])
-
-
 def reaction(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Concentration in mol/l of a trace that flows in and reacts with itself."""
     return np.array([u[0] * (1e-5 - x[0]) - 1e4 * x[0] ** 2])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -141,20 +139,3 @@ def test_fit_of_an_identified_model_is_told() -> None:
         x[k + 1] = 0.8 * x[k] + u[k]
     report = LinearModel.from_data(x, u, dt=1).report()
     assert "Fit over 40 steps held out, 100 % is perfect: 100 % one step ahead, 100 % 10" in report
-
-
-@pytest.mark.parametrize("name", ["cstr", "clipped_pendulum"])
-def test_every_shipped_problem_has_a_report(name: str) -> None:
-    from sb3_yann_envs import problems
-
-    problem: Any = getattr(problems, name)()
-    assert "Poles:" in problem.model.report()
-
-
-def test_names_and_units_stand_in_the_report() -> None:
-    model = LinearModel([[0.5]], [[1.0, 0.0]], 1).named(
-        ["level"], ["feed", "steam"], {"level": "m"}
-    )
-    report = model.report()
-    assert "States: level (m). Inputs: feed, steam." in report.splitlines()[1]
-    assert "  steam has no effect." in report and "Held at 1, feed moves" in report

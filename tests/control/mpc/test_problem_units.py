@@ -176,12 +176,6 @@ def test_what_limits_the_plan_is_called_by_its_name() -> None:
     assert "u[0]" not in text and "x[0]" not in text and "-> flow = [10]" in text
 
 
-def test_a_problem_shows_its_bounds_as_they_were_given() -> None:
-    text = repr(shown())
-    assert "x_min=[330, 1], x_max=[370, 5], u_min=[8], u_max=[15], r_min=[345]" in text
-    assert "du_max=[0.5]" in text and "y_max=[382]" in text
-
-
 def test_an_input_that_cannot_rest_is_told() -> None:
     tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
     box = {"theta_min": 0, "theta_max": 20, "u_min": 4, "u_max": 10}
