@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
-from scipy.spatial import QhullError
 
 from sb3_yann._validation import Array, check_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
@@ -56,7 +55,7 @@ def solve_explicit(
         if solver == "walk":
             raise
         raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
-    except (np.linalg.LinAlgError, QhullError, FloatingPointError) as error:
+    except (np.linalg.LinAlgError, FloatingPointError) as error:
         fault = str(error).partition("\n")[0].rstrip(".")
         raise ExplicitSolutionError(
             f"No explicit law was found: the equations of a region have no solution in float64 "

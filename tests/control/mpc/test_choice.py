@@ -8,7 +8,6 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.spatial import QhullError
 
 from benchmarks.online_problems import wide_plant
 from general_problems import PROBLEMS, servo, solved, two_tanks
@@ -80,10 +79,9 @@ def test_auto_gives_up_by_what_it_counts_and_not_by_the_clock(monkeypatch) -> No
     assert len(messages) == 1
 
 
-@pytest.mark.parametrize("error", [np.linalg.LinAlgError("Singular matrix"), QhullError("QH6154")])
-def test_auto_takes_the_online_law_whatever_fails_in_the_search(error, monkeypatch) -> None:
+def test_auto_takes_the_online_law_where_the_search_fails(monkeypatch) -> None:
     def failing(*args, **kwargs):
-        raise error
+        raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(solve, "walk", failing)
     with pytest.raises(ExplicitSolutionError, match="similar magnitudes"):
