@@ -22,7 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 
 from experiments import optimum, pcgym, yardsticks
-from experiments.measures import BARE, EXPLORED, MPC, OBSERVER, OPTIMUM, OURS, REIDENTIFIED
+from experiments.measures import BARE, DRAWING, EXPLORED, MPC, OBSERVER, OPTIMUM, OURS, REIDENTIFIED
 from experiments.plants import printed_pendulum, true_reactor
 from experiments.runner import Outcome, Run
 from experiments.yardsticks import Learner
@@ -193,6 +193,24 @@ def yann(  # noqa: PLR0913 (what the variants vary)
     return Learner(model, model.policy, callbacks)
 
 
+def exploring(make_env: Callable[[], Any], seed: int, plant: Plant, algorithm: str) -> Learner:
+    """Return SAC, TQC or PPO from the MPC on, with the same options for every plant.
+
+    SAC and TQC have the learning rate of their yardsticks.
+    """
+    settings: dict[str, Any] = {} if algorithm == "PPO" else yardsticks.TUNED
+    model = yardsticks.algorithm_named(algorithm)(
+        "YannPolicy",
+        make_env(),
+        seed=seed,
+        device="cpu",
+        policy_kwargs={"problem": plant.problem(), "simulator": True},
+        **settings,
+    )
+    guard = ImprovementGuard(plant.env, patience=10, keep_if_worse=True)
+    return Learner(model, model.policy, [guard])
+
+
 def _yardstick(build: Callable[..., Learner], **options: Any) -> Callable[..., Learner]:
     return lambda make_env, seed, plant: build(make_env, seed, **options)
 
@@ -221,11 +239,12 @@ CHANGES: dict[str, dict[str, Any]] = {
 LEARNERS: dict[str, Callable[..., Learner]] = {
     OURS: yann,
     **{f"{OURS}, {name}": partial(yann, **change) for name, change in CHANGES.items()},
+    **{f"{OURS} by {name}": partial(exploring, algorithm=name) for name in DRAWING},
     "DDPG": _yardstick(yardsticks.sb3_ddpg),
     "DDPG, best kept": _yardstick(yardsticks.best_of_ddpg, seeds=GUARD_SEEDS),
     "TD3": _yardstick(yardsticks.sb3_td3),
-    "SAC": _yardstick(yardsticks.sb3_sac),
-    "TQC": _yardstick(yardsticks.sb3_tqc),
+    "SAC": _yardstick(yardsticks.maximum_entropy, algorithm="SAC"),
+    "TQC": _yardstick(yardsticks.maximum_entropy, algorithm="TQC"),
     "PPO": _yardstick(yardsticks.sb3_ppo),
     "residual RL": _yardstick(yardsticks.residual_rl),
     "residual RL, no noise": _yardstick(yardsticks.residual_rl, noise=0.0),
@@ -281,6 +300,12 @@ def _runs() -> list[Run]:
     add(true_model, [OURS], ten)
     add(reactor, ["DDPG, best kept", "TD3", "residual RL, no noise", "cloned MPC, then DDPG"], five)
     add(pendulum, ["DDPG", "TD3", "residual RL", "cloned MPC, then DDPG"], five)
+    for plant in (reactor, pendulum, printed):
+        add(plant, [f"{OURS} by {name}" for name in DRAWING], five)
+    # The rivals know no MPC: what they are on one pendulum they are on the other.
+    for plant in (reactor, pendulum):
+        add(plant, DRAWING, five)
+        add(plant, DRAWING, five, episodes=500)
     for plant, variants in VARIANTS.items():
         for name in variants:
             add(plant, [f"{OURS}, {name}"], five if "guard" in name else three)

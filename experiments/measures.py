@@ -15,6 +15,8 @@ MPC = "MPC"
 OPTIMUM = "optimum"
 BARE = f"{OURS}, no settings"
 EXPLORED = f"{OURS}, a simulator explored"
+DRAWING = ("SAC", "TQC", "PPO")
+"""Algorithms whose policy draws its actions."""
 OBSERVER = "MPC with observer"
 REIDENTIFIED = "re-identified MPC"
 IMPROVED = "improve in a simulator"

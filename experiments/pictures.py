@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from experiments.measures import IMPROVED, MPC, OBSERVER, OURS
+from experiments.measures import DRAWING, IMPROVED, MPC, OBSERVER, OURS
 from experiments.runner import Outcome, Run
 from sb3_yann._validation import Array
 
@@ -91,10 +91,14 @@ def _shares(outcomes: Mapping[Run, Outcome], plant: str) -> dict[str, tuple[Arra
 
 
 def _learners(outcomes: Mapping[Run, Outcome]) -> dict[str, list[Outcome]]:
-    """Return the runs of each learner, ours first; its variants have a table and no curve."""
+    """Return the runs of each learner, ours first; its variants have a table and no curve.
+
+    Nor have algorithms whose policy draws its actions: some of them go on for ten times as long.
+    """
     found: dict[str, list[Outcome]] = {}
     for run in sorted(outcomes, key=lambda run: run.learner != OURS):
-        if run.episodes and (run.learner == OURS or not run.learner.startswith(OURS)):
+        variant = run.learner != OURS and run.learner.startswith(OURS)
+        if run.episodes and not variant and run.learner not in DRAWING:
             found.setdefault(run.learner, []).append(outcomes[run])
     return found
 

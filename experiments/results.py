@@ -15,7 +15,7 @@ from experiments.published import paper_table
 from experiments.runner import Outcome, Run
 
 EPISODES = 50
-LONG = 200
+LONG = (200, 500)
 RIVAL = "DDPG"
 NOTES = Path(__file__).with_name("notes.md")
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "numpy", "scipy", "ppopt")
@@ -61,9 +61,13 @@ def write_report(
             f"## After {episodes} training episodes\n\n{LEGEND}",
             [_learner_table(outcomes, plant, episodes) for plant in plants],
         ),
-        *_headed(
-            f"## After {LONG} training episodes",
-            [_learner_table(outcomes, plant, LONG, only_learned=True) for plant in plants],
+        *(
+            part
+            for long in LONG
+            for part in _headed(
+                f"## After {long} training episodes",
+                [_learner_table(outcomes, plant, long, only_learned=True) for plant in plants],
+            )
         ),
         *_headed(f"## Learning curves\n\n{CURVES}", curves),
         notes.read_text(encoding="utf-8").strip() if notes.exists() else "",

@@ -64,7 +64,8 @@ _SETTINGS: dict[str, Any] = {
     "device": "cpu",
 }
 
-_TUNED: dict[str, Any] = {"learning_rate": 1e-3}
+TUNED: dict[str, Any] = {"learning_rate": 1e-3}
+"""Of SAC and TQC."""
 
 
 @dataclass(frozen=True)
@@ -187,16 +188,25 @@ def sb3_td3(make_env: MakeEnv, seed: int) -> Learner:
     return _plain(TD3, make_env, seed)
 
 
-def sb3_sac(make_env: MakeEnv, seed: int) -> Learner:
-    """Return SB3's SAC (Haarnoja et al., ICML 2018), from random networks."""
-    return _plain(SAC, make_env, seed, noise=0.0, **_TUNED)
+def algorithm_named(name: str) -> Any:
+    """Return SAC, TQC or PPO; TQC is sb3-contrib's."""
+    if name == "TQC":
+        from sb3_contrib import TQC
+
+        return TQC
+    return {"SAC": SAC, "PPO": PPO}[name]
 
 
-def sb3_tqc(make_env: MakeEnv, seed: int) -> Learner:
-    """Return sb3-contrib's TQC (Kuznetsov et al., ICML 2020), from random networks."""
-    from sb3_contrib import TQC
+def maximum_entropy(make_env: MakeEnv, seed: int, algorithm: str) -> Learner:
+    """Return SB3's SAC or sb3-contrib's TQC, from random networks.
 
-    return _plain(TQC, make_env, seed, noise=0.0, **_TUNED)
+    References
+    ----------
+    T. Haarnoja et al., Soft actor-critic, ICML 2018. A. Kuznetsov et al., Controlling
+    overestimation bias with truncated mixture of continuous distributional quantile critics, ICML
+    2020.
+    """
+    return _plain(algorithm_named(algorithm), make_env, seed, noise=0.0, **TUNED)
 
 
 def sb3_ppo(make_env: MakeEnv, seed: int) -> Learner:

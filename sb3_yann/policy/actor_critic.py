@@ -305,6 +305,12 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         theta = self.extract_features(obs, self.features_extractor)
         return self._in_rewards(-first.value(theta.double()).float())
 
+    @property
+    def unit(self) -> float:
+        """Size of the values that are learnt, in rewards."""
+        first: Any = self.q_networks[0]
+        return float(self.scale * first.scale)
+
     def stage_cost_of_batch(self) -> float:
         """Return the mean stage cost of the latest points to learn from."""
         first: Any = self.q_networks[0]

@@ -53,6 +53,11 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
 
     Parameters
     ----------
+    initial_std : float, default 0.1
+        As that of :class:`YannSACPolicy`, but larger: PPO learns from drawn actions alone what a
+        better one is.
+    actor_lr_mult : float, default 1
+        Multiple of the algorithm's ``learning_rate`` for the actor.
     *args, **kwargs
         As those of :class:`YannSACPolicy`, without ``critic_warmup``; there is one critic, of the
         kind "afterstate".
@@ -66,8 +71,10 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
 
     ALGORITHMS = (PPO,)
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(
+        self, *args: Any, initial_std: float = 0.1, actor_lr_mult: float = 1.0, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, initial_std=initial_std, actor_lr_mult=actor_lr_mult, **kwargs)
         self._squash_output = True  # actions are in [-1, 1], and SB3 gives them units
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -146,8 +153,13 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Return values, the logarithm of the actions' density, and the entropy."""
         self.critic.know_scale(obs, actions)
-        distribution = self.get_distribution(obs)
-        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
+        distribution, values = self.get_distribution(obs), self.predict_values(obs)
+        if values.requires_grad:
+            # The error of values in their own unit: one gradient of both networks is clipped, and
+            # in units of rewards the critic's would leave nothing of the actor's.
+            unit = self.critic.unit
+            values.register_hook(lambda each: each / unit**2)  # type: ignore[no-untyped-call]
+        return values, distribution.log_prob(actions), distribution.entropy()
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         distribution = self.get_distribution(observation)

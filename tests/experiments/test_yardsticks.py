@@ -16,8 +16,10 @@ from experiments.yardsticks import (
     best_of_ddpg,
     cloned,
     lqr,
+    maximum_entropy,
     residual_rl,
     sb3_ddpg,
+    sb3_ppo,
     sb3_td3,
 )
 from sample_plants import Recorder
@@ -32,6 +34,8 @@ BUILDERS = {
     "residual": residual_rl,
     "quiet residual": partial(residual_rl, noise=0.0),
     "cloned": cloned,
+    "sac": partial(maximum_entropy, algorithm="SAC"),
+    "tqc": partial(maximum_entropy, algorithm="TQC"),
 }
 
 
@@ -76,6 +80,21 @@ def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_
     assert np.all(np.abs(executed) <= env.action_space.high)
     one, _ = learner.policy.predict(states[0])
     np.testing.assert_allclose(one, after[0], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+def test_ppo_learns_on_normalized_observations_and_actions(env_id) -> None:
+    env = recorder(env_id)
+    learner = sb3_ppo(lambda: env, 0)
+    states = random_states(env)
+    before, _ = learner.policy.predict(states)
+    learner.model.learn(2048)
+    after, _ = learner.policy.predict(states)
+    assert len(env.pairs) == 2048 and after.dtype == np.float32 and np.any(after != before)
+    high = env.action_space.high
+    assert np.all(np.abs(after) <= high) and 0.2 < np.abs(env.recorded()[1] / high).std() < 0.6
+    seen = learner.policy.features(env.recorded()[0])
+    assert np.all(np.abs(seen.mean(axis=0)) < 0.1) and np.all(np.abs(seen.std(axis=0) - 1) < 0.1)
 
 
 @pytest.mark.parametrize("env_id", ENVS)

@@ -165,6 +165,19 @@ def test_a_guard_keeps_what_is_no_worse_and_the_export_is_the_deterministic_poli
     assert np.allclose([controller(each) for each in obs], actions, atol=1e-6)
 
 
+def test_units_of_the_reward_leave_ppo_s_actor_its_share_of_the_clipped_gradient() -> None:
+    weights = []
+    for scale in (1.0, 1000.0):
+        env = gym.wrappers.TransformReward(LinearPlant(scalar_mpc()), lambda r, k=scale: k * r)
+        model = build(PPO, env, problem=scalar_mpc(), critic={"reward_scale": scale})
+        model.learn(64)
+        weights.append(th.cat([each.flatten() for each in model.policy.actor.parameters()]))
+    start = th.cat([each.flatten() for each in build(PPO).policy.actor.parameters()])
+    moved = (weights[0] - start).abs().max()
+    assert moved > 1e-3
+    assert (weights[1] - weights[0]).abs().max() < 0.05 * moved
+
+
 @EXPLORING
 def test_no_action_noise_explains_itself(algorithm) -> None:
     with pytest.warns(UserWarning, match="turns nothing off here"):
