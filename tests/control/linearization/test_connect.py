@@ -18,29 +18,24 @@ def box(low: Any, high: Any) -> gym.spaces.Box:
 
 
 class Plant(gym.Env[Any, Any]):
-    """A stable plant of one state, with a fault whose size is given."""
+    """A stable plant of one state, with a fault."""
 
     dt = 0.5
 
-    def __init__(self, fault: str = "", size: float = 0.0, wide: float = 4.0) -> None:
-        self.observation_space, self.action_space = box([-wide], [wide]), box([-1], [1])
-        self.fault, self.size, self.kept = fault, size, 0.0
+    def __init__(self, fault: str = "") -> None:
+        self.observation_space, self.action_space = box([-4], [4]), box([-1], [1])
+        self.fault = fault
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         self.x = np.array((options or {}).get("state", [0.0]), float)
-        if self.fault == "shifts":
-            self.x = self.x + self.size
         return self._seen(), {}
 
     def step(self, action: Any) -> Any:
         self.x = 0.5 * self.x + 0.25 * np.asarray(action)
-        if self.fault == "has a lag":
-            self.x = self.x + self.size * self.kept
-            self.kept = float(np.asarray(action)[0])
         return self._seen(), 0.0, self.fault == "ends", False, {}
 
     def _seen(self) -> Any:
-        return self.x + (self.size if self.fault == "shows another" else 0.0)
+        return self.x + (self.fault == "shows another")
 
 
 class Clock(Plant):
@@ -108,7 +103,7 @@ def test_the_notes_tell_what_was_solved_for_and_what_is_observed() -> None:
     )
     assert not any("observation is not this state" in n or "terminates" in n for n in model.notes)
     shown = LinearModel.from_env(
-        Plant("shows another", 1.0), x_ss=[0.0], u_ss=[0.0], get_state=lambda env: env.x
+        Plant("shows another"), x_ss=[0.0], u_ss=[0.0], get_state=lambda env: env.x
     )
     assert any("The observation is not this state." in n for n in shown.notes)
     ends = LinearModel.from_env(Plant("ends"), x_ss=[0.0], u_ss=[0.0])
