@@ -10,7 +10,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_yann.policy.actor_critic import YannCritic
-from sb3_yann.policy.sb3_hooks import single_precision
+from sb3_yann.policy.sb3_hooks import restore_learning_rate, single_precision
 from sb3_yann.policy.spread import Explores, TruncatedNormal
 
 
@@ -114,7 +114,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
 
     def _attach_hooks(self) -> None:
         self.optimizer.register_step_pre_hook(self._before_step)
-        self.optimizer.register_step_post_hook(self._after_step)
+        self.optimizer.register_step_post_hook(restore_learning_rate)
 
     def _before_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
         self.critic_updates.add_(not self._refuses("actor", optimizer))
@@ -122,11 +122,6 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
             group["scheduled_lr"] = group["lr"]
             group["lr"] = group["multiple"] * group["lr"]
         optimizer.param_groups[0]["lr"] *= self.actor_step
-
-    @staticmethod
-    def _after_step(optimizer: th.optim.Optimizer, *_: Any) -> None:
-        for group in optimizer.param_groups:
-            group["lr"] = group.pop("scheduled_lr")
 
     def get_distribution(self, obs: Any) -> TruncatedNormal:  # type: ignore[override]
         """Return the distribution of actions in [-1, 1]."""

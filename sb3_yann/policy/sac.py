@@ -17,12 +17,15 @@ class MaximumEntropy(Explores):
     """What SAC and TQC need besides: an entropy that their defaults keep as small as it begins.
 
     The coefficient starts where the linear model's price of the spread balances its entropy, and
-    the target is the entropy at the start; a number that the user gives stays.
+    the target is the entropy at the start; a number that the user gives stays. The first actions
+    are drawn as all others are, where SB3 draws ``learning_starts`` of them from the whole range.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         algorithm: Any = None if self._algorithm is None else self._algorithm()
+        if algorithm is not None:
+            algorithm.learning_starts = 0
         if algorithm is not None and algorithm.ent_coef == "auto":
             algorithm.ent_coef = f"auto_{self.balanced_entropy_coefficient():.6e}"
         if algorithm is not None and algorithm.target_entropy == "auto":
@@ -51,7 +54,8 @@ class YannSACPolicy(MaximumEntropy, SACPolicy):  # type: ignore[misc]
     """A SAC policy whose most likely action is that of a linear MPC, exactly.
 
     ``SAC("YannPolicy", env)``. The critic starts as the law's value without the entropy term, which
-    shifts it by a number that is the same for all actions.
+    shifts it by a number that is the same for all actions. ``learning_starts`` becomes 0:
+    ``critic_warmup`` says how long the actor waits.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from scipy import stats
 from stable_baselines3 import DDPG, PPO, SAC
 
 from policy_samples import scalar_mpc
-from sample_plants import LinearPlant, feasible_states
+from sample_plants import LinearPlant, Recorder, feasible_states
 from sb3_yann import (
     ControlDiagnostics,
     CostAudit,
@@ -182,6 +182,18 @@ def test_units_of_the_reward_leave_ppo_s_actor_its_share_of_the_clipped_gradient
 def test_no_action_noise_explains_itself(algorithm) -> None:
     with pytest.warns(UserWarning, match="turns nothing off here"):
         build(algorithm).learn(32, callback=NoActionNoise())
+
+
+@EXPLORING
+def test_from_the_first_step_on_actions_are_near_the_mpc_s(algorithm) -> None:
+    env = Recorder(LinearPlant(scalar_mpc()))
+    small = SMALL.get(algorithm, {})
+    with pytest.warns(UserWarning, match="That belongs into a simulator"):
+        model = algorithm("YannPolicy", env, policy_kwargs={"problem": scalar_mpc()}, **small)
+        model.learn(32)
+    observations, actions = env.recorded()
+    law = scalar_mpc().explicit()(observations)
+    assert np.abs(actions[:32] - law[:32]).max() < 6 * model.policy.initial_std * 2
 
 
 @EXPLORING
