@@ -105,10 +105,7 @@ def _parser() -> argparse.ArgumentParser:
         "--checks", metavar="FILE.json", help="limits of readings, and how to fall back"
     )
     one.add_argument(
-        "--observer",
-        choices=("none", "caller"),
-        default="none",
-        help="who estimates what an observer does: an export holds none",
+        "--estimator", choices=("caller",), help="your code runs the estimator of disturbances"
     )
 
     one = add("commission", _commission, "improve a model on its plant, batch by batch")
@@ -193,7 +190,7 @@ def _export(options: Namespace) -> None:
         name=options.name,
         precision="float" if options.float else "double",
         checks=_checks(options.checks),
-        observer=options.observer,
+        estimator=options.estimator,
     )
     print(f"Written: {written}")
 

@@ -6,6 +6,7 @@ import csv
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -205,7 +206,8 @@ class Log:
         episode : str, optional
             A column that changes from one episode to the next.
         time : str, optional
-            A column of times in the unit of ``dt``; an episode ends where a step takes another.
+            A column of times in the unit of ``dt``, or of time stamps as of ISO 8601 with ``dt`` in
+            seconds; an episode ends where a step takes another.
         delimiter : str, default ","
             Between two columns.
         time_unit : str, optional
@@ -257,9 +259,7 @@ class Log:
         ends[1:] |= no_state | no_input
         times = None
         if time is not None:
-            times = np.array(
-                [_number(path, k, row, columns[time]) for k, row in enumerate(content)]
-            )
+            times = np.array([_time(path, k, row, columns[time]) for k, row in enumerate(content)])
         edges = pairwise(np.flatnonzero(ends))
         parts = [slice(first, stop) for first, stop in edges if stop - first > 1]
         if not parts:
@@ -352,6 +352,20 @@ def _number(path: object, row: int, content: dict[str, str], name: str) -> float
         return float(text) if text else np.nan
     except ValueError:
         raise ValueError(f"{path}, row {row + 2}: {name} is {text!r}, expected a number.") from None
+
+
+def _time(path: object, row: int, content: dict[str, str], name: str) -> float:
+    """Return a time as it is given, a time stamp in seconds."""
+    try:
+        return _number(path, row, content, name)
+    except ValueError:
+        try:
+            stamp = datetime.fromisoformat(content[name].strip())
+        except ValueError:
+            pass
+        else:
+            return (stamp - datetime(1970, 1, 1, tzinfo=stamp.tzinfo)).total_seconds()
+        raise
 
 
 def _require_one_state_more(name: str, parts: list[Array], states: list[Array]) -> None:

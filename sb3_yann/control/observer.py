@@ -134,12 +134,23 @@ class StateEstimator:
         """The estimated disturbance (d,)."""
         return self.estimate[self.model.n_states :].copy()
 
-    def reset(self, y: ArrayLike) -> tuple[Array, Array]:
-        """Restart with d_hat = 0 and the smallest x_hat that gives y (q,); return both."""
+    def reset(
+        self, y: ArrayLike, u: ArrayLike | None = None, d: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """Restart from a reading y (q,); return x_hat and d_hat.
+
+        With the plant's input u (m,), and its measured disturbances d, the filter starts where it
+        would rest, had y, u and d always been these. Without u, d_hat is 0 and x_hat the smallest
+        state that gives y. What is NaN counts as at the operating point.
+        """
         now = np.array(y, np.float64)
         now = check_array("y", np.where(np.isnan(now), 0.0, now), (self.n_measured,))
-        start = self._smallest @ now
-        self.estimate = np.concatenate([start, np.zeros(self.n_estimated)])
+        if u is None:
+            self.estimate = np.concatenate([self._smallest @ now, np.zeros(self.n_estimated)])
+        else:
+            u = check_array("u", u, (self.model.n_inputs,))
+            d = check_array("d", np.zeros(self.n_known) if d is None else d, (self.n_known,))
+            self.estimate = self.resting @ np.concatenate([now, u, d])
         return self.x_hat, self.d_hat
 
     def update(self, y: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -163,6 +174,13 @@ class StateEstimator:
     def _smallest(self) -> Array:
         """The matrix (n, q) from outputs to the smallest state that gives them."""
         return np.asarray(np.linalg.pinv(self.C))
+
+    @cached_property
+    def resting(self) -> Array:
+        """The matrix from constant ``[y; u; d]`` to the estimate at which the filter rests."""
+        left = np.eye(len(self.A)) - self.gain @ self.C_aug
+        driven = np.hstack([self.gain, left @ self.B, left @ self.E])
+        return np.asarray(np.linalg.solve(np.eye(len(self.A)) - left @ self.A, driven))
 
     def _after(self, u: ArrayLike, d: ArrayLike | None) -> Array:
         if (d is None) != (self.n_known == 0):

@@ -9,6 +9,7 @@ from importlib.resources import files
 from sb3_yann.deployment import code
 from sb3_yann.deployment.code import Arrays, literal, table
 from sb3_yann.deployment.controller import steps_of
+from sb3_yann.deployment.known_answers import known_answers
 
 
 def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, str]:
@@ -26,14 +27,22 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
         What the files are called, without a suffix.
     """
     lines = [f"  {line}" for line in code.signal_lines(data, "action")]
-    n_obs, m = data["obs_matrix"].shape[1], len(data["action_scale"])
+    n_obs, n_seen = len(data["obs_rest"]), data["obs_matrix"].shape[1]
+    sizes = {"N_OBS": n_obs, "N_SEEN": n_seen, "N_INPUTS": len(data["action_scale"])}
+    memory = ""
+    if estimates := len(data.get("est_gain", ())):
+        memory = f"    yann_real estimate[{estimates}]; /* states and disturbances */\n"
+        if loads := len(data["est_loads"]):
+            memory += f"    yann_real load[{loads}]; /* measured disturbances */\n"
     entries = {
         "ABOUT": comment([*about.splitlines(), "", *lines, "", f"{code.Cost.of(data)}."]),
-        "SIZES": f"#define YANN_N_OBS {n_obs}\n#define YANN_N_INPUTS {m}",
+        "SIZES": "\n".join(f"#define YANN_{key} {size}" for key, size in sizes.items()),
+        "MEMORY": memory,
         "REAL": precision,
         "TABLES": _definitions(data, precision),
         "ONLINE": _template("online.c") if "qp_gram" in data else "",
-        **code.known_answers(data, precision),
+        "ESTIMATOR": _template("estimator.c") if estimates else "",
+        **known_answers(data, precision),
     }
     suffixes = {"controller.c": ".c", "controller.h": ".h", "selftest.c": "_selftest.c"}
     texts = {file + suffix: fill(each, entries, data) for each, suffix in suffixes.items()}
@@ -82,7 +91,10 @@ def _definitions(data: Arrays, precision: str) -> str:
         "MOVING": int(len(data["moving"]) > 0),
         "N_NETWORKS": n_networks,
         "ONLINE": int("qp_gram" in data),
+        "N_ESTIMATES": len(data.get("est_gain", ())),
     }
+    if "est_gain" in data:
+        flags |= {"N_OUTPUTS": len(data["est_C"]), "N_LOADS": len(data["est_loads"])}
     if "qp_gram" in data:
         rows, most = len(data["qp_d0"]), int(data["qp_most"])
         flags |= {"QP_ROWS": rows, "QP_MOST": most, "QP_FIXED": len(data["qp_fixed"])}

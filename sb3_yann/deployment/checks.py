@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +19,15 @@ class Checks:
     Parameters
     ----------
     obs_min, obs_max : array_like, shape (n_obs,), or float, optional
-        Limits of the readings, in the units of the export. None is no limit.
+        Limits of the readings, in the units of the export. None is no limit. Readings are what the
+        sensors say, not what an estimator makes of them.
     frozen_after : int, default 0
         A state that stays the same to the bit for so many steps in which another reading moves is
         frozen. 0 checks nothing: only you know how coarse a sensor is.
+    missing : int or list of int, default 0
+        For how many steps in a row a reading may be NaN before that is a fault, one number or one
+        for each: 60 for a laboratory's hourly value among readings of every minute. An estimator
+        goes on without it, elsewhere the last good one stands in.
     late_after : float, optional
         A step is late when more time has passed since the last one, in units of dt, 1.5 by default.
         It is checked where a step is told the time. None checks nothing.
@@ -41,6 +47,7 @@ class Checks:
     obs_min: ArrayLike | None = None
     obs_max: ArrayLike | None = None
     frozen_after: int = 0
+    missing: int | Sequence[int] = 0
     late_after: float | None = 1.5
     hold: int = 5
     recover: int = 10
@@ -49,11 +56,16 @@ class Checks:
     def arrays(self, size: int) -> dict[str, Any]:
         """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""
         low, high = check_bounds("obs", self.obs_min, self.obs_max, size)
-        counts = {
+        counts: dict[str, Any] = {
             name: np.int64(check_int(name, getattr(self, name), 0))
             for name in ("frozen_after", "hold", "recover", "transfer")
         }
         late = np.inf
         if self.late_after is not None:
             late = check_positive("late_after", self.late_after, "None checks nothing.")
+        given = np.ravel(self.missing).tolist()
+        if len(given) not in (1, size):
+            raise ValueError(f"missing = {self.missing} must be one number, or {size}.")
+        missing = [check_int("missing", each, 0) for each in given]
+        counts["missing"] = np.resize(np.array(missing, np.int64), size)
         return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.deployment.controller import FAR, MODES, Controller, steps_of
+from sb3_yann.deployment.controller import FAR, Controller, steps_of
 
 Arrays = Mapping[str, Any]
 Tables = dict[str, NDArray[Any]]
@@ -73,13 +73,21 @@ def search_tolerances(data: Arrays, precision: str) -> dict[str, float]:
 
 def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
     """Return the tables of numbers and those of indices, by their names in code."""
-    same = "A b gains offsets obs_matrix obs_offset obs_rest obs_min obs_max action_shift"
+    same = "A b gains offsets obs_matrix obs_offset obs_rest seen_rest obs_min obs_max action_shift"
     numbers: Tables = {name: data[name] for name in same.split()}
     numbers["action_scale"] = action_scale(data, precision)
     numbers["input_min"], numbers["input_max"] = data["bounds"]
     numbers["far"] = FAR * np.abs(data["box"]).max(0)
     starts = np.array([*data["starts"], len(data["b"])])
     indices: Tables = {"starts": starts, "watched": data["watched"].astype(np.int64)}
+    indices |= {"source": data["source"], "missing": data["missing"]}
+    if "est_gain" in data:
+        names = ("est_step", "est_rest", "est_first", "est_C", "est_gain")
+        numbers |= {name: data[name] for name in names}
+        numbers["input_scale"], numbers["input_shift"] = data["est_input"]
+        numbers["est_min"], numbers["est_max"] = data["est_box"]
+        if len(data["est_loads"]):
+            indices["est_loads"] = data["est_loads"]
     if data["zero_input"]:
         numbers["resting"] = data["resting"]
     if len(data["change"]):
@@ -157,6 +165,9 @@ class Cost:
             rows, most = len(data["qp_d0"]), int(data["qp_most"])
             program = rows * n + steps_of(data) * most * (rows + 2 * most)
         products += 2 * data["kept"].size
+        filtering = sum(
+            data[name].size for name in ("est_step", "est_C", "est_gain") if name in data
+        )
         return cls(
             numbers=sum(each.size for each in [*numbers.values(), *search_numbers.values()]),
             indices=sum(each.size for each in [*indices.values(), *search_indices.values()]),
@@ -164,10 +175,11 @@ class Cost:
             multiplications=n * n_obs
             + search
             + program
+            + filtering
             + m * (n + 2)
             + (products + 2 * n) * bool(widths),
             activations=2 * hidden,
-            locals=2 * n + 8 * m + hidden + 8,
+            locals=2 * n + 8 * m + hidden + 8 + 2 * n_obs,
         )
 
     def __str__(self) -> str:
@@ -248,7 +260,7 @@ def ascii_text(lines: Iterable[str]) -> str:
     return "\n".join(lines).encode("ascii", "backslashreplace").decode()
 
 
-# ---- Known answers ----
+# ---- Points at which answers are known ----
 
 
 def sample_observations(controller: Controller, count: int, seed: int = 0) -> Array:
@@ -268,7 +280,7 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     size = 1e-6 if precision == "float" else 1e-13
     scale = np.abs(obs).max(0)
     actions, kept = controller.evaluate(obs), np.ones(len(obs), bool)
-    half = _input_ranges(controller, actions) / 2
+    half = input_ranges(controller, actions) / 2
     rooms = room_outside(controller.data, precision), room_of(controller.data, precision)
     inside = controller.in_domain(obs)
     room = np.where(inside, rooms[1], rooms[0])[:, None]
@@ -283,59 +295,8 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     return np.asarray(obs[kept])
 
 
-def _input_ranges(controller: Controller, actions: Array) -> Array:
+def input_ranges(controller: Controller, actions: Array) -> Array:
     """Return the ranges of the inputs (m,), of those without bounds what the actions span."""
     scale, bounds = controller.data["action_scale"], controller.data["bounds"]
     largest = np.abs(actions - controller.data["action_shift"]).max(0)
     return 2 * np.where(np.isfinite(bounds).all(0), scale, np.maximum(scale, largest))
-
-
-def known_answers(data: Arrays, precision: str) -> dict[str, str]:
-    """Return what the self-test in C is filled with: points and steps, and what they must give.
-
-    ValueError if a rounding changes all answers.
-    """
-    controller, n_points, n_steps = Controller(data), 48, 60
-    drawn = sample_observations(controller, 4 * n_points)
-    if precision == "float":
-        drawn = drawn.astype(np.float32).astype(np.float64)
-    obs = insensitive(controller, drawn, precision)[:n_points]
-    if not len(obs):
-        raise ValueError(
-            f"In {precision} a rounding of a reading moves the output by more than "
-            f"{room_of(data, precision):g} of its range, at all points tried: readings are large "
-            "beside what they move by. Pass precision='double'."
-        )
-    steps = np.arange(n_steps)
-    readings = obs[steps // 4 % len(obs)]
-    lost = ((steps >= 10) & (steps < 13)) | ((steps >= 30) & (steps < 40))
-    elapsed = np.where(steps == 20, 3.0, 1.0)
-    requests = np.select([(steps >= 50) & (steps < 53), steps >= 56], [1, 2], 0)
-    actions, status, modes = [], [], []
-    for k in steps:
-        reading = readings[k].copy()
-        if lost[k]:
-            reading[0] = np.nan
-        controller.request = MODES[requests[k]]
-        actions.append(controller(reading, elapsed=elapsed[k]))
-        status.append(int(controller.status))
-        modes.append(MODES.index(controller.mode))
-    numbers = {
-        "points": obs,
-        "policy": controller.evaluate(obs),
-        "law": controller.evaluate(obs, networks=False),
-        "readings": np.where(lost[:, None] & (np.arange(obs.shape[1]) == 0), 0.0, readings),
-        "elapsed": elapsed,
-        "actions": np.array(actions),
-        "range_of": _input_ranges(controller, controller.evaluate(drawn)),
-    }
-    whole = {"lost": lost, "requests": requests, "status": status, "modes": modes}
-    texts = [table("yann_real", name, each, precision) for name, each in numbers.items()]
-    texts += [table("int", name, np.array(each), precision) for name, each in whole.items()]
-    return {
-        "VECTORS": "\n".join(texts),
-        "POINTS": str(len(obs)),
-        "STEPS": str(n_steps),
-        "ROOM_INSIDE": f"{room_of(data, precision):g}",
-        "ROOM_OUTSIDE": f"{room_outside(data, precision):g}",
-    }

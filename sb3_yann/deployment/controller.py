@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-FORMATS = (1, 2)  # of the arrays; a reader takes its own only: the second has rows to keep
+FORMATS = (1, 2, 3)  # of the arrays; a reader takes its own only: rows to keep, an estimator
 POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
 MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
 FAR = 1e12  # theta is clipped to so many times its box: beyond, slacks would overflow
@@ -60,9 +60,37 @@ def _shapes_of_program(
     return [(f"qp_{name}", shape) for name, shape in shapes.items()]
 
 
+def _shapes_of_estimator(
+    data: Mapping[str, Any], n_read: int, n_obs: int, m: int
+) -> list[tuple[str, tuple[int, ...]]]:
+    """Return names and shapes of an estimator's arrays; none where there is none.
+
+    ValueError where an entry of what the policy sees has no place that it comes from.
+    """
+    size = q = k = 0
+    if "est_gain" in data:
+        (size, q), k = data["est_gain"].shape, len(data["est_loads"])
+    places = data["source"]
+    for name, most in (("source", n_read + size + m), ("est_loads", n_read)):
+        at = data[name] if name in data else places[:0]
+        if at.dtype.kind != "i" or (at < 0).any() or (at >= most).any():
+            raise ValueError(f"{name} holds what is no place of a reading or an estimate")
+    shapes: dict[str, tuple[int, ...]] = {
+        "source": (n_obs,),
+        "seen_rest": (n_obs,),
+        "missing": (n_read,),
+    }
+    if size:
+        shapes |= {"est_step": (size, size + m + k + 1), "est_rest": (size, q + m + k + 1)}
+        shapes |= {"est_first": (size, q + 1), "est_C": (q, size), "est_gain": (size, q)}
+        shapes |= {"est_input": (2, m), "est_loads": (k,), "est_box": (2, size)}
+    return [*shapes.items()]
+
+
 def _check_arrays(data: Mapping[str, Any]) -> None:
     """Raise ValueError where arrays do not fit together, or a step cannot use them."""
     (p, m, n), (q,), n_obs = data["gains"].shape, data["b"].shape, data["obs_matrix"].shape[-1]
+    n_read = len(data["obs_rest"])
     counts = "hold recover transfer frozen_after n_layers"
     shapes: list[tuple[tuple[int, ...], str]] = [
         ((p, m, n), "gains"),
@@ -75,7 +103,7 @@ def _check_arrays(data: Mapping[str, Any]) -> None:
         ((2,), "tolerances fades"),
         ((n, n_obs), "obs_matrix"),
         ((n,), "obs_offset per_theta"),
-        ((n_obs,), "obs_rest obs_min obs_max watched obs_names"),
+        ((n_read,), "obs_rest obs_min obs_max watched obs_names"),
         ((2, m), "bounds"),
         ((2 if len(data["change"]) else 0, m), "change"),
         ((2 if len(data["moving"]) else 0, m), "moving"),
@@ -89,7 +117,8 @@ def _check_arrays(data: Mapping[str, Any]) -> None:
         wanted.append((f"layer{i}", (k, width, size + 1)))
         size = width
     wanted += _shapes_of_program(data, n, m)
-    may_be_infinite = "bounds change obs_min obs_max late_after reach confines".split()
+    wanted += _shapes_of_estimator(data, n_read, n_obs, m)
+    may_be_infinite = "bounds change obs_min obs_max late_after reach confines est_box".split()
     for name, shape in wanted:
         if data[name].shape != shape:
             raise ValueError(f"{name} has shape {data[name].shape}, expected {shape}")
@@ -134,7 +163,11 @@ def _as_readings(name: str, value: Any) -> Array:
 class Controller:
     """What runs in production: ``controller(obs)`` is the action, with a fallback at every step.
 
-    A faulty reading is replaced by the last good one, and the MPC's law acts alone. After ``hold``
+    With an estimator obs are the measured outputs y, then references and what else theta holds and
+    nothing estimates: ``controller([*y, *r])``.
+
+    A faulty reading is replaced by the last good one, and the MPC's law acts alone. An estimator
+    goes on without a faulty output. After ``hold``
     steps with a fault the output is held: manual. Once the readings are good again the law acts,
     and after ``recover`` good steps the policy. At every change the output goes on from where it
     was, and the difference fades within ``transfer`` steps.
@@ -153,9 +186,9 @@ class Controller:
         Steps, those of each mode, those with each status, and changes of the mode.
     name : str
     obs_names, action_names : tuple of str
-        What the entries are called.
+        What the entries of a step are called.
     note : str
-        What it lacks, such as an observer that the caller runs; empty where nothing.
+        What it lacks, such as an estimator that the caller runs; empty where nothing.
 
     Examples
     --------
@@ -181,8 +214,12 @@ class Controller:
         self.data = {name: np.asarray(each) for name, each in data.items()}
         try:
             (_, m, n) = self.data["gains"].shape
+            n_obs = self.data["obs_matrix"].shape[-1]
             self.data.setdefault("kept", np.empty((0, n + m + 2)))  # as there was none
             self.data.setdefault("moving", np.empty((0, m), np.int64))
+            self.data.setdefault("source", np.arange(n_obs))
+            self.data.setdefault("seen_rest", self.data["obs_rest"])
+            self.data.setdefault("missing", np.zeros(n_obs, np.int64))
             version = int(self.data["format"])
             if version not in FORMATS:
                 raise ValueError(
@@ -225,16 +262,19 @@ class Controller:
 
     def reset(self) -> None:
         """Forget all steps, as at the start: the policy acts, from the operating point."""
-        n_obs, m = len(self.data["obs_rest"]), len(self.data["action_scale"])
+        n_read, m = len(self.data["obs_rest"]), len(self.data["action_scale"])
         self.request = self.mode = POLICY
         self.status = Status(0)
         found = [str(each.name).lower() for each in Status]
         self.counters = dict.fromkeys(["steps", *MODES, *found, "changes"], 0)
         self._good: Array = self.data["obs_rest"].astype(np.float64)  # the last good readings
-        self._last: Array = np.full(n_obs, np.nan)
-        self._same: NDArray[np.int64] = np.zeros(n_obs, np.int64)
+        self._last: Array = np.full(n_read, np.nan)
+        self._same: NDArray[np.int64] = np.zeros(n_read, np.int64)
+        self._absent: NDArray[np.int64] = np.zeros(n_read, np.int64)
         self._faults, self._sound = 0, int(self.data["recover"])
-        self._output: Array = self.evaluate(self.data["obs_rest"], networks=False)
+        self._output: Array = self.evaluate(self.data["seen_rest"], networks=False)
+        self._estimate: Array | None = None  # x_hat, d_hat in plant units
+        self._loads: Array = np.zeros(0)  # the measured disturbances that act until the next step
         self._bump, self._left = np.zeros(m), 0
 
     def evaluate(self, obs: ArrayLike, networks: bool = True) -> Array:
@@ -246,18 +286,18 @@ class Controller:
         Parameters
         ----------
         obs : array_like, shape (n_obs,) or (batch, n_obs)
-            In the units of the export.
+            In the units of the export; with an estimator, what the policy sees of it.
         networks : bool, default True
             False is the MPC's law.
         """
-        rows, single = self._rows(obs)
+        rows, single = self._rows(obs, len(self.data["source"]))
         action: Array = self._act(rows, networks)[0]
         action = action * self.data["action_scale"] + self.data["action_shift"]
         return action[0] if single else action
 
     def in_domain(self, obs: ArrayLike) -> NDArray[np.bool_]:
         """Return where the MPC has a solution: a bool, or (batch,)."""
-        rows, single = self._rows(obs)
+        rows, single = self._rows(obs, len(self.data["source"]))
         inside: NDArray[np.bool_] = self._act(rows, False)[3]
         return inside[0] if single else inside
 
@@ -273,38 +313,43 @@ class Controller:
         elapsed : float, optional
             Time since the last step, in units of dt. None is in time.
         manual : array_like, shape (m,), optional
-            The operator's output where he asks for it; otherwise it is held while manual.
+            The operator's output where he asks for it; otherwise it is held while manual. At the
+            first step it is the plant's present input, whoever acts: the output goes on from it,
+            and the estimator starts at rest there. Without it, it starts at the operating point.
 
         Raises
         ------
         ValueError
             If a shape is wrong, or ``request`` is none of the three.
         """
-        rows, single = self._rows(obs)
+        rows, single = self._rows(obs, len(self._good))
         if not single or self.request not in MODES:
             raise ValueError(
                 f"obs has shape {rows.shape}, request is {self.request!r}; a step takes "
                 f"({self._good.size},) and one of {MODES}. Use evaluate(obs) for a batch."
             )
-        reading, data, m = rows[0], self.data, len(self._output)
-        used, status = self._readings(reading)
+        data, m = self.data, len(self._output)
+        given = np.full(m, np.nan) if manual is None else _as_readings("manual", manual)
+        if given.shape != (m,):
+            raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
+        told = self.counters["steps"] == 0 and bool(np.isfinite(given).all())
+        if told:
+            self._output = given.copy()
+        faulty, status = self._readings(rows[0])
         if elapsed is not None and elapsed > float(data["late_after"]):
             status |= Status.LATE
         mode = self._mode(status)
-        action, low, high, inside, sound = self._act(used[None], mode == POLICY)
+        seen = self._seen(rows[0], faulty, told)
+        action, low, high, inside, sound = self._act(seen[None], mode == POLICY)
         status |= Status(0) if inside[0] else Status.OUTSIDE
         status |= Status(0) if sound[0] else Status.NETWORK
         scale, shift = data["action_scale"], data["action_shift"]
         target = action[0] * scale + shift
         if mode == MANUAL:
-            target = self._output
-            if manual is not None and self.request == MANUAL:
-                given = _as_readings("manual", manual)
-                if given.shape != (m,):
-                    raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
-                target = np.where(np.isfinite(given), given, self._output)
-        if mode != self.mode:
-            self.counters["changes"] += 1
+            by_hand = np.isfinite(given) & (self.request == MANUAL)
+            target = np.where(by_hand, given, self._output)
+        if mode != self.mode or told:
+            self.counters["changes"] += mode != self.mode
             self._left = int(data["transfer"])
             self._bump = self._output - target
         if mode == MANUAL:
@@ -313,9 +358,10 @@ class Controller:
             target = target + self._bump * (self._left / int(data["transfer"]))
             self._left -= 1
         if len(data["change"]):
-            shows_previous = (data["obs_matrix"][-m:] != 0).any(0)
-            if (shows_previous & (used != reading)).any():  # rates count from the own output then
-                last = (self._output - shift) / scale
+            shows_previous = data["source"][(data["obs_matrix"][-m:] != 0).any(0)]
+            lost = self._good != rows[0]
+            if lost[shows_previous[shows_previous < len(lost)]].any():
+                last = (self._output - shift) / scale  # rates count from the own output then
                 low, high = np.clip(last + data["change"], *data["bounds"])[:, None]
         self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
         self.mode, self.status = mode, status
@@ -324,8 +370,8 @@ class Controller:
             self.counters[name] += 1
         return self._output.copy()
 
-    def _readings(self, obs: Array) -> tuple[Array, Status]:
-        """Return the readings to act on, and what is wrong with those that came."""
+    def _readings(self, obs: Array) -> tuple[NDArray[np.bool_], Status]:
+        """Keep the good readings; return which others there are, and what is wrong with them."""
         finite, status = np.isfinite(obs), Status(0)
         beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
         moved = obs != self._last
@@ -334,14 +380,49 @@ class Controller:
         self._last = obs.copy()  # a caller may fill the same array again
         after = int(self.data["frozen_after"])
         frozen = finite & self.data["watched"] & (self._same >= after) & (after > 0)
+        self._absent = np.where(finite, 0, self._absent + 1)
         for which, flag in (
-            (~finite, Status.NOT_FINITE),
+            (self._absent > self.data["missing"], Status.NOT_FINITE),
             (beyond, Status.OUT_OF_RANGE),
             (frozen, Status.FROZEN),
         ):
             status |= flag if which.any() else Status(0)
-        self._good = np.where(~finite | beyond | frozen, self._good, obs)
-        return self._good, status
+        faulty = ~finite | beyond | frozen
+        self._good = np.where(faulty, self._good, obs)
+        return faulty, status
+
+    def _seen(self, obs: Array, faulty: NDArray[np.bool_], told: bool) -> Array:
+        """Return what the policy sees: good readings, estimates and the last input, each in place.
+
+        Parameters
+        ----------
+        obs, faulty : ndarray, shape (n_read,)
+            The readings, and which are not good.
+        told : bool
+            Whether this is the first step and the plant's present input is known.
+        """
+        data = self.data
+        if "est_gain" not in data:
+            return np.asarray(self._good[data["source"]])
+        scale, shift = data["est_input"]
+        u, q = self._output * scale + shift, len(data["est_C"])
+        y = np.where(faulty, np.nan, obs)[:q]
+        loads, rest = self._good[data["est_loads"]], data["obs_rest"][:q]
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self._estimate is not None:
+                found = data["est_step"] @ [*self._estimate, *u, *self._loads, 1.0]
+                left = y - data["est_C"] @ found
+                found = found + data["est_gain"] @ np.where(np.isfinite(left), left, 0.0)
+            elif told:
+                found = data["est_rest"] @ [*np.where(np.isnan(y), rest, y), *u, *loads, 1.0]
+            else:
+                found = data["est_first"] @ [*np.where(np.isnan(y), rest, y), 1.0]
+        if not np.isfinite(found).all():
+            found = data["est_first"] @ [*rest, 1.0]
+        self._estimate, self._loads = found, loads
+        low, high = data["est_box"]
+        shown = np.concatenate([self._good, np.clip(found, low, high), u])
+        return np.asarray(shown[data["source"]])
 
     def _mode(self, status: Status) -> str:
         """Return who acts now."""
@@ -352,13 +433,12 @@ class Controller:
             return MANUAL
         return MPC if self.request == MPC or self._sound < recover else POLICY
 
-    def _rows(self, obs: ArrayLike) -> tuple[Array, bool]:
-        given, n_obs = _as_readings("obs", obs), len(self.data["obs_rest"])
-        if given.ndim not in (1, 2) or given.shape[-1] != n_obs:
-            raise ValueError(
-                f"obs has shape {given.shape}, expected ({n_obs},) or (batch, {n_obs}): "
-                f"{', '.join(self.obs_names)}."
-            )
+    def _rows(self, obs: ArrayLike, size: int) -> tuple[Array, bool]:
+        given = _as_readings("obs", obs)
+        if given.ndim not in (1, 2) or given.shape[-1] != size:
+            names = f": {', '.join(self.obs_names)}" * (size == len(self.obs_names))
+            wanted = f"expected ({size},) or (batch, {size}){names}"
+            raise ValueError(f"obs has shape {given.shape}, {wanted}.")
         return np.atleast_2d(given), given.ndim == 1
 
     def _act(self, obs: Array, networks: bool) -> tuple[Any, ...]:

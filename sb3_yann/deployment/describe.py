@@ -8,23 +8,25 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from sb3_yann._validation import Array, check_choice
-from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine, StateEstimator
 from sb3_yann.control.model.labels import labels_of, missing_observer
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMATS
+from sb3_yann.deployment.estimating import Estimator, estimator_arrays
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import AffineFeatures, keeps_entries
 from sb3_yann.policy.policies import StartsAsMPC
+from sb3_yann.units import ActionUnits
 
 Exportable = BaseAlgorithm | StartsAsMPC | LinearMPC | PiecewiseAffine | OnlineLaw
 
 
 def describe(
-    given: Exportable, name: str, checks: Checks, observer: str = "none"
+    given: Exportable, name: str, checks: Checks, estimator: Estimator = None
 ) -> dict[str, Any]:
     """Return the arrays of a controller.
 
@@ -37,8 +39,8 @@ def describe(
         What the controller is called.
     checks : Checks
         Limits of the readings, and how to fall back.
-    observer : {"none", "caller"}, default "none"
-        Who runs the observer of estimated disturbances.
+    estimator : StateEstimator or "caller", optional
+        What estimates states and disturbances; "caller" where whoever calls it does.
 
     Raises
     ------
@@ -51,18 +53,10 @@ def describe(
             f"{type(given).__name__} cannot be exported: pass a model with a YannPolicy, a "
             "LinearMPC, or a law from LinearMPC.explicit()."
         )
-    problem, note = None, ""
-    if isinstance(policy, StartsAsMPC | LinearMPC):
-        problem = policy.problem if isinstance(policy, StartsAsMPC) else policy
-    model: Any = policy.model if problem is None else problem.model
-    if model is not None:
-        note = missing_observer(model)
-    if check_choice("observer", observer, ("none", "caller")) == "none" and note:
-        raise ValueError(
-            f"{note} An export does not hold it, and does not reach its set-points without it. If "
-            "your code runs the observer and passes what it estimates: export(..., "
-            'observer="caller").'
-        )
+    problem = policy.problem if isinstance(policy, StartsAsMPC) else None
+    problem = policy if isinstance(policy, LinearMPC) else problem
+    own = estimator if isinstance(estimator, StateEstimator) else None
+    note = _lacks(policy, problem, estimator)
     note = " ".join(filter(None, [note, _unconfirmed(given)]))
     if isinstance(policy, StartsAsMPC):
         layer = policy.actor.mu
@@ -84,7 +78,8 @@ def describe(
     labels = [*state_names, *(f"theta[{i}]" for i in range(len(state_names), n))]
     rest: Array = np.zeros(n)
     if problem is not None:
-        labels, rest = _with_sources(problem), problem.theta_rest
+        labels = _with_sources(problem) if own is None else [*problem.labels()]
+        rest = problem.theta_rest
 
     matrix, offset, scale, shift = _signal_maps(policy, law)
     watched = states
@@ -93,26 +88,71 @@ def describe(
             labels = [f"obs[{i}]" for i in range(matrix.shape[1])]
             shown = matrix != 0  # entries are watched that say what states are, and nothing else
             watched = shown[states].any(0) & ~shown[~states].any(0)
+    seen_rest = np.asarray(np.linalg.lstsq(matrix, rest - offset, rcond=None)[0], np.float64)
+    signals = {
+        "source": np.arange(matrix.shape[1]),
+        "obs_names": np.array(labels),
+        "obs_rest": seen_rest,
+        "watched": watched,
+    }
+    if own is not None and problem is not None:
+        units = ActionUnits("plant", np.ones(law.n_inputs), problem.model.u_ss)
+        units = policy.action_units if isinstance(policy, StartsAsMPC) else units
+        signals = estimator_arrays(problem, own, labels, seen_rest, units)
+    limits = checks.arrays(len(signals["obs_rest"]))
+    newest = own is not None or limits["missing"].any()
     return {
         **_law_arrays(law),
         **program,
         **networks,
+        **signals,
+        **limits,
         "change": change,
         "moving": np.empty((0, law.n_inputs), np.int64) if law.moving is None else law.moving,
-        **checks.arrays(matrix.shape[1]),
-        "watched": watched,
-        "format": np.int64(FORMATS[len(networks["kept"]) > 0]),
+        "format": np.int64(FORMATS[2 if newest else len(networks["kept"]) > 0]),
         "name": name,
         "dt": np.float64(0.0 if law.model is None else law.model.dt),
         "obs_matrix": matrix,
         "obs_offset": offset,
-        "obs_rest": np.linalg.lstsq(matrix, rest - offset, rcond=None)[0],
+        "seen_rest": seen_rest,
         "action_scale": scale,
         "action_shift": shift,
-        "obs_names": np.array(labels),
         "action_names": np.array([*input_names]),
         "note": note,
     }
+
+
+def _lacks(policy: Any, problem: LinearMPC | None, estimator: Estimator) -> str:
+    """Return what the controller leaves to its caller; raise where an estimator has no place."""
+    model = policy.model if problem is None else problem.model
+    if isinstance(estimator, StateEstimator):
+        if problem is None or not _shows_theta(policy):
+            raise ValueError(
+                "A law alone, and a policy whose observation mixes entries of theta, do not say "
+                "where estimates belong. Pass the LinearMPC, or a model whose observation is theta."
+            )
+        return ""
+    if estimator not in (None, "caller"):
+        raise ValueError(f'estimator = {estimator!r} must be a StateEstimator or "caller".')
+    note = "" if model is None else missing_observer(model)
+    if estimator is None and note:
+        raise ValueError(
+            f"{note} The controller does not reach its set-points without. Have it exported too: "
+            "export(..., estimator=observer), the one of offset_free or of the env. Where your "
+            'code runs it: estimator="caller".'
+        )
+    return note
+
+
+def _shows_theta(policy: Any) -> bool:
+    """Return whether what is seen is theta, in its own units."""
+    if not isinstance(policy, StartsAsMPC):
+        return True
+    extractor, n = policy.actor.features_extractor, policy.problem.n_theta
+    if not isinstance(extractor, AffineFeatures):
+        return True
+    matrix, offset = extractor.matrix.cpu().numpy(), extractor.offset.cpu().numpy()
+    return np.array_equal(matrix, np.eye(n)) and np.allclose(offset, -policy.problem.theta_ss)
 
 
 def _with_sources(problem: LinearMPC) -> list[str]:

@@ -16,6 +16,7 @@ from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.code import Cost
 from sb3_yann.deployment.describe import Exportable, describe
+from sb3_yann.deployment.estimating import Estimator
 from sb3_yann.deployment.fmu import fmu_file
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
@@ -66,7 +67,7 @@ def export(
     name: str | None = None,
     precision: str = "double",
     checks: Checks | None = None,
-    observer: str = "none",
+    estimator: Estimator = None,
 ) -> Exported:
     """Write a controller that runs without this package, as a file or as code.
 
@@ -94,9 +95,11 @@ def export(
     checks : Checks, optional
         Limits of the readings and how to fall back. By default only what is not finite is a fault,
         and late steps where the time is told.
-    observer : {"none", "caller"}, default "none"
-        Who runs the observer of estimated disturbances, as of :func:`offset_free`: an export holds
-        none, and is refused for such a problem unless the caller does. Every file says so then.
+    estimator : StateEstimator or "caller", optional
+        What estimates states and disturbances from measured outputs. It becomes part of the
+        controller, which then takes the outputs y, references r, measured disturbances, and puts
+        out the input: ``controller([*y, *r])``. "caller" leaves it to your code, and every file
+        says so. A problem with estimated disturbances is refused without.
 
     Returns
     -------
@@ -134,7 +137,12 @@ def export(
             f"{target.stem}.h would stand in for C's own header: call the file something else."
         )
     limits = check_options("checks", checks or Checks(), Checks)
-    data = describe(given, prefix, limits, observer)
+    data = describe(given, prefix, limits, estimator)
+    if kind == "onnx" and "est_gain" in data:
+        raise ValueError(
+            "An ONNX graph has no memory, so it holds no estimator: take another format, or pass "
+            'estimator="caller".'
+        )
     if "qp_gram" in data and (kind in ("onnx", "st", "xml") or precision != "double"):
         raise ValueError(
             "The law is solved online, by a quadratic program at each step. That is exported as "

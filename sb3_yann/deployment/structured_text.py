@@ -112,11 +112,20 @@ def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str
         "rate": len(data["change"]) > 0,
         "moving": len(data["moving"]) > 0,
         "zero input": bool(data["zero_input"]),
+        "estimator": "est_gain" in data,
+        "readings alone": "est_gain" not in data,
+        "loads": len(data.get("est_loads", ())) > 0,
     }
     (p, m, n), hidden = data["gains"].shape, [1, 1]
     for i in range(n_layers - 1):
         hidden[i] = data[f"layer{i}"].shape[1]
-    sizes = {"OBS": data["obs_matrix"].shape[1], "M": m, "N": n, "P": p}
+    sizes = {"OBS": len(data["obs_rest"]), "SEEN": data["obs_matrix"].shape[1]}
+    sizes |= {"M": m, "N": n, "P": p}
+    if flags["estimator"]:
+        (size, q), loads = data["est_gain"].shape, len(data["est_loads"])
+        sizes |= {"EST": size, "Q": q, "LOADS": loads, "FIRST": q + 1}
+        sizes |= {"STEP": size + m + loads + 1, "REST": q + m + loads + 1}
+        sizes["ROOM"] = size + q + m + loads
     sizes |= {"KEPT": len(data["kept"]), "WIDE": n + m + 2}
     sizes |= {"H1": hidden[0], "H2": hidden[1], "HL": hidden[max(n_layers - 2, 0)]}
     kind = "LREAL" if precision == "double" else "REAL"

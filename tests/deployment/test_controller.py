@@ -397,10 +397,10 @@ def test_an_export_without_its_observer_is_refused_or_says_so(suffix, kind, tmp_
         space = spaces.Box(-100, 100, (3,)), spaces.Box(0, 30, (1,))
         policy = {"policy_kwargs": {"problem": given}}
         given = DDPG("YannPolicy", Silent(*space), **policy, device="cpu")
-    with pytest.raises(ValueError, match='observer="caller"'):
+    with pytest.raises(ValueError, match='estimator="caller"'):
         export(given, tmp_path / f"tank.{suffix}")
     assert not [*tmp_path.iterdir()]
-    written = export(given, tmp_path / f"tank.{suffix}", observer="caller")
+    written = export(given, tmp_path / f"tank.{suffix}", estimator="caller")
     assert "runs the observer" in str(written) and "runs the observer" in texts(tmp_path)
     assert "measured" not in str(written)
     if suffix == "npz":
@@ -427,8 +427,8 @@ def test_a_disturbance_that_may_be_measured_or_not_comes_from_the_caller(tmp_pat
     read = Controller.load(tmp_path / "law.npz")
     assert read.obs_names[1] == "d[0] (from the caller's sensor or observer)"
     assert (read.note, written.note) == ("", "") and "NOTE" not in repr(read) + str(written)
-    with pytest.raises(ValueError, match="observer = 'me' must be one of"):
-        export(mpc, tmp_path / "law.npz", observer="me")
+    with pytest.raises(ValueError, match="estimator = 'me' must be"):
+        export(mpc, tmp_path / "law.npz", estimator="me")
 
 
 def test_a_policy_that_nothing_has_confirmed_says_so_in_its_files(tmp_path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -79,6 +80,26 @@ def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
     assert after < 0.99 * before and "violations: 0" in done.stdout
     assert (tmp_path / "out" / "from_a_log.zip").exists()
     assert (tmp_path / "out" / "from_a_log.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_three_tags_become_a_page_and_code(tmp_path) -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "outputs_only.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "order 2" in done.stdout and "act for [3] samples" in done.stdout
+    reached = re.search(r"the kettle is at (.*) °C", done.stdout)
+    assert abs(float(reached[1]) - 82) < 0.3
+    assert (tmp_path / "out" / "kettle.html").stat().st_size > 10_000
+    built = ["gcc", "-std=c99", "kettle.c", "kettle_selftest.c", "-lm", "-o", "test"]
+    if shutil.which("gcc"):
+        subprocess.run(built, cwd=tmp_path / "out", check=True)
+        subprocess.run([tmp_path / "out" / "test"], check=True)
 
 
 @pytest.mark.nightly

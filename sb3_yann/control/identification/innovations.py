@@ -27,8 +27,8 @@ LAGS = (1, 2, 4, 6, 9, 13, 19, 28)
 """Lags of the ARX models that are tried."""
 CHUNK = 2000
 """Longest stretch of samples whose first state is estimated on its own."""
-CHANCE = 0.001
-"""Significance level of the effects of inputs."""
+CHANCES = CHANCE, SURE_CHANCE = 0.001, 1e-6
+"""Significance levels of the effects of inputs."""
 FLOOR = 1e-14
 """Variance, of scaled outputs, below which all is rounding."""
 TINY_RIDGE = 1e-9
@@ -135,11 +135,12 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
     return lags, arx(episodes, lags, lags - 1)
 
 
-def dead_times(episodes: Sequence[Episode], limit: int) -> list[int]:
+def dead_times(episodes: Sequence[Episode], limit: int) -> list[tuple[int, ...]]:
     """Return for each input how many of its latest values have no effect on the next output.
 
     Wald's test that their coefficients in a long ARX model are zero, for one sample more as long as
-    it does not speak against it.
+    it does not speak against it, at each of the levels ``CHANCES``: among many inputs and outputs
+    one that is too strict ends it too early.
     """
     q, m = episodes[0].states.shape[1], episodes[0].inputs.shape[1]
     lags, found = lags_by_criterion(episodes)
@@ -147,15 +148,17 @@ def dead_times(episodes: Sequence[Episode], limit: int) -> list[int]:
     if lags < longest:
         lags, found = longest, arx(episodes, longest, longest - 1)
     width = episodes[0].regressors.shape[1]
+    columns = [[lag * width + q + j for lag in range(lags)] for j in range(m)]
+    # What never acts has no dead time.
+    idle = [no_effect(found, each, CHANCE) for each in columns]
     delays = []
-    for j in range(m):
-        columns = [lag * width + q + j for lag in range(min(limit, lags - 1))]
-        dead = 0
-        while dead < len(columns) and no_effect(found, columns[: dead + 1], CHANCE):
-            dead += 1
-        # What never acts has no dead time.
-        idle = no_effect(found, [lag * width + q + j for lag in range(lags)], CHANCE)
-        delays.append(0 if idle else dead)
+    for chance in CHANCES:
+        dead = [0] * m
+        for j, each in enumerate(columns):
+            longest = 0 if idle[j] else min(limit, lags - 1)
+            while dead[j] < longest and no_effect(found, each[: dead[j] + 1], chance):
+                dead[j] += 1
+        delays.append(tuple(dead))
     return delays
 
 
@@ -239,7 +242,8 @@ class Chunks:
     """Stretches of a log, side by side, in which prediction errors are computed.
 
     The first state of each is a free vector, which a projection takes out (Golub and Pereyra,
-    *Separable nonlinear least squares*, Inverse Problems 19, 2003).
+    *Separable nonlinear least squares*, Inverse Problems 19, 2003). An output that is NaN is
+    replaced by its prediction.
     """
 
     def __init__(self, episodes: Sequence[Episode]) -> None:
@@ -256,42 +260,59 @@ class Chunks:
         self.there = np.zeros((*shape, 1))
         for i, (y, v) in enumerate(parts):
             self.y[i, : len(y)], self.v[i, : len(y)], self.there[i, : len(y)] = y, v, 1.0
+        read = np.isfinite(self.y)
+        self.read, self.lost = read * self.there, ~read * self.there
+        self.y[~read] = 0.0
+        self.gaps = bool(np.any(self.lost))
         self.samples = int(self.there.sum())
+        self.readings: Array = self.read.sum(axis=(0, 1))
 
     def covariance(self, model: Innovations) -> Array:
         """Return the mean square (q, q) of the prediction errors, the first states by its noise."""
-        root = linalg.cholesky(model.noise, lower=True)
+        weight = whitening(model.noise, self.readings)
+        inside = self.there[..., 0] > 0
         with np.errstate(all="ignore"):
-            left = self._simulate(model, linalg.inv(root))[0].reshape(-1, len(root)) @ root.T
-            return np.asarray(left.T @ left / self.samples)
+            left = self._simulate(model, weight)[0].reshape(self.y.shape)[inside]
+            return mean_square(left @ np.linalg.inv(weight).T, self.read[inside] > 0)
+
+    def size(self, noise: Array) -> float:
+        """Return twice the negative log-likelihood of a sample, but for a constant."""
+        return log_determinant(noise, self.readings)
 
     def spread(self, model: Innovations) -> tuple[Array, Array]:
         """Return mean (n,) and covariance (n, n) of the states."""
-        weight = linalg.inv(linalg.cholesky(model.noise, lower=True))
+        weight = whitening(model.noise, self.readings)
         x = self._simulate(model, weight)[1][self.there[..., 0] > 0]
         return x.mean(axis=0), np.atleast_2d(np.cov(x.T, bias=True))
 
     def gauss_newton(self, model: Innovations) -> tuple[Array, Array]:
         """Return the normal equations of a step: the matrix (p, p) and the right side (p,)."""
         n, (count, length, q) = model.order, self.y.shape
-        weight = linalg.inv(linalg.cholesky(model.noise, lower=True))
+        weight = whitening(model.noise, self.readings)
         left, x, basis, inverse = self._simulate(model, weight)
         ones = np.ones((count, length, 1))
-        signals = np.concatenate([x, self.v, self.y - model.y_0, ones], axis=2)
+        shown = self.read * (self.y - model.y_0) + self.lost * (x @ model.C.T)
+        signals = np.concatenate([x, self.v, shown, ones], axis=2)
         w = signals.shape[2]
-        slopes = np.zeros((count, length, q, n * w + q * n + q))
-        inner, C = model.inner, weight @ model.C
+        slopes: Array = np.zeros((count, length, q, n * w + q * n + q))
+        blocks = np.einsum("op,sti->stopi", np.eye(q), x).reshape(count, length, q, q * n)
+        slopes[..., n * w : n * w + q * n] = blocks
+        slopes[..., n * w + q * n :] = np.eye(q)
+        inner, C = model.inner, model.C
         rows = np.arange(n)
         moved: Array = np.zeros((count, n, w, n))
+        by_C: Array = np.zeros((count, n, q * n + q))  # what C and y_0 do where y is predicted
         for k in range(length):
             flat = moved.reshape(count, n, w * n)
             slopes[:, k, :, : n * w] = C @ flat
             moved = (inner @ flat).reshape(count, n, w, n)
             moved[:, rows, :, rows] += signals[:, k]
-        blocks = np.einsum("ok,sti->stoki", weight, x).reshape(count, length, q, q * n)
-        slopes[..., n * w : n * w + q * n] = blocks
-        slopes[..., n * w + q * n :] = weight
-        slopes *= self.there[..., None]
+            if self.gaps:
+                gain = model.K * self.lost[:, k, None, :]
+                slopes[:, k, :, n * w :] += C @ by_C
+                moved += (gain @ slopes[:, k, :, : n * w]).reshape(count, n, w, n)
+                by_C = inner @ by_C + gain @ slopes[:, k, :, n * w :]
+        slopes = (weight @ slopes) * self.read[..., None]
         wide: Array = slopes.reshape(count, length * q, -1)
         wide = wide - basis @ (inverse @ wide)
         flat_slopes = wide.reshape(count * length * q, -1)
@@ -300,22 +321,61 @@ class Chunks:
     def _simulate(self, model: Innovations, weight: Array) -> tuple[Array, Array, Array, Array]:
         """Return weighted errors, states, and what first states do to errors, with its inverse."""
         n, (count, length, q) = model.order, self.y.shape
-        inner, C = model.inner, weight @ model.C
-        fed = self.v @ model.B.T + (self.y - model.y_0) @ model.K.T + model.c
-        free = np.zeros((length, n, n))
+        inner, C, K = model.inner, model.C, model.K
+        errors = self.read * (self.y - model.y_0)
+        fed = self.v @ model.B.T + errors @ K.T + model.c
+        free = np.zeros((count, length, n, n))
         x: Array = np.zeros((count, length, n))
         now: Array = np.zeros((count, n))
-        power: Array = np.eye(n)
+        power: Array = np.tile(np.eye(n), (count, 1, 1))
         for k in range(length):
-            x[:, k], free[k] = now, power
+            x[:, k], free[:, k] = now, power
             now, power = now @ inner.T + fed[:, k], inner @ power
-        basis = ((C @ free)[None] * self.there[..., None]).reshape(count, length * q, n)
-        left = ((self.y - model.y_0) @ weight.T - x @ C.T) * self.there
+            if self.gaps:
+                lost = self.lost[:, k]
+                now = now + (lost * (x[:, k] @ C.T)) @ K.T
+                power = power + K @ (lost[:, :, None] * (C @ free[:, k]))
+        basis = (weight @ (C @ free)) * self.read[..., None]
+        basis = basis.reshape(count, length * q, n)
+        left = ((errors - self.read * (x @ C.T)) @ weight.T) * self.read
         left = left.reshape(count, length * q, 1)
         inverse = np.linalg.pinv(basis, rcond=1e-10)
         first = inverse @ left
-        x = x + np.einsum("tij,sj->sti", free, first[..., 0])
+        x = x + np.einsum("stij,sj->sti", free, first[..., 0])
         return np.asarray(left - basis @ first), x, basis, np.asarray(inverse, np.float64)
+
+
+def whitening(noise: Array, readings: Array) -> Array:
+    """Return the matrix (q, q) that makes errors white: those read more often come first.
+
+    Where one that is read less often is missing, theirs are still white.
+    """
+    order = np.argsort(-readings, kind="stable")
+    at = np.ix_(order, order)
+    found = np.zeros_like(noise)
+    found[at] = linalg.inv(linalg.cholesky(noise[at], lower=True))
+    return found
+
+
+def log_determinant(noise: Array, readings: Array) -> float:
+    """Return that of a covariance, each output as often as it is read."""
+    share = readings / np.max(readings)
+    try:
+        return float(-2 * np.sum(share * np.log(np.diag(whitening(noise, readings)))))
+    except (linalg.LinAlgError, ValueError):
+        return np.inf
+
+
+def mean_square(errors: Array, read: NDArray[np.bool_]) -> Array:
+    """Return the mean square (q, q) of errors (T, q); correlations where all are read."""
+    whole = errors[np.all(read, axis=1)]
+    found = whole.T @ whole / max(len(whole), 1)
+    if len(whole) == len(errors):
+        return np.asarray(found)
+    size = np.sqrt(np.sum(np.where(read, errors, 0.0) ** 2, axis=0) / np.sum(read, axis=0))
+    own = np.sqrt(np.diag(found))
+    scale = np.where(own > 0, size / np.where(own > 0, own, 1.0), 0.0)
+    return np.asarray(scale[:, None] * found * scale)
 
 
 def moved_by(model: Innovations, step: Array) -> Innovations:
@@ -341,7 +401,7 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
     """Return the model of least determinant of its prediction errors' covariance near a model."""
     floor = FLOOR * np.eye(len(model.C))
     model = replace(model, noise=chunks.covariance(model) + floor)
-    size, damping = np.linalg.slogdet(model.noise)[1], 1e-4
+    size, damping = chunks.size(model.noise), 1e-4
     for _ in range(steps):
         matrix, side = chunks.gauss_newton(model)
         scale = np.sqrt(np.diag(matrix)) + 1e-12 * np.sqrt(np.max(np.diag(matrix)))
@@ -351,7 +411,7 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
             trial = moved_by(model, np.linalg.solve(scaled, side / scale) / scale)
             if spectral_radius(trial.inner) < 1:
                 noise = chunks.covariance(trial) + floor
-                now = np.linalg.slogdet(noise)[1] if np.all(np.isfinite(noise)) else np.inf
+                now = chunks.size(noise) if np.all(np.isfinite(noise)) else np.inf
                 if now < size:
                     model, size = replace(trial, noise=noise), now
                     damping = max(damping / 10, 1e-9)

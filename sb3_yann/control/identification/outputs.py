@@ -94,15 +94,15 @@ def fit_structure(
     m = episodes[0].inputs.shape[1]
     trials = [tuple(delays)] if delays is not None else [(0,) * m]
     if delays is None:
-        late = tuple(dead_times(fitted, MAX_DELAY))
-        trials += [late] if any(late) else []
-    searches = [Search(shifted(fitted, lags), shifted(tested, lags), lags) for lags in trials]
+        trials += [each for each in dict.fromkeys(dead_times(fitted, MAX_DELAY)) if any(each)]
+    searches = [Search(fitted, tested, lags) for lags in trials]
     rough = [each.rough(order) for each in searches]
-    best = 0
-    if len(trials) > 1 and (rough[1].criterion < rough[0].criterion - SURE / sum(map(len, fitted))):
-        best = 0 if rough[1].error > rough[0].error * WORSE else 1
+    best = int(np.argmin([each.criterion for each in rough]))
+    sure = rough[best].criterion < rough[0].criterion - SURE / sum(map(len, fitted))
+    if not sure or rough[best].error > rough[0].error * WORSE:
+        best = 0
     found = searches[best].best(order)
-    whole = Search(shifted(episodes, found.delays), [], found.delays)
+    whole = Search(episodes, [], found.delays)
     final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
     past = whole.past
     return replace(
@@ -150,10 +150,10 @@ class Search:
     """Models of each order for given dead times."""
 
     def __init__(
-        self, fitted: list[Episode], tested: list[Episode], delays: tuple[int, ...]
+        self, fitted: Sequence[Episode], tested: Sequence[Episode], delays: tuple[int, ...]
     ) -> None:
-        self.past, self.chunks = Past(fitted), Chunks(fitted)
-        self.fitted, self.tested, self.delays = fitted, tested, delays
+        self.fitted, self.tested = shifted(fitted, delays), shifted(tested, delays)
+        self.past, self.chunks, self.delays = Past(self.fitted), Chunks(self.fitted), delays
         self.largest = min(MAX_ORDER, self.past.limit)
         self.tried: list[Structure] = []
 

@@ -14,6 +14,7 @@
 typedef yann_real real;
 
 #define N_OBS YANN_N_OBS
+#define N_SEEN YANN_N_SEEN
 #define N_INPUTS YANN_N_INPUTS
 #define ZERO ((real)0)
 #define ONE ((real)1)
@@ -244,23 +245,23 @@ static void keep(const real theta[N_THETA], const real law[N_INPUTS], const real
 #endif
 
 /* Write the action, and the bounds that it keeps, in the units of the plant or the env. */
-static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPUTS],
+static unsigned act(const real seen[N_SEEN], int with_networks, real action[N_INPUTS],
                     real low[N_INPUTS], real high[N_INPUTS])
 {
     real theta[N_THETA], law[N_INPUTS], inside;
     unsigned status = 0;
-    for (int i = 0; i < N_OBS; i++) {
-        if (!isfinite(obs[i])) {
+    for (int i = 0; i < N_SEEN; i++) {
+        if (!isfinite(seen[i])) {
             status |= YANN_NOT_FINITE;
         }
     }
     for (int j = 0; j < N_THETA; j++) {
         int known = 1;
         theta[j] = obs_offset[j];
-        for (int i = 0; i < N_OBS; i++) {
+        for (int i = 0; i < N_SEEN; i++) {
             if (obs_matrix[j][i] != ZERO) {
-                theta[j] += obs_matrix[j][i] * obs[i];
-                known = known && isfinite(obs[i]);
+                theta[j] += obs_matrix[j][i] * seen[i];
+                known = known && isfinite(seen[i]);
             }
         }
         /* What is not finite counts as at the operating point, what is far as not so far. */
@@ -346,18 +347,19 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
     return status;
 }
 
-unsigned yann_policy(const real obs[N_OBS], real action[N_INPUTS])
+unsigned yann_policy(const real seen[N_SEEN], real action[N_INPUTS])
 {
     real low[N_INPUTS], high[N_INPUTS];
-    return act(obs, 1, action, low, high);
+    return act(seen, 1, action, low, high);
 }
 
-unsigned yann_law(const real obs[N_OBS], real action[N_INPUTS])
+unsigned yann_law(const real seen[N_SEEN], real action[N_INPUTS])
 {
     real low[N_INPUTS], high[N_INPUTS];
-    return act(obs, 0, action, low, high);
+    return act(seen, 0, action, low, high);
 }
 
+@ESTIMATOR@
 /* ---- One step of the plant's controller ---- */
 
 void yann_init(yann_state *state)
@@ -366,6 +368,7 @@ void yann_init(yann_state *state)
         state->good[i] = obs_rest[i];
         state->last[i] = obs_rest[i];
         state->same[i] = 0;
+        state->absent[i] = 0;
     }
     for (int i = 0; i < N_INPUTS; i++) {
         state->bump[i] = ZERO;
@@ -383,11 +386,11 @@ void yann_init(yann_state *state)
     for (int i = 0; i < 6; i++) {
         state->found[i] = 0;
     }
-    (void)yann_law(obs_rest, state->output);
+    (void)yann_law(seen_rest, state->output);
 }
 
-/* Keep what is good of the readings; return what is wrong with the others. */
-static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
+/* Keep what is good of the readings; return what is wrong with the others, NaN in `good`. */
+static unsigned read_sensors(yann_state *state, const real obs[N_OBS], real good[N_OBS])
 {
     unsigned status = 0;
     int moved = !state->started;
@@ -403,9 +406,12 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
             state->same[i]++;
         }
         state->last[i] = obs[i];
+        good[i] = (real)NAN;
         if (!isfinite(obs[i])) {
-            fault = YANN_NOT_FINITE;
+            state->absent[i] += state->absent[i] <= missing[i] ? 1 : 0;
+            fault = state->absent[i] > missing[i] ? YANN_NOT_FINITE : 0;
         } else {
+            state->absent[i] = 0;
             if (obs[i] < obs_min[i] || obs[i] > obs_max[i]) {
                 fault |= YANN_OUT_OF_RANGE;
             }
@@ -413,8 +419,8 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
                 fault |= YANN_FROZEN;
             }
         }
-        if (fault == 0) {
-            state->good[i] = obs[i];
+        if (fault == 0 && isfinite(obs[i])) {
+            state->good[i] = good[i] = obs[i];
         }
         status |= fault;
     }
@@ -427,8 +433,10 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
 static int previous_is_lost(const yann_state *state, const real obs[N_OBS])
 {
     for (int i = 0; i < N_INPUTS; i++) {
-        for (int j = 0; j < N_OBS; j++) {
-            if (obs_matrix[N_THETA - N_INPUTS + i][j] != ZERO && !(state->good[j] == obs[j])) {
+        for (int j = 0; j < N_SEEN; j++) {
+            const int at = source[j];
+            if (obs_matrix[N_THETA - N_INPUTS + i][j] != ZERO && at < N_OBS &&
+                !(state->good[at] == obs[at])) {
                 return 1;
             }
         }
@@ -436,6 +444,30 @@ static int previous_is_lost(const yann_state *state, const real obs[N_OBS])
     return 0;
 }
 #endif
+
+/* What the policy sees: good readings, estimates and the last input, each in its place. */
+static void look(yann_state *state, const real good[N_OBS], int begins, int told,
+                 real seen[N_SEEN])
+{
+#if N_ESTIMATES > 0
+    estimate(state, good, begins, told);
+    for (int j = 0; j < N_SEEN; j++) {
+        const int at = source[j] - N_OBS, input = at - N_ESTIMATES;
+        if (input >= 0) {
+            seen[j] = state->output[input] * input_scale[input] + input_shift[input];
+        } else if (at >= 0) {
+            seen[j] = between(state->estimate[at], est_min[at], est_max[at]);
+        } else {
+            seen[j] = state->good[source[j]];
+        }
+    }
+#else
+    (void)good, (void)begins, (void)told;
+    for (int j = 0; j < N_SEEN; j++) {
+        seen[j] = state->good[source[j]];
+    }
+#endif
+}
 
 /* Who acts now. */
 static yann_mode who_acts(yann_state *state, unsigned status, yann_mode request)
@@ -459,13 +491,22 @@ static yann_mode who_acts(yann_state *state, unsigned status, yann_mode request)
 unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_mode request,
                    const real *manual, real action[N_INPUTS])
 {
-    real target[N_INPUTS], low[N_INPUTS], high[N_INPUTS];
-    unsigned status = read_sensors(state, obs);
+    real target[N_INPUTS], low[N_INPUTS], high[N_INPUTS], good[N_OBS], seen[N_SEEN];
+    const int begins = !state->started;
+    int told = begins && manual != NULL;
+    for (int i = 0; i < N_INPUTS && told; i++) {
+        told = isfinite(manual[i]);
+    }
+    for (int i = 0; i < N_INPUTS && told; i++) {
+        state->output[i] = manual[i];
+    }
+    unsigned status = read_sensors(state, obs, good);
     if (elapsed > LATE_AFTER) {
         status |= YANN_LATE;
     }
     const yann_mode mode = who_acts(state, status, request);
-    status |= act(state->good, mode == YANN_POLICY, target, low, high);
+    look(state, good, begins, told, seen);
+    status |= act(seen, mode == YANN_POLICY, target, low, high);
 #if RATE
     /* Rates count from the own output then. */
     for (int i = 0; i < N_INPUTS && previous_is_lost(state, obs); i++) {
@@ -481,12 +522,12 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
             const int given = request == YANN_MANUAL && manual != NULL && isfinite(manual[i]);
             target[i] = given ? manual[i] : state->output[i];
         }
-        if (mode != state->mode) {
+        if (mode != state->mode || told) {
             state->bump[i] = state->output[i] - target[i];
         }
     }
-    if (mode != state->mode) {
-        state->changes++;
+    if (mode != state->mode || told) {
+        state->changes += mode != state->mode ? 1 : 0;
         state->left = TRANSFER;
     }
     if (mode == YANN_MANUAL) {

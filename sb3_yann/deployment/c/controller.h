@@ -37,7 +37,8 @@ typedef struct {
     yann_real last[YANN_N_OBS]; /* the last readings */
     yann_real output[YANN_N_INPUTS];
     yann_real bump[YANN_N_INPUTS]; /* what a change of who acts must still make up for */
-    int same[YANN_N_OBS];          /* for how many steps a reading has not moved */
+@MEMORY@    int same[YANN_N_OBS];   /* for how many steps a reading has not moved */
+    int absent[YANN_N_OBS]; /* for how many steps it has been missing */
     int faults, sound, left;
     int started;
     yann_mode mode;      /* who acted at the last step */
@@ -54,14 +55,15 @@ void yann_init(yann_state *state);
  * One step: write the action, return what was found (0 for nothing).
  *   elapsed  time since the last step in units of dt; 0 or less where it is not known
  *   request  what the operator wants
- *   manual   the operator's output, which acts where he requests it; or NULL to hold it
+ *   manual   the operator's output, which acts where he requests it; or NULL to hold it. At the
+ *            first step: the plant's present input, whoever acts; the output goes on from it
  */
 unsigned yann_step(yann_state *state, const yann_real obs[YANN_N_OBS], yann_real elapsed,
                    yann_mode request, const yann_real *manual, yann_real action[YANN_N_INPUTS]);
 
-/* The policy, and the MPC's law alone, at one observation; they return what they found. */
-unsigned yann_policy(const yann_real obs[YANN_N_OBS], yann_real action[YANN_N_INPUTS]);
-unsigned yann_law(const yann_real obs[YANN_N_OBS], yann_real action[YANN_N_INPUTS]);
+/* The policy, and the MPC's law alone, at what they see; they return what they found. */
+unsigned yann_policy(const yann_real seen[YANN_N_SEEN], yann_real action[YANN_N_INPUTS]);
+unsigned yann_law(const yann_real seen[YANN_N_SEEN], yann_real action[YANN_N_INPUTS]);
 
 #ifdef __cplusplus
 }

@@ -14,6 +14,9 @@
 
 #define N_POINTS @POINTS@
 #define N_STEPS @STEPS@
+#define N_STATES @STATES@ /* of the plant in the loop; 0 for readings that were recorded */
+#define N_OUTPUTS @OUTPUTS@
+#define N_LOADS @LOADS@
 
 @VECTORS@
 
@@ -35,6 +38,45 @@ static double room_at(unsigned status)
     return status & YANN_OUTSIDE ? @ROOM_OUTSIDE@ : @ROOM_INSIDE@;
 }
 
+#if N_STATES > 0
+static yann_real plant[N_STATES];
+
+/* Add the plant's outputs to the readings. */
+static void add_outputs(yann_real obs[])
+{
+    for (int i = 0; i < N_OUTPUTS; i++) {
+        for (int j = 0; j < N_STATES; j++) {
+            obs[i] += C_of_plant[i][j] * plant[j];
+        }
+    }
+}
+
+/* Move the plant by a step with an action and measured loads. */
+static void move(const yann_real action[], const yann_real obs[])
+{
+    yann_real next[N_STATES];
+    for (int a = 0; a < N_STATES; a++) {
+        const yann_real *row = step_of_plant[a];
+        next[a] = row[N_STATES + YANN_N_INPUTS + N_LOADS];
+        for (int j = 0; j < N_STATES; j++) {
+            next[a] += row[j] * plant[j];
+        }
+        for (int j = 0; j < YANN_N_INPUTS; j++) {
+            next[a] += row[N_STATES + j] * action[j];
+        }
+#if N_LOADS > 0
+        for (int j = 0; j < N_LOADS; j++) {
+            next[a] += row[N_STATES + YANN_N_INPUTS + j] * obs[loads_of_plant[j]];
+        }
+#endif
+    }
+    for (int a = 0; a < N_STATES; a++) {
+        plant[a] = next[a];
+    }
+    (void)obs;
+}
+#endif
+
 int main(void)
 {
     static yann_state state;
@@ -50,20 +92,34 @@ int main(void)
         wrong += !(worst(action, law[k]) <= room);
     }
     yann_init(&state);
-    room = 0.0;
+    room = @ROOM_IN_LOOP@;
+#if N_STATES > 0
+    for (int j = 0; j < N_STATES; j++) {
+        plant[j] = start_of_plant[j];
+    }
+#endif
     for (int k = 0; k < N_STEPS; k++) {
         yann_real obs[YANN_N_OBS];
         for (int i = 0; i < YANN_N_OBS; i++) {
             obs[i] = readings[k][i];
         }
+#if N_STATES > 0
+        add_outputs(obs);
+#endif
         if (lost[k]) {
             obs[0] = (yann_real)NAN;
         }
-        const unsigned found =
-            yann_step(&state, obs, elapsed[k], (yann_mode)requests[k], NULL, action);
+        if (starts_anew[k]) { /* with the plant's present input */
+            yann_init(&state);
+        }
+        const unsigned found = yann_step(&state, obs, elapsed[k], (yann_mode)requests[k],
+                                         starts_anew[k] ? action : NULL, action);
         room = fmax(room, room_at(found)); /* an output is held, and fades */
         by_step = fmax(by_step, worst(action, actions[k]));
         wrong += !(worst(action, actions[k]) <= room);
+#if N_STATES > 0
+        move(action, readings[k]);
+#endif
         wrong += found != (unsigned)status[k] || state.mode != (yann_mode)modes[k];
     }
     printf("@FILE@: largest error %.2g (policy), %.2g (law), %.2g (steps) of the range; %s\n",

@@ -1,0 +1,267 @@
+"""A controller is exported with its estimator: outputs in, inputs out, in every format."""
+
+from __future__ import annotations
+
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deployed import COMPILERS, STRICT, Compiled, disturbed, needs_compiler
+from sb3_yann import (
+    Checks,
+    Controller,
+    DisturbanceBounds,
+    LinearModel,
+    LinearMPC,
+    RateLimits,
+    StateEstimator,
+    Tracking,
+    export,
+    offset_free,
+)
+from sb3_yann._validation import Array
+from sb3_yann.deployment.controller import MODES, Status
+from sb3_yann.policy import YannPolicy
+from structured_text import FunctionBlock
+
+A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.1], [0.05, 0.0, 0.8]])
+B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
+C = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+X_SS, U_SS = np.array([50.0, 2.0, 300.0]), np.array([3.0, 7.0])
+LOAD = np.array([[0.0], [0.3], [0.1]])
+BEGIN = np.array([52.0, 2.0, 297.0])
+
+
+@cache
+def problem(rates: bool = False) -> tuple[LinearMPC, StateEstimator]:
+    """Return an offset-free MPC of three states, two of them shown, with a measured load."""
+    model = LinearModel(A, B, 1.0, X_SS, U_SS, E=LOAD, d_ss=[1.0], C=C)
+    mpc = LinearMPC(
+        model,
+        Q=np.eye(3),
+        R=0.1 * np.eye(2),
+        horizon=1 if rates else 2,
+        u_min=U_SS - 2,
+        u_max=U_SS + 2,
+        theta_min=X_SS - 20,
+        theta_max=X_SS + 20,
+        tracking=Tracking(C, [45, 295], [55, 305]),
+        disturbances=DisturbanceBounds(0.0, 2.0),
+        rate=RateLimits(-0.5, 0.5) if rates else None,
+    )
+    return offset_free(mpc)
+
+
+@cache
+def policy(rates: bool = False) -> YannPolicy:
+    mpc = problem(rates)[0]
+    mpc.explicit()
+    return disturbed(mpc, 0.05, networks="shared")
+
+
+def noisy_steps(count: int) -> list[tuple[Any, ...]]:
+    """Return noise, load, reference, elapsed, request, manual, and whether it starts anew."""
+    rng = np.random.default_rng(5)
+    found = []
+    for k in range(count):
+        noise = 0.05 * rng.normal(size=2)
+        if rng.random() < 0.1:
+            noise[rng.integers(2)] = rng.choice([np.nan, np.inf, 1e9])
+        if k % 7:
+            noise[1] = np.nan  # read now and then
+        reference = np.array([[52.0, 302.0], [47.0, 299.0]])[k // 100 % 2]
+        request = int(rng.choice([0, 1, 2], p=[0.96, 0.02, 0.02]))
+        manual = U_SS + rng.uniform(-1, 1, 2) if rng.random() < 0.3 else None
+        load = np.nan if rng.random() < 0.02 else 1.0 + 0.5 * (k // 150 % 2)
+        anew = k in (300, 601)
+        found.append((noise, load, reference, 1.0 + rng.random(), request, manual, anew))
+    return found
+
+
+CHECKS = Checks([-1e3] * 5, [1e3] * 5, missing=[2, 8, 0, 0, 0], hold=3, recover=4, late_after=1.95)
+
+
+def loop(controller: Any, steps: list[tuple[Any, ...]]) -> tuple[Array, list[tuple[int, int]]]:
+    """Return inputs (T, 2), and status and mode, of a plant that the model does not quite know."""
+    x, u = BEGIN, U_SS
+    inputs, said = [], []
+    for noise, load, reference, elapsed, request, manual, anew in steps:
+        if anew:
+            controller.begin()
+        shown = np.array([*(C @ x + noise), *reference, load])
+        u, status, mode = controller.step(shown, elapsed, request, u if anew else manual)
+        inputs.append(u)
+        said.append((status, mode))
+        load = 1.0 if np.isnan(load) else load
+        x = X_SS + A @ (x - X_SS) + 1.05 * B @ (u - U_SS) + LOAD[:, 0] * (load - 1) + [0.05, 0, 0.1]
+    return np.array(inputs), said
+
+
+class InPython:
+    """The controller of a .npz, as the others are called."""
+
+    def __init__(self, controller: Controller) -> None:
+        self.controller = controller
+
+    def begin(self) -> None:
+        self.controller.reset()
+
+    def step(self, obs: Array, elapsed: float, request: int, manual: Any) -> Any:
+        self.controller.request = MODES[request]
+        u = self.controller(obs, elapsed, manual)
+        return u, int(self.controller.status), MODES.index(self.controller.mode)
+
+
+class InC:
+    def __init__(self, given: Any, folder: Path, **options: Any) -> None:
+        self.compiled = Compiled(given, folder, **options)
+        self.compiled.begin()
+
+    def begin(self) -> None:
+        self.compiled.begin()
+
+    def step(self, obs: Array, elapsed: float, request: int, manual: Any) -> Any:
+        u, status = self.compiled.step(obs, elapsed, request, manual)
+        return u, status, -1
+
+
+class InStructuredText:
+    def __init__(self, text: str) -> None:
+        self.block = FunctionBlock(text)
+
+    def begin(self) -> None:
+        self.block.vars["started"] = False
+
+    def step(self, obs: Array, elapsed: float, request: int, manual: Any) -> Any:
+        given = [0.0, 0.0] if manual is None else list(manual)
+        command, status, mode = self.block.step(
+            obs=list(obs), elapsed=elapsed, request=request, manual=given,
+            has_manual=manual is not None,
+        )  # fmt: skip
+        return np.array(command), status, mode
+
+
+@needs_compiler
+@pytest.mark.parametrize("rates", [False, True])
+@pytest.mark.parametrize("kind", ["problem", "policy"])
+def test_C_in_closed_loop_is_python_over_1000_samples(kind, rates, tmp_path) -> None:
+    mpc, observer = problem(rates)
+    given = mpc if kind == "problem" else policy(rates)
+    compiled = InC(given, tmp_path, estimator=observer, checks=CHECKS)
+    python = InPython(compiled.compiled.controller)
+    steps = noisy_steps(1000)
+    wanted, said = loop(python, steps)
+    found, own = loop(compiled, steps)
+    np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)  # of a range of 4
+    assert [each[0] for each in own] == [each[0] for each in said]
+    met = Status(0)
+    for status, _ in said:
+        met |= Status(status)
+    assert met >= Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.LATE
+    assert {mode for _, mode in said} == {0, 1, 2}
+    assert sum(mode == 0 for _, mode in said) > 200  # a value of every seventh step is no fault
+
+
+@pytest.mark.parametrize("rates", [False, True])
+def test_structured_text_in_closed_loop_is_python(rates, tmp_path) -> None:
+    observer = problem(rates)[1]
+    options = {"estimator": observer, "checks": CHECKS}
+    export(policy(rates), tmp_path / "plant.npz", **options)
+    export(policy(rates), tmp_path / "plant.st", **options)
+    block = InStructuredText((tmp_path / "plant.st").read_text())
+    steps = noisy_steps(400)
+    wanted, said = loop(InPython(Controller.load(tmp_path / "plant.npz")), steps)
+    found, own = loop(block, steps)
+    np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)
+    assert own == said
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_the_self_test_runs_a_closed_loop_and_can_fail(precision, tmp_path) -> None:
+    observer = problem()[1]
+    export(policy(), tmp_path / "plant.c", estimator=observer, precision=precision)
+    code = tmp_path / "plant.c"
+    assert self_test(tmp_path) == 0
+    text = code.read_text()
+    for old, factor in (("est_gain[j][i] * x[i]", "0.9"), ("state->output[i] * input", "1.01")):
+        assert old in text
+        code.write_text(text.replace(old, f"(real){factor} * {old}"))
+        assert self_test(tmp_path) == 1
+
+
+def self_test(folder: Path) -> int:
+    sources = [str(folder / "plant.c"), str(folder / "plant_selftest.c")]
+    guards = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    program = str(folder / "test")
+    subprocess.run([COMPILERS[0], *STRICT, *guards, *sources, "-lm", "-o", program], check=True)
+    return subprocess.run([program], capture_output=True).returncode
+
+
+def settled(controller: Controller, reference: Array, steps: int = 300) -> tuple[Array, Array]:
+    """Return outputs (T, 2) and inputs of a plant with loads that nothing measures."""
+    x, u = BEGIN, []
+    shown = []
+    for _ in range(steps):
+        shown.append(C @ x)
+        u.append(controller([*shown[-1], *reference, 1.0]))
+        x = X_SS + A @ (x - X_SS) + 1.1 * B @ (u[-1] - U_SS) + [0.05, 0.0, 0.1]
+    return np.array(shown), np.array(u)
+
+
+def test_outputs_settle_without_offset_by_the_exported_controller_alone(tmp_path) -> None:
+    mpc, observer = problem()
+    export(mpc, tmp_path / "plant.npz", estimator=observer)
+    controller = Controller.load(tmp_path / "plant.npz")
+    assert controller.note == ""
+    assert controller.obs_names[:4] == ("x[0]", "x[2]", "r[0]", "r[1]")
+    shown, _ = settled(controller, np.array([51.0, 301.0]))
+    np.testing.assert_allclose(shown[-1], [51.0, 301.0], atol=1e-4)
+
+
+def test_it_is_the_estimator_and_the_law_of_the_wrapped_env(tmp_path) -> None:
+    mpc, observer = problem()
+    export(mpc, tmp_path / "plant.npz", estimator=observer)
+    shown, inputs = settled(Controller.load(tmp_path / "plant.npz"), np.array([51.0, 301.0]), 50)
+    low, high, law = mpc.disturbances.d_min[1:], mpc.disturbances.d_max[1:], mpc.explicit()
+    for k, y in enumerate(shown):
+        y = y - C @ X_SS
+        found = observer.update(y, inputs[k - 1] - U_SS, [0.0]) if k else observer.reset(y)
+        theta = [*(found[0] + X_SS), 51.0, 301.0, 1.0, *np.clip(found[1], low, high)]
+        np.testing.assert_allclose(inputs[k], law.plant_input(np.array(theta)), atol=1e-9)
+
+
+def test_a_start_goes_on_from_the_plants_present_input(tmp_path) -> None:
+    mpc, observer = problem()
+    export(mpc, tmp_path / "plant.npz", estimator=observer, checks=Checks(transfer=20))
+    controller = Controller.load(tmp_path / "plant.npz")
+    u, d = np.array([3.7, 6.6]), np.array([0.3, -0.2])  # a load that nothing measures
+    deviation = np.linalg.solve(np.eye(3) - A, B @ (u - U_SS) + np.linalg.pinv(C) @ d)
+    y = C @ (X_SS + deviation)
+    inputs = [controller([*y, *y, 1.0], manual=u)]
+    np.testing.assert_allclose(inputs[0], u, atol=1e-12)
+    np.testing.assert_allclose(controller._estimate, [*(X_SS + deviation), *d], atol=1e-9)
+    for _ in range(50):  # the plant rests there, and that is where it is asked to be
+        inputs.append(controller([*y, *y, 1.0]))
+    np.testing.assert_allclose(inputs, np.tile(u, (51, 1)), atol=1e-6)
+
+
+def test_what_estimates_is_refused_where_it_does_not_fit(tmp_path) -> None:
+    mpc, observer = problem()
+    path = tmp_path / "plant.npz"
+    other = StateEstimator(LinearModel(A, 2 * B, 1.0, X_SS, U_SS, C=C))
+    for given, options, message in (
+        (mpc, {"estimator": other}, "of another model than the problem"),
+        (mpc, {"estimator": "me"}, "must be a StateEstimator"),
+        (mpc.explicit(), {"estimator": observer}, "do not say where"),
+        (mpc, {}, "estimator=observer"),
+        (mpc, {"estimator": observer, "format": "onnx"}, "no memory"),
+        (mpc, {"estimator": observer, "checks": Checks(missing=[1, 2])}, "one number, or 5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            export(given, path, **options)
+    assert not list(tmp_path.iterdir())
