@@ -474,8 +474,8 @@ class YannPolicy(StartsAsMPC, TD3Policy):
         Whether what the networks add stops where the model's next state would leave the MPC's hard
         bounds, or the set from which inputs can keep them (:attr:`LinearMPC.kept_set`). Where the
         law alone is beyond one, the policy goes no further. The default is True where there are
-        hard bounds of states or outputs, but for ``infeasible="zero_input"``: there the paper's law
-        gives up beyond them, and the networks are to come back.
+        hard bounds of states or outputs, or bounds in theta, but for ``infeasible="zero_input"``:
+        there the paper's law gives up beyond them, and the networks are to come back.
     bounds_margin : float, default 0
         What the plant's next state may differ from the model's, in half-widths of the box of theta:
         the policy keeps so far from the bounds, where the law does.

@@ -64,6 +64,11 @@ def test_a_preview_of_what_stays_is_no_preview(weights: dict[str, Any]) -> None:
     assert ahead.layout.names[:9] == (
         "x[0]", "x[1]", "r[0]", "r_1[0]", "r_2[0]", "d[0]", "d_1[0]", "d_2[0]", "d_3[0]",
     )  # fmt: skip
+    named = replace(ahead, model=replace(model, state_names=["place", "speed"]))
+    assert named.labels()[2:5] == (
+        "set-point of place", "set-point of place, 1 sample ahead",
+        "set-point of place, 2 samples ahead",
+    )  # fmt: skip
     theta = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (50, mpc.n_theta)) / 3
     both = theta @ ahead.layout.lift.T
     assert np.abs(mpc.online()(theta) - ahead.online()(both)).max() < 1e-9
