@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deployed import Compiled, disturbed, needs_compiler
-from sb3_yann import LinearModel, LinearMPC, MixedBounds, RateLimits, Terminal, export
+from sb3_yann import LinearModel, LinearMPC, MixedBounds, RateLimits, SoftBounds, Terminal, export
 from sb3_yann.deployment.controller import Controller, Status
 
 
@@ -33,6 +33,9 @@ CASES: dict[str, dict[str, Any]] = {
         "m": 2, "x_max": 6, "mixed": MixedBounds(G=[[1, 1]], high=0.8), "infeasible": "zero_input",
     },
     "bounds that change": {"parametric_bounds": ["u_max"], "terminal": Terminal(set="invariant")},
+    "soft bounds in a small unit, at the default penalty": {
+        "x_min": -6, "x_max": 6, "soft": SoftBounds(x=0.1),
+    },
     "soft and hard bounds in theta": {
         "x_min": -6, "x_max": 6, "parametric_bounds": ["u_max", "x_max[0]"],
         "mixed": MixedBounds(F=[[1, 1, 0]], G=[[1]], low=-4, high=4, soft=0.5),

@@ -518,23 +518,23 @@ def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> 
 
 
 def _choose_penalty(problem: MPCProblem) -> None:
-    """Store 100 times the cost of coming back from the bounds, or less, down to that cost.
+    """Store 100 times the cost of coming back from the bounds, at most, with inputs at theirs.
 
-    Less where a slack would cost so much more than inputs that solvers lose digits.
+    A unit of violation that is larger than a bound counts as so many times more. It is less where a
+    slack would cost so much more than inputs that solvers lose digits, down to ten times the share
+    of a unit in that cost, which multipliers are like.
     """
     soft = problem.soft
-    cost = _cost_of_coming_back(problem)
-    soft._store(penalty=100 * cost)
+    cost, wide = _cost_of_coming_back(problem)
+    most = 100 * cost * max(1.0, wide)
+    soft._store(penalty=most)
     with contextlib.suppress(ValueError):  # the laws say so
         steep = steepness(condense(problem)[0], problem.u_min, problem.u_max)
-        soft._store(penalty=cost * max(1.0, 100 / max(steep, 1.0)))
+        soft._store(penalty=most if steep <= 1 else max(most / steep, 10 * cost * wide))
 
 
-def _cost_of_coming_back(problem: MPCProblem) -> float:
-    """Return the cost of coming back from the bounds, at most, with inputs at theirs.
-
-    A unit of violation that is larger than a bound counts as so many times more.
-    """
+def _cost_of_coming_back(problem: MPCProblem) -> tuple[float, float]:
+    """Return that cost, and the largest unit of violation in parts of its bound."""
     n = problem.model.n_states
     given = [problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]]
     sizes = np.abs([np.where(np.isfinite(each), each, 0.0) for each in given])
@@ -548,11 +548,11 @@ def _cost_of_coming_back(problem: MPCProblem) -> float:
     y, mixed = (np.where(np.isfinite(each), each, 0.0).max(axis=0) for each in sides)
     units = [(problem.soft.x, x), (problem.soft.y, y), (problem.mixed.soft, mixed)]
     parts = [unit[size > 0] / size[size > 0] for unit, size in units]
-    wide = max(1.0, *(float(part.max(initial=0.0)) for part in parts))
+    wide = max(float(part.max(initial=0.0)) for part in parts)
     if not total > 0:
         raise ValueError(
             "SoftBounds.penalty is missing, and nothing tells how much a violation should cost: "
             "neither states nor inputs have a bound that costs anything. Pass the cost of one unit "
             "of violation."
         )
-    return float(total * wide)
+    return float(total), wide
