@@ -154,13 +154,6 @@ def test_starts_are_the_states_of_the_episodes() -> None:
     np.testing.assert_allclose(episodes.costs, alone.costs, rtol=1e-9)
 
 
-@pytest.mark.parametrize("env", [Countdown, Countdown(), "no such env"])
-@pytest.mark.parametrize("starts", [[], [[2]], [[2], [3], [4], [5]]])
-def test_starts_that_are_not_as_many_as_the_seeds_are_refused(env, starts) -> None:
-    with pytest.raises(ValueError, match=r"zip\(\)"):
-        evaluate(Tenth(), env, [1, 2, 3], starts=starts)
-
-
 def test_envs_made_for_the_episodes_are_closed() -> None:
     before = Countdown.open
     evaluate(Tenth(), Countdown, [3, 1, 4])

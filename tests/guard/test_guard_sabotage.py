@@ -204,16 +204,6 @@ def test_rejections_shrink_the_step_to_its_floor_and_acceptances_let_it_grow_to_
     assert model.policy.actor_step == 1  # a later run without a guard
 
 
-def test_candidates_are_tried_every_so_many_episodes_and_at_the_end() -> None:
-    model, guard = build(gradient_steps=0), make_guard(eval_freq=3)
-    values = iter(np.linspace(0.1, 0.3, 20))
-    train(
-        model, 9 * STEPS, At(range(1, 100), lambda p: correct(p, RIGHT, next(values, 0.3))), guard
-    )
-    assert [each.episode for each in guard.decisions][:3] == [1, 4, 7]
-    assert guard.decisions[-1].episode in (7, 9)
-
-
 @pytest.mark.parametrize("what", ["cost", "observation"])
 def test_a_candidate_with_what_is_not_finite_in_its_episodes_violates_and_returns(what) -> None:
     class Faulty(Slide):

@@ -162,6 +162,7 @@ def test_the_reactor_s_figure_is_that_of_its_optimum() -> None:
     assert found.total == pytest.approx(1 - best.mean() / found.mpc_costs.mean(), rel=0.02)
 
 
+@pytest.mark.nightly
 def test_what_a_linear_model_cannot_do_is_left_to_learning() -> None:
     # This start swings: the torque cannot lift the pendulum, and no linear model says so.
     found = headroom(problems.clipped_pendulum(), "ClippedPendulum-v0", n_starts=3, seed=2001)
@@ -224,6 +225,7 @@ def test_the_best_of_a_random_plant_is_one_controller() -> None:
     assert found.total < found.offset + 0.05
 
 
+@pytest.mark.nightly
 def test_another_way_to_swing_is_found() -> None:
     """From the MPC's own swing the search ends 1 % below it; a push first leads to 4 %."""
     seed = 2008
@@ -244,7 +246,7 @@ def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
 
 def test_a_twin_s_members_share_the_starts() -> None:
     twin = reactor_s_twin()
-    found = headroom(problems.cstr(), twin, n_starts=4)
+    found = headroom(problems.cstr(), twin, n_starts=3)
     alone = evaluate(problems.cstr().explicit(), partial(twin.env, 2), [2])
     np.testing.assert_allclose(found.mpc_costs[2], alone.costs[0], rtol=1e-5)
 

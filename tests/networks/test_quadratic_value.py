@@ -16,7 +16,6 @@ from sample_laws import (
     to_action,
 )
 from sb3_yann.networks import QuadraticStateActionValue, Ranges, YannLayer
-from weights import network_of
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
@@ -113,19 +112,6 @@ def test_twenty_steps_of_adam_do_not_flip_the_sign_of_the_reactors_smallest_entr
     change = matrix(value).diag() / before - 1
     assert change.abs().max() < 0.021
     assert change.abs().min() > 0
-
-
-def test_training_fits_what_the_quadratic_cannot() -> None:
-    rows = random_rows("pendulum", 512)
-    value = critic("pendulum")
-    target = value(rows).detach() + 5 * th.sin(3 * rows[:, :1])
-    optimizer = th.optim.Adam(network_of(value).parameters(), 1e-2)
-    for _ in range(300):
-        optimizer.zero_grad()
-        loss = (value(rows) - target).square().mean()
-        loss.backward()
-        optimizer.step()
-    assert loss.item() < 0.2 * (5 * th.sin(3 * rows[:, :1])).square().mean().item()
 
 
 @pytest.mark.parametrize(

@@ -68,21 +68,3 @@ def test_it_goes_on_from_a_saved_state() -> None:
             parameter.grad = gradient
             optimizer.step()
     assert th.equal(one, two)
-
-
-def test_it_goes_on_from_what_an_adam_left() -> None:
-    parameter = th.nn.Parameter(th.ones(ROWS, 2, 3))
-    adam = th.optim.Adam([parameter], lr=0.01)
-    parameter.grad = th.ones(ROWS, 2, 3)
-    adam.step()
-    rows = RowAdam([parameter], lr=0.01)
-    rows.load_state_dict(copy.deepcopy(adam.state_dict()))
-    adam.step()
-    expected = parameter.detach().clone()
-    again = th.nn.Parameter(th.ones(ROWS, 2, 3) - 0.01)
-    other = RowAdam([again], lr=0.01)
-    other.load_state_dict(copy.deepcopy(rows.state_dict()))
-    again.grad = th.ones(ROWS, 2, 3)
-    other.step()
-    assert th.allclose(again, expected, atol=1e-6)
-    assert other.state[again]["steps"].tolist() == [2.0] * ROWS

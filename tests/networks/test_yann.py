@@ -164,26 +164,6 @@ def test_correction_at_its_bound_gets_the_gradient_that_leads_back_and_no_other(
         assert bool(bias.grad[..., -1].any()) is alive
 
 
-def test_correction_learns_to_leave_its_bound() -> None:
-    law = law_of("pendulum")
-    layer = YannLayer(law, max_correction=0.1, pinned=False)
-    with th.no_grad():
-        last_layer(layer)[..., -1] = 3.0
-    theta = box_points(law, 2000)
-    theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
-
-    def distance() -> float:
-        return (layer(theta) - layer.law(theta)).abs().mean().item()
-
-    assert distance() > 0.199
-    optimizer = th.optim.Adam(layer.parameters(), 1e-1)
-    for _ in range(100):
-        optimizer.zero_grad()
-        (layer(theta) - layer.law(theta)).square().mean().backward()
-        optimizer.step()
-    assert distance() < 0.05
-
-
 def test_law_without_input_bounds_is_refused() -> None:
     bounded = solved("two inputs")
     free = LinearMPC(

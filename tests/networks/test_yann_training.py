@@ -68,16 +68,4 @@ def test_region_away_from_the_origin_is_not_pinned() -> None:
     assert bool(pinned[law.locate(np.zeros(2))])
 
 
-@INFEASIBLE
-@EVERY_LAW
-def test_equilibrium_moves_where_no_region_is_pinned(name: str, infeasible: str) -> None:
-    law = law_of(name, infeasible)
-    layer = YannLayer(law, pinned=False)
-    assert not network_of(layer).pinned.any()
-    origin = th.zeros(1, law.n_theta)
-    assert th.equal(layer(origin), layer.law(origin))
-    train(layer, origin, target=0.3, steps=100)
-    assert (layer(origin) - 0.3).abs().max() < 0.05
-
-
 # --- what torch and Stable-Baselines3 see --------------------------------------------------------

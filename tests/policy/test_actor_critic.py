@@ -92,15 +92,6 @@ def test_the_actors_loss_leaves_the_critic_alone_which_still_learns() -> None:
     assert all(each.grad is not None for each in critic.parameters())
 
 
-def test_an_optimizer_of_the_users_choice_is_taken_as_it_is() -> None:
-    assert build().actor.optimizer.defaults["fused"] is True
-    kwargs = {"optimizer_kwargs": {"eps": 1e-5}}
-    chosen = build(policy_kwargs=kwargs).actor.optimizer.defaults
-    assert (chosen["fused"], chosen["eps"]) == (None, 1e-5)
-    kwargs = {"optimizer_class": th.optim.SGD}
-    assert type(build(policy_kwargs=kwargs).actor.optimizer) is th.optim.SGD
-
-
 def test_constants_are_no_parameters_and_target_updates_leave_them_alone() -> None:
     model = build()
     learnt = {name for name, _ in model.actor.named_parameters()}

@@ -13,9 +13,8 @@ from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from general_problems import servo
 from sample_plants import LinearPlant, Recorder, two_input_mpc
-from sb3_yann import AffineObservation, NoActionNoise, NonFiniteWarning, RateLimits, YannPolicy
+from sb3_yann import AffineObservation, NoActionNoise, NonFiniteWarning, YannPolicy
 from sb3_yann.policy.sb3_hooks import FiniteRows
 from sb3_yann_envs import problems
 
@@ -204,16 +203,6 @@ def test_where_an_observation_overflows_in_the_networks_the_law_acts_and_says_so
         actions, _ = model.predict(seen)
     np.testing.assert_allclose(actions[0], mpc.explicit()(seen[0]), atol=1e-6)
     np.testing.assert_allclose(actions[1:], alone, atol=1e-6)
-
-
-def test_the_limits_of_the_rate_hold_where_the_state_is_not_known() -> None:
-    mpc = servo(rate=RateLimits(-0.1, 0.1))
-    model = shaken(build(LinearPlant(mpc), policy={"problem": mpc}))
-    observation = np.zeros(mpc.n_theta, np.float32)
-    observation[0], observation[mpc.layout.previous] = np.nan, 0.4
-    with pytest.warns(NonFiniteWarning):
-        action, _ = model.predict(observation)
-    assert np.all(np.abs(action - 0.4) <= 0.1 + 1e-6)
 
 
 def test_an_entry_that_theta_does_not_depend_on_leaves_theta_as_it_is() -> None:

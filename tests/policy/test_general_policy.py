@@ -7,7 +7,6 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 from stable_baselines3 import DDPG, TD3
 
 from general_problems import LOADED, solved
@@ -35,21 +34,6 @@ def test_predict_equals_an_independent_online_qp(name: str, algorithm: type[DDPG
     thetas, expected = feasible_states(mpc, 1000)
     actions, _ = model.predict(thetas.astype(np.float32))
     assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
-
-
-def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
-    mpc = solved("servo with rates")
-    model = DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs={"problem": mpc})
-    layer = model.actor.mu
-    theta = th.zeros(1, mpc.n_theta)
-    theta[0, mpc.layout.reference] = 1.0  # asks for more than the rate allows
-    assert layer(theta).item() == pytest.approx((0.7 - 0.5) / 1.5, abs=1e-5)
-    optimizer = th.optim.Adam(layer.parameters(), 1e-2)
-    for _ in range(100):
-        optimizer.zero_grad()
-        (layer(theta) + 0.4).square().sum().backward()
-        optimizer.step()
-    assert layer(theta).item() < 0
 
 
 def unconstrained_steps(mpc: LinearMPC, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch as th
 from stable_baselines3 import DDPG, TD3
 
-from general_problems import RATED, servo
 from policy_samples import POLICIES, build, scalar_mpc, starts, updates, with_full_buffer
 from sb3_yann import LinearMPC, OnlineLawWarning, YannPolicy
 from sb3_yann.control import OnlineLaw
 from sb3_yann.control.mpc import choice
-from sb3_yann.networks import RowAdam, SharedYannLayer, YannLayer
-from weights import is_mpc, network_of
+from sb3_yann.networks import SharedYannLayer
+from weights import is_mpc
 
 SHAPES = pytest.mark.parametrize(
     "options", [{"law": "online"}, {"networks": "shared"}, {"law": "online", "networks": "shared"}]
@@ -71,44 +69,6 @@ def test_networks_per_region_need_regions() -> None:
         build(policy_kwargs={"networks": "each"})
     with pytest.raises(ValueError, match="law = 'none' must be one of"):
         build(policy_kwargs={"law": "none"})
-
-
-def test_networks_per_region_are_the_default_where_there_are_regions() -> None:
-    for options in ({}, {"law": "explicit"}, {"networks": "per_region"}):
-        model = build(policy_kwargs=options)
-        assert isinstance(model.actor.mu, YannLayer)
-        assert len(network_of(model).pinned) == scalar_mpc().explicit().n_regions
-    assert not isinstance(build(policy_kwargs={"networks": "shared"}).actor.optimizer, RowAdam)
-
-
-def test_a_shared_network_is_wider_by_default() -> None:
-    sizes = [
-        network_of(build(policy_kwargs={"networks": each})).first.nodes.shape[2]
-        for each in ("per_region", "shared")
-    ]
-    assert sizes == [16, 64]
-
-
-def test_limits_of_correction_and_rate_hold() -> None:
-    mpc = servo(**RATED)
-    options = {"law": "online", "max_correction": 0.1, "pin_equilibrium": True}
-    model = build(DDPG, mpc, options)
-    with th.no_grad():
-        for each in model.actor.parameters():
-            each.add_(10 * th.randn(each.shape))
-    theta = starts(mpc)
-    u, law = model.predict(theta)[0], 0.5 + 1.5 * model.actor.mu.law(th.as_tensor(theta)).numpy()
-    feasible = mpc.online().in_domain(theta)  # elsewhere the law breaks a rate, and the layer none
-    assert np.abs(law - mpc.online()(theta))[feasible].max() < 1e-5
-    previous = theta[:, -1:]
-    assert np.abs(u - law).max() <= 0.1 * 3 + 1e-5
-    reachable = np.abs(previous) <= 1  # others are not between the bounds of the input
-    change = (u - previous)[reachable[:, 0]]
-    assert np.all((change >= -0.5 - 1e-5) & (change <= 0.7 + 1e-5))
-    model.policy.limit_correction(0.0)
-    assert np.abs(model.predict(theta)[0] - law).max() < 1e-5
-    rest = np.zeros((1, mpc.n_theta), np.float32)
-    assert np.abs(model.predict(rest)[0] - mpc.online()(rest)) < 1e-6
 
 
 def test_observations_that_are_sampled_again_are_not_solved_again() -> None:
