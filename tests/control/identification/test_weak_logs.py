@@ -106,7 +106,7 @@ def test_a_perfect_log_that_is_weak_is_left_as_it_is() -> None:
 
 def test_intervals_of_the_poles_hold_the_truth() -> None:
     inside = 0
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         x, u = np.zeros((301, 2)), rng.normal(size=(300, 1))
         for k in range(300):
@@ -117,7 +117,7 @@ def test_intervals_of_the_poles_hold_the_truth() -> None:
         first = note.partition(": ")[2].partition(";")[0]
         value, _, width = first.partition(" within ")
         inside += abs(float(value) - 0.9) <= float(width)
-    assert 50 <= inside <= 60
+    assert 25 <= inside <= 30
 
 
 def test_a_pole_that_may_be_unstable_is_told() -> None:
