@@ -108,11 +108,7 @@ def fields_in_deviations(problem: Any) -> dict[str, Any]:
 class ActionUnits(ReadOnlyArrays):
     """How an env takes the inputs of a problem: ``action = scale * u + shift``, u in deviations.
 
-    Attributes
-    ----------
-    kind : {"plant", "normalized"}
-        Plant units, or [-1, 1] for the range of the input.
-    scale, shift : ndarray, shape (m,)
+    ``kind`` is "plant" for plant units, or "normalized" for [-1, 1] as the range of the input.
     """
 
     kind: str
@@ -121,14 +117,9 @@ class ActionUnits(ReadOnlyArrays):
 
     @classmethod
     def of(cls, problem: Any, low: NDArray[Any], high: NDArray[Any]) -> ActionUnits | None:
-        """Return what bounds of the env's actions say; None where they fit nothing.
+        """Return what bounds (m,) of the env's actions say; None where they fit nothing.
 
-        Parameters
-        ----------
-        problem : LinearMPC
-            With the bounds of the inputs.
-        low, high : ndarray, shape (m,)
-            The env's, maybe rounded to their own type.
+        They may be rounded to their own type.
         """
         u_min, u_max, u_ss = problem.u_min, problem.u_max, problem.model.u_ss
         half = half_widths(u_min, u_max)
@@ -154,14 +145,9 @@ class ActionUnits(ReadOnlyArrays):
 def same_bounds(
     given: tuple[NDArray[Any], NDArray[Any]], wanted: tuple[Array, Array], half: Array
 ) -> bool:
-    """Tell whether bounds are the same but for the rounding of their type.
+    """Tell whether bounds, low and high (m,), are the same but for the rounding of their type.
 
-    Parameters
-    ----------
-    given, wanted : pair of ndarray, shape (m,)
-        Low and high.
-    half : ndarray, shape (m,)
-        Half-widths; where they are infinite, the size of the bound is the unit.
+    Where half-widths are infinite, the size of the bound is the unit.
     """
     found, bounds = np.array(given, np.float64), np.array(wanted)
     if found.shape != bounds.shape:
