@@ -196,9 +196,11 @@ def yann(  # noqa: PLR0913 (what the variants vary)
 def exploring(make_env: Callable[[], Any], seed: int, plant: Plant, algorithm: str) -> Learner:
     """Return SAC, TQC or PPO from the MPC on, with the same options for every plant.
 
-    SAC and TQC have the learning rate of their yardsticks.
+    SAC and TQC have the learning rate of their yardsticks, PPO learns after every second episode.
     """
-    settings: dict[str, Any] = {} if algorithm == "PPO" else yardsticks.TUNED
+    settings = yardsticks.TUNED
+    if algorithm == "PPO":
+        settings = {"n_steps": 2 * plant.steps, "batch_size": 100}
     model = yardsticks.algorithm_named(algorithm)(
         "YannPolicy",
         make_env(),
