@@ -156,11 +156,11 @@ class Log:
         ValueError
             For shapes that do not fit, or numbers that are not finite.
         """
-        x = _matrices("states", states)
-        u = _matrices("actions", inputs)
+        x = as_matrices("states", states)
+        u = as_matrices("actions", inputs)
         d: list[Array] = [np.zeros((len(each), 0)) for each in u]
         if disturbances is not None:
-            d = _matrices("disturbances", disturbances)
+            d = as_matrices("disturbances", disturbances)
         for name, parts in (("actions", u), ("disturbances", d)):
             _require_one_state_more(name, parts, x)
         if sum(map(len, u)) < 2:
@@ -289,7 +289,7 @@ def cut_at_gaps(
     """Return the log of arrays as of `Log.from_arrays`, cut where an entry is NaN."""
     given = {"outputs": outputs, "inputs": inputs, "disturbances": disturbances}
     parts = {
-        name: _matrices(name, values, gaps=True)
+        name: as_matrices(name, values, gaps=True)
         for name, values in given.items()
         if values is not None
     }
@@ -413,7 +413,7 @@ def _without_gaps(episodes: list[Episode], time: Arrays, dt: float) -> tuple[lis
     return parts, lost
 
 
-def _matrices(name: str, value: Arrays, *, gaps: bool = False) -> list[Array]:
+def as_matrices(name: str, value: Arrays, *, gaps: bool = False) -> list[Array]:
     """Return one float64 matrix for each episode, all with the same columns, NaN where allowed."""
     given = list(value) if isinstance(value, (list, tuple)) else []
     flat = [i for i, part in enumerate(given) if np.shape(part) != () and np.ndim(part) == 1]

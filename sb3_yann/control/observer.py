@@ -9,10 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, check_array, check_outputs, check_positive_vector
+from sb3_yann._validation import (
+    Array,
+    check_array,
+    check_int,
+    check_outputs,
+    check_positive_vector,
+)
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
 
+PERIODS = 40
+"""Of all rates, after which the gain of a filter with several is that of the limit."""
 STANDARD = "Give standard deviations, above 0."
 
 
@@ -33,6 +41,9 @@ class StateEstimator:
         Standard deviations of w, of the steps of d, and of v, of shapes (n,), (d,) and (q,), per
         sample; or their covariances (n, n), (d, d) and (q, q). Only their ratios matter: more
         disturbance noise makes the estimate of d faster and rougher.
+    every : int or sequence of int, default 1
+        Each output is read every so many samples, together where several are: 60 for a laboratory's
+        hourly value among readings of every minute.
     cross_noise : array_like, shape (n, q), optional
         Covariance of w and v, which a model in innovation form has.
     gain : array_like, shape (n + d, q), optional
@@ -66,6 +77,7 @@ class StateEstimator:
         disturbance_noise: ArrayLike = 1.0,
         measurement_noise: ArrayLike = 1.0,
         cross_noise: ArrayLike | None = None,
+        every: int | Sequence[int] = 1,
         gain: ArrayLike | None = None,
     ) -> None:
         if not isinstance(model, LinearModel):
@@ -86,6 +98,10 @@ class StateEstimator:
         V, v_std = _covariance("measurement_noise", measurement_noise, q)
         cross = np.zeros((n, q)) if cross_noise is None else cross_noise
         cross = np.vstack([check_array("cross_noise", cross, (n, q)), np.zeros((d, q))])
+        periods = [check_int("every", each) for each in np.ravel(every).tolist()]
+        if len(periods) not in (1, q):
+            raise ValueError(f"every = {every} must be one number, or {q}.")
+        self.every = np.resize(periods, q)
         if gain is None:
             found = self._kalman_gain(linalg.block_diag(W, D), V, cross)
             if found is None:
@@ -195,6 +211,8 @@ class StateEstimator:
 
     def _kalman_gain(self, W: Array, V: Array, cross: Array) -> Array | None:
         """Return the steady-state gain of the filter, None where rounding hides it."""
+        if np.any(self.every > 1):
+            return self._gain_of_rates(W, V, cross)
         try:
             with np.errstate(all="ignore"):
                 P = linalg.solve_discrete_are(self.A.T, self.C_aug.T, W, V, s=cross)
@@ -210,9 +228,38 @@ class StateEstimator:
             pass
         return None
 
+    def _gain_of_rates(self, W: Array, V: Array, cross: Array) -> Array:
+        """Return the mean gain of each output, over the samples at which it is read."""
+        A, C = self.A, self.C_aug
+        period = int(np.lcm.reduce(self.every))
+        total: Array = np.zeros((len(A), len(C)))
+        P = W + np.eye(len(A)) * np.trace(W) / len(A)
+        for k in range(PERIODS * period):
+            seen = np.flatnonzero(k % self.every == 0)
+            S = C[seen] @ P @ C[seen].T + V[np.ix_(seen, seen)]
+            own = np.linalg.solve(S, C[seen] @ P).T
+            told = np.linalg.solve(S, cross[:, seen].T).T
+            if k >= (PERIODS - 1) * period:
+                total[:, seen] += own + np.linalg.lstsq(A, told, rcond=None)[0]
+            ahead = A @ own + told
+            moved = A - ahead @ C[seen]
+            shared = ahead @ cross[:, seen].T
+            P = (
+                moved @ P @ moved.T
+                + W
+                + ahead @ V[np.ix_(seen, seen)] @ ahead.T
+                - shared
+                - shared.T
+            )
+        return total / (period / self.every)
+
     def _radius(self, gain: Array) -> float:
-        """Return by which factor the error of the estimate changes in a sample, in the end."""
-        return lqr.spectral_radius((np.eye(len(self.A)) - gain @ self.C_aug) @ self.A)
+        """Return by which factor the error of the estimate changes in a period, in the end."""
+        error = np.eye(len(self.A))
+        for k in range(int(np.lcm.reduce(self.every))):
+            seen = k % self.every == 0
+            error = (np.eye(len(self.A)) - gain[:, seen] @ self.C_aug[seen]) @ self.A @ error
+        return lqr.spectral_radius(error)
 
 
 class DisturbanceObserver(StateEstimator):

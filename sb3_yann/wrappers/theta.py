@@ -407,7 +407,7 @@ class EstimateState(Appending):
         measured = self.inner.to_deviations(measured) if self.inner.shifted else measured
         u = None if u is None else self.inner.input_to_deviations(u)
         failing = ~np.isfinite(measured)
-        if np.any(failing & ~self.failing):  # once, for a sensor that stays so
+        if np.any((failing & ~self.failing)[observer.every == 1]):  # once, for one that stays so
             shown = observation[: len(measured)].tolist()
             at = f"The measurement {shown} is not finite: the observer predicts it."
             warnings.warn(at, NonFiniteWarning, stacklevel=4)

@@ -116,3 +116,22 @@ def test_tracking_from_outputs_alone_settles_without_offset(lost: int) -> None:
     for _ in range(120):
         shown, *_ = plain.step(law.plant_input(shown))
     assert abs(plain.unwrapped.x[0] + 50 - reference) > 0.1  # what the estimate takes away
+
+
+def test_a_filter_of_two_rates_uses_the_rare_readings_fully() -> None:
+    a = [[0.95, 0.1, 0], [0, 0.9, 0], [0, 0.2, 0.98]]
+    model = LinearModel(a, [[0.1], [0.5], [0]], 1, C=[[1, 0, 0], [0, 0, 1]])
+    noise = {"state_noise": 0.1, "measurement_noise": 0.3}
+    rng = np.random.default_rng(0)
+    filters = StateEstimator(model, **noise), StateEstimator(model, **noise, every=[1, 20])
+    x, errors = np.zeros(3), ([], [])
+    for k in range(4000):
+        y = model.C @ x + 0.3 * rng.normal(size=2)
+        y[1] = y[1] if k % 20 == 0 else np.nan
+        for each, own in zip(filters, errors, strict=True):
+            own.append(each.update(y, [0.0])[0][2] - x[2] if k else each.reset(y)[0][2])
+        x = model.step(x, [0.0]) + 0.1 * rng.normal(size=3)
+    plain, rated = (float(np.mean(np.square(own[200:]))) for own in errors)
+    assert rated < 0.85 * plain
+    with pytest.raises(ValueError, match="every = "):
+        StateEstimator(model, every=[1, 2, 3])

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from test_whole_controller import CHECKS, InPython, loop, noisy_steps, problem
 
 from deployed import COMPILERS, STRICT, needs_compiler, observations, policy_of, with_faults
 from sb3_yann import Controller, export
@@ -287,3 +288,30 @@ def _is_running(number: int) -> bool:
     except OSError:
         return False
     return said.rpartition(")")[2].split()[0] not in "ZX"
+
+
+class InALoop:
+    """An instance, as the other forms of a whole controller are called."""
+
+    def __init__(self, instance) -> None:
+        self.instance = instance
+
+    def begin(self) -> None:
+        assert self.instance.code.fmi2Reset(self.instance.own) == 0
+
+    def step(self, obs, elapsed, request, manual):
+        self.instance.give(obs, elapsed, request, manual)
+        assert self.instance.step() == 0
+        command, status, mode = self.instance.outputs()
+        return command, status, MODES.index(mode)
+
+
+@needs_library
+def test_with_its_estimator_it_is_the_controller_in_closed_loop(opened):
+    mpc, observer = problem()
+    instance, controller = opened(mpc, estimator=observer, checks=CHECKS)
+    steps = noisy_steps(400)
+    wanted, said = loop(InPython(controller), steps)
+    found, own = loop(InALoop(instance), steps)
+    np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)
+    assert own == said

@@ -45,6 +45,9 @@ class Innovations:
     c, y_0 : ndarray, shapes (n,) and (q,)
     noise : ndarray, shape (q, q)
         Covariance of e.
+    sparse : bool
+        Whether some outputs are read now and then only: K and the noise are those of the samples
+        at which they are.
     """
 
     A: Array
@@ -54,6 +57,7 @@ class Innovations:
     c: Array
     y_0: Array
     noise: Array
+    sparse: bool = False
 
     @property
     def order(self) -> int:
@@ -178,9 +182,12 @@ class Past:
     ----------
     episodes : sequence of Episode
         Outputs as states; inputs moved by their dead times.
+    rare : ndarray of bool, shape (q,), optional
+        Outputs that are read now and then: stand-ins take their place.
     """
 
-    def __init__(self, episodes: Sequence[Episode]) -> None:
+    def __init__(self, episodes: Sequence[Episode], rare: NDArray[np.bool_] | None = None) -> None:
+        self.rare = np.zeros(episodes[0].states.shape[1], bool) if rare is None else rare
         p, self.arx = lags_by_criterion(episodes)
         q, self.width = episodes[0].states.shape[1], episodes[0].regressors.shape[1]
         self.rows = with_lags(episodes, p, p - 1)
@@ -225,11 +232,15 @@ class Past:
         noise = errors.T @ errors / len(errors)
         c = found.predict(np.zeros((1, n + driven + q)))[0] + K @ self.arx.reached
         A = inner + K @ C
-        if spectral_radius(inner) >= 1:
+        some, own = ~self.rare, noise + FLOOR * np.eye(q)
+        K[:, self.rare] = 0.0  # stand-ins tell nothing of it
+        if spectral_radius(A - K @ C) >= 1:
             # The gain of the filter for what these states and outputs miss is stable.
             spread = K @ noise @ K.T + found.covariance
-            K = kalman_gain(A, C, (spread + spread.T) / 2, noise + FLOOR * np.eye(q), K @ noise)
-        return Innovations(A, B, K, C, c, self.arx.reached, noise + FLOOR * np.eye(q))
+            cross = K @ noise[:, some]
+            at = np.ix_(some, some)
+            K[:, some] = kalman_gain(A, C[some], (spread + spread.T) / 2, own[at], cross)
+        return Innovations(A, B, K, C, c, self.arx.reached, own, bool(self.rare.any()))
 
 
 def kalman_gain(A: Array, C: Array, spread: Array, noise: Array, cross: Array) -> Array:
@@ -266,6 +277,13 @@ class Chunks:
         self.gaps = bool(np.any(self.lost))
         self.samples = int(self.there.sum())
         self.readings: Array = self.read.sum(axis=(0, 1))
+        self.rare: NDArray[np.bool_] = self.readings < self.readings.max()
+
+    def forgets(self, model: Innovations) -> bool:
+        """Return whether errors of the states decay, with and without the rare outputs."""
+        often = ~self.rare
+        between = model.A - model.K[:, often] @ model.C[often]
+        return spectral_radius(model.inner) < 1 and spectral_radius(between) < 1
 
     def covariance(self, model: Innovations) -> Array:
         """Return the mean square (q, q) of the prediction errors, the first states by its noise."""
@@ -409,7 +427,7 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
         while damping < 1e4:
             scaled = matrix / np.outer(scale, scale) + damping * np.eye(len(side))
             trial = moved_by(model, np.linalg.solve(scaled, side / scale) / scale)
-            if spectral_radius(trial.inner) < 1:
+            if chunks.forgets(trial):
                 noise = chunks.covariance(trial) + floor
                 now = chunks.size(noise) if np.all(np.isfinite(noise)) else np.inf
                 if now < size:
@@ -425,7 +443,8 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
 def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Array, Array]) -> Array:
     """Return the states (T + 1, n) that the outputs before each sample tell.
 
-    The filter begins with a mean and a covariance, and goes on without what is missing.
+    The filter begins with a mean and a covariance, and goes on without what is missing. Where some
+    outputs are read now and then its gain is K throughout.
 
     Parameters
     ----------
@@ -447,6 +466,9 @@ def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Arra
     cross = K @ noise
     for k, step in enumerate(moved):
         left = outputs[k] - model.y_0 - C @ x[k]
+        if model.sparse:
+            x[k + 1] = A @ x[k] + step + K @ np.where(there[k], left, 0.0)
+            continue
         if P is None and whole[k]:
             x[k + 1] = A @ x[k] + step + K @ left
             continue

@@ -16,12 +16,13 @@ from sb3_yann.control.identification.innovations import (
     Past,
     dead_times,
     filtered,
+    log_determinant,
+    mean_square,
     refined,
     shifted,
 )
 from sb3_yann.control.identification.least_squares import NOT_EXCITED
 from sb3_yann.control.identification.residuals import curvature_test, project_out
-from sb3_yann.control.lqr import spectral_radius
 from sb3_yann.log import Episode, split_episodes
 
 AHEAD = 20
@@ -88,21 +89,27 @@ def fit_structure(
     order: int | None,
     delays: Sequence[int] | None,
     held_out: float,
+    read: Sequence[Episode] | None = None,
 ) -> Structure:
-    """Return the model of scaled episodes whose order and dead times are given, or None to find."""
-    fitted, tested = split_episodes(episodes, held_out)
+    """Return the model of scaled episodes whose order and dead times are given, or None to find.
+
+    ``read`` are the same episodes with NaN where a stand-in takes the place of a reading.
+    """
+    read = episodes if read is None else read
+    fitted, _ = split_episodes(episodes, held_out)
+    known, tested = split_episodes(read, held_out)
     m = episodes[0].inputs.shape[1]
     trials = [tuple(delays)] if delays is not None else [(0,) * m]
     if delays is None:
         trials += [each for each in dict.fromkeys(dead_times(fitted, MAX_DELAY)) if any(each)]
-    searches = [Search(fitted, tested, lags) for lags in trials]
+    searches = [Search(fitted, known, tested, lags) for lags in trials]
     rough = [each.rough(order) for each in searches]
     best = int(np.argmin([each.criterion for each in rough]))
     sure = rough[best].criterion < rough[0].criterion - SURE / sum(map(len, fitted))
     if not sure or rough[best].error > rough[0].error * WORSE:
         best = 0
     found = searches[best].best(order)
-    whole = Search(episodes, [], found.delays)
+    whole = Search(episodes, read, [], found.delays)
     final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
     past = whole.past
     return replace(
@@ -150,10 +157,15 @@ class Search:
     """Models of each order for given dead times."""
 
     def __init__(
-        self, fitted: Sequence[Episode], tested: Sequence[Episode], delays: tuple[int, ...]
+        self,
+        fitted: Sequence[Episode],
+        read: Sequence[Episode],
+        tested: Sequence[Episode],
+        delays: tuple[int, ...],
     ) -> None:
-        self.fitted, self.tested = shifted(fitted, delays), shifted(tested, delays)
-        self.past, self.chunks, self.delays = Past(self.fitted), Chunks(self.fitted), delays
+        self.fitted, self.tested = shifted(read, delays), shifted(tested, delays)
+        self.chunks, self.delays = Chunks(self.fitted), delays
+        self.past = Past(shifted(fitted, delays), self.chunks.rare)
         self.largest = min(MAX_ORDER, self.past.limit)
         self.tried: list[Structure] = []
 
@@ -192,7 +204,7 @@ class Search:
     def judged(self, model: Innovations) -> Structure:
         """Return a model with its criterion and its free runs over held-out data."""
         q = len(model.C)
-        if spectral_radius(model.inner) >= 1:
+        if not self.chunks.forgets(model):
             none = np.full(q, np.inf)
             nowhere = np.zeros(model.order), np.eye(model.order)
             return Structure(model, self.delays, none, np.inf, nowhere, (none, none))
@@ -209,12 +221,14 @@ class Search:
 
         The chunks' own first states would count as parameters.
         """
-        errors = np.concatenate(
-            [each.states[1:] - predicted(model, each, start, 1) for each in self.fitted]
-        )
-        steps, q = errors.shape
+        shown = np.concatenate([each.states[1:] for each in self.fitted])
+        guess = np.concatenate([predicted(model, each, start, 1) for each in self.fitted])
+        read = np.isfinite(shown)
+        steps, q = shown.shape
         price = 2 * np.log(np.log(max(steps, 16)))
-        size = np.linalg.slogdet(errors.T @ errors / steps + FLOOR * np.eye(q))[1]
+        errors = np.where(read, shown - guess, 0.0)
+        noise = mean_square(errors, read) + FLOOR * np.eye(q)
+        size = log_determinant(noise, read.sum(axis=0))
         return float(size + price * model.n_parameters / steps)
 
 
@@ -228,8 +242,12 @@ def free_run_errors(
         return none, none
     target = np.concatenate([each.states[ahead:] for each in longer])
     guess = np.concatenate([predicted(model, each, start, ahead) for each in longer])
-    errors = np.sqrt(np.mean((target - guess) ** 2, axis=0))
-    moved = np.std(target, axis=0)
+    read = np.isfinite(target)
+    with np.errstate(invalid="ignore"):
+        count = read.sum(axis=0)
+        mean = np.where(read, target, 0.0).sum(axis=0) / count
+        moved = np.sqrt((np.where(read, target - mean, 0.0) ** 2).sum(axis=0) / count)
+        errors = np.sqrt((np.where(read, target - guess, 0.0) ** 2).sum(axis=0) / count)
     return errors, 100 * (1 - errors / np.where(moved > 0, moved, np.nan))
 
 

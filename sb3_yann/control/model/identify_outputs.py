@@ -25,10 +25,11 @@ from sb3_yann.control.identification.innovations import (
 from sb3_yann.control.identification.least_squares import WEAK, Regression, pole_note, regress
 from sb3_yann.control.identification.outputs import AHEAD, Structure, fit_structure, predicted
 from sb3_yann.control.identification.residuals import listed
+from sb3_yann.control.identification.slow import read_log
 from sb3_yann.control.linear_system import names
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
-from sb3_yann.log import Arrays, Episode, Log, cut_at_gaps
+from sb3_yann.log import Arrays, Episode, Log
 
 APART = 1e3
 """Condition number of C up to which outputs serve as states."""
@@ -58,6 +59,8 @@ class IdentifiedOutputs(ReadOnlyArrays):
         Smallest over largest singular value of outputs and inputs, each in units of its spread.
     start : tuple of ndarray, shapes (n,) and (n, n)
         Mean and covariance of the states in the log, from which a prediction begins.
+    every : tuple of int, length q
+        Each output is read every so many samples, of those whose inputs are known.
     drift : ndarray, shape (n,)
         Motion in one sample at the operating point, which ``model`` leaves out.
 
@@ -82,6 +85,7 @@ class IdentifiedOutputs(ReadOnlyArrays):
     excitation: float
     start: tuple[Array, Array]
     drift: Array
+    every: tuple[int, ...] = ()
     __eq__, __hash__ = object.__eq__, object.__hash__  # fits may be NaN
 
     def __str__(self) -> str:
@@ -128,6 +132,11 @@ class IdentifiedOutputs(ReadOnlyArrays):
 
     def estimator(self) -> StateEstimator:
         """Return the Kalman filter of this model, in deviations, for `wrappers.EstimateState`."""
+        if any(each > 1 for each in self.every):
+            own = len(self.model.A) - sum(self.delays)  # the rest are inputs on their way
+            gain = np.zeros_like(self.gain)
+            gain[:own] = np.linalg.lstsq(self.model.A[:own, :own], self.gain[:own], rcond=None)[0]
+            return StateEstimator(self.model, every=self.every, gain=gain)
         spread = self.gain @ self.noise
         return StateEstimator(
             self.model,
@@ -144,7 +153,8 @@ class IdentifiedOutputs(ReadOnlyArrays):
         rest = model.x_ss - model.A @ model.x_ss - driven @ np.append(model.u_ss, model.d_ss)
         none = np.zeros(len(self.noise))
         C = model.shown
-        return Innovations(model.A, driven, self.gain, C, rest + self.drift, none, self.noise)
+        sparse, c = any(each > 1 for each in self.every), rest + self.drift
+        return Innovations(model.A, driven, self.gain, C, c, none, self.noise, sparse)
 
 
 def identify_outputs(
@@ -166,7 +176,8 @@ def identify_outputs(
     Parameters
     ----------
     outputs : Log, or array_like, shape (T + 1, q), or a sequence of such
-        A log whose states are the outputs; or one record or several. Rows with NaN are gaps.
+        A log whose states are the outputs; or one record or several. Rows with NaN are gaps, but
+        for outputs that are read in fewer than four of five samples: these need not be there.
     inputs : array_like, shape (T, m), or a sequence of such
         As they were executed: row k acts between rows k and k + 1 of the outputs.
     dt : float
@@ -203,11 +214,12 @@ def identify_outputs(
         given = {"inputs": inputs, "dt": dt, "disturbances": disturbances}
         if beside := [name for name, value in given.items() if value is not None]:
             raise TypeError(f"{beside} is given, but the log has its own: leave it out.")
-        log = outputs
+        log, read = outputs, list(outputs.episodes)
+        every: tuple[int, ...] = (1,) * log.sizes[0]
     elif inputs is None or dt is None:
         raise TypeError("identify_outputs takes a Log, or outputs and inputs with dt=.")
     else:
-        log = cut_at_gaps(outputs, inputs, dt, disturbances)
+        log, read, every = read_log(outputs, inputs, dt, disturbances)
     wanted = None if isinstance(order, str) and order == "auto" else check_int("order", order, 1)
     episodes, (q, m, d) = list(log.episodes), log.sizes
     require_moving(episodes, log.sizes)
@@ -218,9 +230,10 @@ def identify_outputs(
     share = check_range("held_out", held_out, 0, 0.5, "[]")
     center, scale = plain.center, np.where(plain.spread > 0, plain.spread, 1.0)
     scaled = [_scaled(each, center, scale, q, m) for each in episodes]
-    found = fit_structure(scaled, wanted, as_delays(delay, m), share)
+    known = [_scaled(each, center, scale, q, m) for each in read]
+    found = fit_structure(scaled, wanted, as_delays(delay, m), share, known)
     model, start = _in_plant_units(found, center, scale, q)
-    rows = shifted(episodes, found.delays)
+    rows = shifted(read, found.delays)
     states = [
         Episode(
             filtered(model, each.states, each.driven @ model.B.T + model.c, start),
@@ -244,7 +257,7 @@ def identify_outputs(
         system.u_ss,
         E if d else None,
         system.d_ss if d else None,
-        notes=[*system.notes, *_notes(log, found, plain, step, model.noise)],
+        notes=[*system.notes, *_notes(log, found, plain, step, model.noise), *_rates(log, every)],
         state_names=_state_names(log, model, found.delays),
         input_names=log.input_names,
         units=dict(zip(log.input_names, log.units[q : q + m], strict=True)) if log.units else (),
@@ -266,6 +279,7 @@ def identify_outputs(
             np.append(start[0], plain.center[q : q + m][late]),
             linalg.block_diag(start[1], memory) if len(late) else start[1],
         ),
+        every=every,
         drift=np.append(drift - system.x_ss, np.zeros(len(late))),
     )
 
@@ -305,7 +319,8 @@ def _in_plant_units(
         K, C = np.vstack([K, np.zeros((1, q))]), np.column_stack([C, left])
         c, mean, spread = np.append(c, 1.0), np.append(mean, 1.0), linalg.block_diag(spread, 0.0)
     noise = unit[:, None] * model.noise * unit
-    return Innovations(A, B, K, C, c, np.zeros(q), noise), (mean, spread)
+    plain = Innovations(A, B, K, C, c, np.zeros(q), noise, model.sparse)
+    return plain, (mean, spread)
 
 
 def _with_memory(
@@ -337,6 +352,13 @@ def _state_names(log: Log, model: Innovations, delays: Sequence[int]) -> Sequenc
     if log.state_names and np.array_equal(model.C, np.eye(q, model.order)):
         own[:q] = log.state_names
     return [*own, *memory_labels(delays, log.input_names or names((0, m)))]
+
+
+def _rates(log: Log, every: Sequence[int]) -> list[str]:
+    """Return a note on outputs that are read now and then."""
+    shown = log.state_names or [f"y[{i}]" for i in range(len(every))]
+    rare = [f"{name} every {n}" for name, n in zip(shown, every, strict=True) if n > 1]
+    return [f"Read now and then: {', '.join(rare)} samples." for _ in rare[:1]]
 
 
 def _notes(

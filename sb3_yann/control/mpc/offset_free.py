@@ -23,6 +23,7 @@ def offset_free(
     mpc: LinearMPC,
     d_max: ArrayLike | None = None,
     measured: ArrayLike | Sequence[int] | None = None,
+    every: int | Sequence[int] = 1,
 ) -> tuple[LinearMPC, DisturbanceObserver]:
     """Return the MPC with a disturbance of each measured state, and the observer that estimates it.
 
@@ -43,6 +44,8 @@ def offset_free(
     measured : array_like, shape (q, n), or list of int, optional
         The measured outputs, or the indices of the measured states. The default is the model's C.
         The disturbances then act on these.
+    every : int or sequence of int, default 1
+        Each output is read every so many samples, as of :class:`StateEstimator`.
 
     Raises
     ------
@@ -102,4 +105,4 @@ def offset_free(
         theta_max=mpc.theta_max[states],
     )
     noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
-    return found, DisturbanceObserver(model, C, **noise)
+    return found, DisturbanceObserver(model, C, every=every, **noise)

@@ -212,3 +212,21 @@ def test_C_is_kept_by_copies_units_and_sampling() -> None:
     np.testing.assert_array_equal(sampled.C, [[1, 0]])
     back = LinearModel.from_statespace(sampled.to_statespace())
     np.testing.assert_array_equal(back.C, [[1, 0]])
+
+
+def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
+    u = steps(2000, 2, 0)
+    y = played(u, A, B, C, 1)
+    y[np.arange(len(y)) % 10 > 0, 1] = np.nan
+    found = identify_outputs(y, u, dt=0.5)
+    assert found.every == (1, 10) and "Read now and then: y[1] every 10" in found.report()
+    fresh = steps(800, 2, 5)
+    z = played(fresh, A, B, C, 6)
+    best = best_possible({"A": A, "B": B, "C": C}, z, fresh, 0.05, 20)
+    shown = z.copy()
+    shown[np.arange(len(z)) % 10 > 0, 1] = np.nan
+    guess = found.predict(shown, fresh, ahead=20)
+    late = slice(60, None)
+    for i in range(2):  # of a filter that reads each sample
+        assert rms((guess - z[20:])[late, i]) < 1.2 * rms((best - z[20:])[late, i])
+    assert found.estimator().every.tolist() == [1, 10]
