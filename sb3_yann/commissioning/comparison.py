@@ -200,22 +200,17 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inpu
 
     References and measured disturbances are those of the episodes.
     """
-    dynamics, row = twin.dynamics, twin.dynamics.row
-    lengths, members = np.array([len(each.actions) for each in episodes]), len(dynamics.members)
-    first = row.begin(np.array([[each.thetas[0] for each in episodes]]))
-    theta = np.repeat(first, members, axis=0)
-    shape, costs = theta.shape, np.zeros(theta.shape[:2])
+    dynamics, row, problem = twin.dynamics, twin.dynamics.row, twin.problem
+    lengths = np.array([len(each.actions) for each in episodes])
+    steps = np.arange(lengths.max())[:, None]
+    first = row.begin(np.array([each.thetas[0] for each in episodes]))
+    given = np.stack([e.thetas[np.minimum(steps[:, 0], len(e.actions))] for e in episodes], axis=1)
+    starts = np.repeat(first[None], len(dynamics.members), axis=0)
     with np.errstate(all="ignore"):
-        for k in range(lengths.max()):
-            now = [each.thetas[min(k, last)] for each, last in zip(episodes, lengths, strict=True)]
-            theta[..., row.given] = np.array(now)[:, row.given]
-            u = act(row.shown(theta.reshape(-1, shape[-1]))).reshape(*shape[:2], -1)
-            costs += np.where(
-                k < lengths, twin.problem.deviations.stage_cost(row.shown(theta), u), 0.0
-            )
-            after = dynamics.step(theta, u)
-            reached = np.array([row.shown(theta), row.shown(after)])
-            soft = bound_excess(twin.problem, reached, u[None]).penalty
-            costs += np.where(k < lengths, soft, 0.0)
-            theta = after
-    return np.asarray(costs.mean(axis=0))
+        rows, u = dynamics.roll_out(act, starts, len(steps), given[..., row.given])
+        costs = np.asarray(problem.deviations.stage_cost(row.shown(rows[:-1]), u))
+        found = np.sum(costs * (steps < lengths)[:, None], axis=0)
+        for i, length in enumerate(lengths):
+            played = row.shown(rows[: length + 1, :, i])
+            found[:, i] += bound_excess(problem, played, u[:length, :, i]).penalty
+    return np.asarray(found.mean(axis=0))

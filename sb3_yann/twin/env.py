@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -115,46 +114,24 @@ class TwinEnv(gym.Env[Single, Single]):
         if u.shape != self.action_space.shape or not np.all(np.isfinite(u)):
             wanted = f"{self.action_space.shape} finite numbers"
             raise ValueError(f"action = {action!r} must be {wanted}.")
-        rows, told, over = step_all([self], self._acting, u[None])
-        thetas = self.dynamics.problem.units.to_plant(self.dynamics.row.shown(rows))
-        info = {name: each[0].item() for name, each in told.items()} | {"state": thetas[0]}
-        return thetas[0].astype(np.float32), -info["cost"], False, bool(over[0]), info
-
-
-def step_all(
-    envs: Sequence[TwinEnv], dynamics: Dynamics, actions: Array
-) -> tuple[Array, dict[str, NDArray[Any]], NDArray[np.bool_]]:
-    """Step envs of one twin as one array; return rows, what infos tell, and who is over.
-
-    Rows are in deviations.
-
-    Parameters
-    ----------
-    envs : sequence of TwinEnv
-        Amid their episodes.
-    dynamics : Dynamics
-        One member for each env: the one that acts.
-    actions : ndarray, shape (envs, m)
-        In plant units; they are clipped to their bounds.
-    """
-    row = dynamics.row
-    u = dynamics.problem.units.input_to_deviations(actions)
-    problem = dynamics.problem.deviations
-    u = np.clip(u, problem.u_min, problem.u_max)
-    before = np.array([each._theta for each in envs])
-    costs = np.asarray(problem.stage_cost(row.shown(before), u))
-    after = dynamics.step(before[:, None], u[:, None])[:, 0]
-    for each, theta in zip(envs, after, strict=True):
-        each._steps += 1
-        if each._steps < len(each._episode.thetas):
-            theta[row.given] = each._episode.thetas[each._steps, row.given]
-        each._theta = theta.copy()
-    over = np.array([each._steps >= len(each._episode) for each in envs])
-    excess = bound_excess(problem, np.array([row.shown(before), row.shown(after)]), u[None])
-    told = {
-        "cost": costs,
-        "violation": envs[0].limits.violated(after) | (excess.largest > EXCESS_ROOM),
-        "excess": excess.largest,
-        "penalty": excess.penalty,
-    }
-    return after, told, over
+        row, units = self.dynamics.row, self.dynamics.problem.units
+        problem = self.dynamics.problem.deviations
+        u = np.clip(units.input_to_deviations(u), problem.u_min, problem.u_max)
+        before = self._theta
+        after = self._acting.step(before[None, None], u[None, None])[0, 0]
+        self._steps += 1
+        if self._steps < len(self._episode.thetas):
+            after[row.given] = self._episode.thetas[self._steps, row.given]
+        self._theta = after
+        beyond = bound_excess(problem, row.shown(np.array([before, after])), u[None])
+        excess = float(beyond.largest)
+        theta = units.to_plant(row.shown(after))
+        info = {
+            "cost": float(problem.stage_cost(row.shown(before), u)),
+            "violation": bool(self.limits.violated(after)) or excess > EXCESS_ROOM,
+            "excess": excess,
+            "penalty": float(beyond.penalty),
+            "state": theta,
+        }
+        over = self._steps >= len(self._episode)
+        return theta.astype(np.float32), -info["cost"], False, over, info

@@ -43,7 +43,6 @@ from sb3_yann.twin.trust import (
     evidence,
     relative_error,
 )
-from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -98,9 +97,8 @@ class PlantTwin:
     >>> twin = PlantTwin.fit(problem, [*zip(log.observations, log.actions)])
     >>> twin.trusted
     True
-    >>> observations, _ = twin.vector_env(8).reset(seed=0)
-    >>> observations.shape
-    (8, 4)
+    >>> twin.env().reset(seed=0)[0].shape
+    (4,)
     """
 
     problem: LinearMPC
@@ -339,11 +337,3 @@ class PlantTwin:
         """
         self.require_trust()
         return TwinEnv(self.dynamics, self.episodes, self.starts, self.limits, member)
-
-    def vector_env(self, n_envs: int, member: int | None = None) -> TwinVectorEnv:
-        """Return as many of :meth:`env`, which step as one array, as Gymnasium's vector env."""
-        return TwinVectorEnv(copies(self.env(member), n_envs))
-
-    def vec_env(self, n_envs: int, member: int | None = None) -> TwinVecEnv:
-        """Return as many of :meth:`env`, which step as one array, for Stable-Baselines3."""
-        return TwinVecEnv(copies(self.env(member), n_envs))

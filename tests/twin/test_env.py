@@ -77,8 +77,6 @@ def test_a_model_trains_in_it_under_a_guard_that_plays_every_member() -> None:
 def test_a_start_that_is_none_is_refused() -> None:
     with pytest.raises(ValueError, match=r"options\['state'\] = \[nan, 0.0\] must be finite"):
         twin().env().reset(options={"state": [np.nan, 0.0]})
-    with pytest.raises(ValueError, match=r"options = \{'start': 0\} must be \{'state': starts\}"):
-        twin().vector_env(2).reset(options={"start": 0})
 
 
 def held() -> tuple[PlantTwin, list[Episode]]:

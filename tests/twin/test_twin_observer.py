@@ -75,25 +75,6 @@ def test_the_twin_s_env_is_the_wrapped_plant_step_by_step() -> None:
     assert clipped > 5
 
 
-def test_vector_envs_step_as_the_env_does() -> None:
-    found = observed()
-    env, several, venv = found.env(), found.vector_env(3), found.vec_env(2)
-    first, rng = several.reset(seed=4)[0], np.random.default_rng(0)
-    venv.seed(4)
-    other = venv.reset()
-    one = env.reset(seed=4)[0]
-    for _ in range(60):
-        np.testing.assert_array_equal(first[0], one)
-        np.testing.assert_array_equal(other[0], one)
-        u = rng.uniform(-1, 1, (3, 1)).astype(np.float32)
-        before, (one, reward, *_) = one, env.step(u[0])
-        first, rewards, *_ = several.step(u)
-        other = venv.step(u[:2])[0]
-        cost = found.problem.stage_cost(before.astype(float), u[0].astype(float))
-        assert rewards[0] == pytest.approx(reward, rel=1e-12)
-        assert reward == pytest.approx(-float(cost), rel=1e-4, abs=1e-6)
-
-
 @pytest.mark.parametrize("begin", [0, 20])
 def test_the_log_tells_what_was_measured_and_estimated(begin) -> None:
     mpc, observer = offset_free_problem()
