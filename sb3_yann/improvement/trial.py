@@ -171,9 +171,8 @@ class Trial:
         costs, unsafe = played
         known, mean, excess = self.known, self.mean, costs - self.mpc[0]
         safe = not np.any(less_safe(unsafe, self.mpc[1]))
-        # What the members say of a start on average: where they differ, the interval is wide.
-        policy, mpc = (Scores(self._of_starts(c), u[known]) for c, u in (played, self.mpc))
-        allowed_more = RULE.tolerance(mpc.costs, BoundNames.of(self.twin.problem))
+        policy, mpc = (Scores(c[known], u[known]) for c, u in (played, self.mpc))
+        allowed_more = RULE.tolerance(self.mpc[0][known], BoundNames.of(self.twin.problem))
         reason = no_worse(policy, mpc, mpc, allowed_more).reason
         logged, error = self._as_logged(excess)
         if not reason and not logged <= 0:
@@ -186,11 +185,6 @@ class Trial:
         change, worst = float(excess[known].mean()), float(excess[known].max())
         shown = change / mean, worst / mean, safe, logged / mean, error / mean
         return Check(iteration, not reason, reason, *shown)
-
-    def _of_starts(self, costs: Array) -> Array:
-        """Return the members' mean of what each known start costs, for each member again."""
-        by_member = costs.reshape(self.starts.shape[:2])[:, : self.n_known]
-        return np.tile(by_member.mean(axis=0), len(by_member))
 
     def _as_logged(self, excess: Array) -> tuple[float, float]:
         """Return the mean of the starts that go on as the log does, and its standard error.

@@ -126,12 +126,13 @@ class TwinEnv(gym.Env[Single, Single]):
         beyond = bound_excess(problem, row.shown(np.array([before, after])), u[None])
         excess = float(beyond.largest)
         theta = units.to_plant(row.shown(after))
+        cost = float(problem.stage_cost(row.shown(before), u))
         info = {
-            "cost": float(problem.stage_cost(row.shown(before), u)),
+            "cost": cost,
             "violation": bool(self.limits.violated(after)) or excess > EXCESS_ROOM,
             "excess": excess,
             "penalty": float(beyond.penalty),
             "state": theta,
         }
         over = self._steps >= len(self._episode)
-        return theta.astype(np.float32), -info["cost"], False, over, info
+        return theta.astype(np.float32), -cost, False, over, info
