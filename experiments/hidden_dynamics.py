@@ -3,7 +3,8 @@
 Thirty plants, drawn from seeds: order one to three, units, actuator lag, backlash, a load that
 lasts, another gain than the model's. Of each two logs, the MPC's ordinary one and one with a
 dither. `improve` knows the log alone; then MPC and policy play sixty starts of the plant that no
-log has. Prints a row for each log: what was promised, its interval, and what the plant gave.
+log has. Prints a row for each log: what was promised, its interval, and what the plant gave. With
+`--commission` sixty episodes of `Commissioning` take the place of the logs.
 """
 
 from __future__ import annotations
@@ -18,9 +19,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import TimeLimit
+from stable_baselines3 import DDPG
 
 from experiments.markdown import table
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
+from sb3_yann import (
+    Commissioning,
+    LinearModel,
+    LinearMPC,
+    PlantTwin,
+    Tracking,
+    YannPolicy,
+    improve,
+)
 from sb3_yann._validation import Array
 from sb3_yann.evaluation import evaluate
 from sb3_yann.wrappers import SetPoint, StageCost
@@ -204,12 +214,31 @@ def execute(seed: int, how: str) -> Row:
     )  # fmt: skip
 
 
+def commission(seed: int) -> list[str]:
+    """Return what sixty episodes of a commissioning ended with, as a row."""
+    mpc, make = draw(seed)
+    options = {"problem": mpc, "networks": "shared"}
+    model = DDPG(YannPolicy, make(), policy_kwargs=options, seed=0, device="cpu")
+    run = Commissioning(model, make, batch=4, rounds=1, updates=300, seed=100_000 * seed)
+    last = run.run(4)[-1]
+    told = f"{last.cost:.4g}, {last.mpc:.4g}"
+    alarms = sum(each.alarms for each in run.batches)
+    change = f"{100 * true_change(run.model, mpc, make):+.2f}"
+    return [str(seed), run.kept, told, str(alarms), change, last.reason[:60]]
+
+
 def main() -> None:
     """Do the runs, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("--seeds", type=int, nargs=2, default=(SEEDS.start, SEEDS.stop))
     parser.add_argument("--out", type=Path, default=Path("hidden_dynamics.jsonl"))
+    parser.add_argument("--commission", action="store_true")
     args = parser.parse_args()
+    if args.commission:
+        header = "plant", "kept", "cost, the MPC's", "alarms", "true, %", "last"
+        rows = [commission(seed) for seed in range(*args.seeds)]
+        print(table(header, rows, 3))
+        return
     done = [json.loads(line) for line in args.out.open()] if args.out.exists() else []
     for seed in range(*args.seeds):
         for how in LOGS:

@@ -149,6 +149,11 @@ class Commissioning:
         return [*self.journal.batches]
 
     @property
+    def kept(self) -> str:
+        """The policy that the plant has confirmed: "MPC", or the batch after which it came."""
+        return self.journal.state.kept_policy
+
+    @property
     def episodes(self) -> list[PlantEpisode]:
         """All episodes so far."""
         return [*self.journal.episodes]

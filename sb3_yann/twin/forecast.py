@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sb3_yann._validation import Array
-from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.twin.dynamics import Dynamics, law_of
 from sb3_yann.twin.log import Episode, records
@@ -31,7 +29,6 @@ LESS = 0.02  # share of the errors of one step that it must explain on held-out 
 RIDGE = 1e-3  # of its standardized regressors
 RUNS = 100  # from new starts, at least
 ROWS = 4  # steps of a log for each coefficient, at least
-GAINS = 0.6, 1.7  # times the model's: an input may act so, unless the log refutes it
 
 Inputs = Callable[[Array], Array]
 
@@ -46,78 +43,14 @@ class Judge:
         Member k has not seen fold k: every episode whose number is k modulo the members.
     says : str
         What sets it apart.
+    refuted : bool
+        Whether it predicts held-out episodes surely worse than the twin. Dynamics that both lack
+        may feign that: with a memory it counts.
     """
 
     dynamics: Dynamics
     says: str = ""
-
-
-@dataclass(frozen=True)
-class OtherGain(Dynamics):
-    """A twin in which an input acts otherwise, where it is not what the log lets expect of it.
-
-    ``x+ = f(x, u) + effect (u_j - expected(theta))``. In a closed loop the inputs follow theta:
-    what is smooth in theta may as well be the plant's own, and the log does not tell ``effect``.
-
-    Attributes
-    ----------
-    j : int
-    effect : ndarray, shape (n,)
-    expected : ndarray, shape (c,)
-        Coefficients of a constant, theta and its squares and products.
-    """
-
-    j: int
-    effect: Array
-    expected: Array
-
-    @classmethod
-    def of(cls, twin: Dynamics, episodes: Sequence[Episode], j: int, gain: float) -> OtherGain:
-        """Return a twin in which input j acts so many times as the model says on average."""
-        rows = np.concatenate([each.thetas[:-1] for each in episodes])
-        u = np.concatenate([each.actions for each in episodes])
-        columns = _columns(twin, rows)
-        expected = np.linalg.lstsq(columns, u[:, j], rcond=None)[0]
-        own = twin.jacobians(rows[None], u[None])[1][..., twin.row.state, j].mean(axis=(0, 1))
-        effect = gain * twin.problem.model.B[:, j] - own
-        return cls(twin.problem, twin.coordinates, twin.members, j, effect, expected)
-
-    def step(self, theta: Array, u: Array) -> Array:
-        """Return the next rows (members, batch, size)."""
-        after = super().step(theta, u)
-        other = u[..., self.j] - _columns(self, theta) @ self.expected
-        after += other[..., None] * (self.row.spread @ self.effect)
-        self.row.clip(after)
-        self.coordinates.wrap(after)
-        return np.asarray(after)
-
-
-def _columns(twin: Dynamics, rows: Array) -> Array:
-    """Return a constant, theta, and squares and products of it, at rows (..., size)."""
-    theta = twin.row.shown(rows) / twin.problem.theta_half
-    i, j = np.triu_indices(theta.shape[-1])
-    one = np.ones((*theta.shape[:-1], 1))
-    return np.concatenate([one, theta, theta[..., i] * theta[..., j]], axis=-1)
-
-
-def judges(twin: Dynamics, episodes: Sequence[Episode]) -> tuple[Judge, ...]:
-    """Return a twin, and what else a log may allow: each input with another gain.
-
-    In a closed loop the inputs follow the states, and a log may not tell their gains.
-
-    Parameters
-    ----------
-    twin : Dynamics
-        Member k has not seen fold k of the episodes.
-    episodes : sequence of Episode
-        The log.
-    """
-    names = labels_of(twin.problem.model)[1]
-    found = [Judge(twin)]
-    for j, gain in product(range(len(names)), GAINS):
-        says = f"a gain of {names[j]} {gain:g} times the model's, which the log allows,"
-        found.append(Judge(OtherGain.of(twin, episodes, j, gain), says))
-    return tuple(found)
+    refuted: bool = False
 
 
 class Forecast(NamedTuple):
@@ -297,7 +230,7 @@ def forecast(
     for judge in judges:
         law = law_of(judge.dynamics.problem)
         for remembers in (False, True):
-            if remembers and not own.tells:
+            if (judge.refuted and not remembers) or (remembers and not own.tells):
                 continue
             replays = _Replays(judge, episodes, remembers)
             if surely_worse(replays.left - (own if remembers else plain).left):

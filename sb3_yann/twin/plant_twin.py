@@ -16,7 +16,7 @@ from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.env import TwinEnv
-from sb3_yann.twin.forecast import Forecast, Judge, forecast, judges
+from sb3_yann.twin.forecast import Forecast, Judge, forecast
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from sb3_yann.twin.observers import observer_of, warn_of_estimates
@@ -32,6 +32,7 @@ from sb3_yann.twin.selection import (
     Candidate,
     candidates,
     held_out,
+    judges,
     ridge,
     without_each_fold,
 )
@@ -51,7 +52,7 @@ BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
 AHEAD = 20
 """Steps of the windows that networks are fitted to."""
-ROWS, LACKS = 300, 0.01
+ROWS, LACKS = 100, 0.01
 """Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
 episodes err by so much of the mean."""
 
@@ -223,8 +224,7 @@ class PlantTwin:
             members = [Residual.zero(len(coordinates.scale), problem.model.n_states)] * n_members
         dynamics = Dynamics(problem, coordinates, tuple(members))
         trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
-        own = Dynamics(problem, coordinates, choice.by_fold)
-        found = judges(own, log) if choice.by_fold else ()
+        found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
         return cls(problem, log, choice.name, dynamics, trust, notes, found)
 
     @classmethod

@@ -11,7 +11,9 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.forecast import Judge, surely_worse
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.residuals import Residual
 
@@ -25,6 +27,10 @@ LONGEST = 100
 RUNS = 20
 """Free runs in an episode."""
 FOLDS = 5
+GAINS = (0.6, 1.7)
+"""Times the model's: an input may act so, unless the log refutes it."""
+LOOSE, FIRM = 1e-3, 1e3
+"""Shrinkage of what fits a log around such a gain, and times as much of its inputs."""
 
 
 class Setting(NamedTuple):
@@ -37,11 +43,14 @@ class Setting(NamedTuple):
         Weight of its squared coefficients, times the number of samples.
     factor : float
         How many times as strongly terms with an input are shrunk.
+    gain : tuple of int and float, optional
+        An input, and how many times as the model says it acts where it is shrunk to.
     """
 
     degree: int
     shrinkage: float
     factor: float
+    gain: tuple[int, float] | None = None
 
     @property
     def freedom(self) -> float:
@@ -98,12 +107,16 @@ def ridge(
     of_inputs = np.zeros(F.shape[1], dtype=bool)
     of_inputs[k - problem.model.n_inputs : k] = True
     of_inputs[linear:] = (j >= k - problem.model.n_inputs)[: len(of_inputs) - linear]
-    for degree, shrinkage, factor in settings:
+    for degree, shrinkage, factor, gain in settings:
         size = linear if degree == 1 else F.shape[1]
         weight = shrinkage * np.where(of_inputs[:size], factor, 1.0)
         weight[k:linear] = 1e-9
         matrix = linalg.cho_factor(gram[:size, :size] + count * np.diag(weight + 1e-12))
-        solved = linalg.cho_solve(matrix, cross[:size])
+        about = np.zeros((size, n))
+        if gain is not None:
+            at = k - problem.model.n_inputs + gain[0]
+            about[at] = (gain[1] - 1) * coordinates.scale[at] * problem.model.B[:, gain[0]]
+        solved = about + linalg.cho_solve(matrix, cross[:size] - gram[:size, :size] @ about)
         Q: Array = np.zeros((k, k, n))
         if degree > 1:
             Q[i, j] = solved[linear:] / 2
@@ -151,6 +164,10 @@ class FreeRuns:
     def scores(self) -> Array:
         """The mean logarithm over horizons, (candidates, episodes): less is better."""
         return np.asarray(np.nanmean(np.log(self.by_episode + 1e-12), axis=2))
+
+    def only(self, number: int) -> FreeRuns:
+        """Return those of one candidate."""
+        return FreeRuns(self.horizons, self.by_episode[number : number + 1])
 
     def choose(self, first: int = 0) -> int:
         """Return the first candidate, from a number on, within one standard error of the best.
@@ -209,3 +226,39 @@ def _errors(
         mean = np.mean(((free - actual) / coordinates.units) ** 2, axis=(1, 3))
     found[:, : len(horizons)] = np.where(np.isfinite(mean), np.minimum(mean, 1e12), 1e12)
     return found
+
+
+def judges(
+    coordinates: Coordinates, parts: Sequence[Episode], chosen: Candidate, runs: FreeRuns
+) -> tuple[Judge, ...]:
+    """Return the twins that a log may not refute: the chosen one, and those with other gains.
+
+    In a closed loop a log may not tell the gain of an input, since the states follow it in many
+    ways. The others are shrunk little: what the chosen one owes to its shrinkage shows as well.
+
+    Parameters
+    ----------
+    coordinates : Coordinates
+        What residuals are scaled by.
+    parts : sequence of Episode
+        Each is left out once.
+    chosen : Candidate
+        What the twin is.
+    runs : FreeRuns
+        Those of the chosen one, alone.
+    """
+    problem = coordinates.row.problem
+    degree = 1 if chosen.setting is None else chosen.setting.degree
+    names, others = labels_of(problem.model)[1], list[Setting]()
+    for gain in product(range(len(names)), GAINS):
+        others.append(Setting(degree, LOOSE, FIRM, gain))
+    fits = [ridge(coordinates, each, others) for each in without_each_fold(parts)]
+    rivals = [Candidate("", tuple(fit[i] for fit in fits)) for i in range(len(others))]
+    worse = surely_worse(held_out(coordinates, parts, rivals).scores - runs.scores)
+    found = [Judge(Dynamics(problem, coordinates, chosen.by_fold))]
+    for rival, setting, wrong in zip(rivals, others, worse, strict=True):
+        assert setting.gain is not None
+        j, times = setting.gain
+        says = f"a gain of {names[j]} {times:g} times the model's, which the log allows,"
+        found.append(Judge(Dynamics(problem, coordinates, rival.by_fold), says, bool(wrong)))
+    return tuple(found)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import Commissioning, YannPolicy, improve
+from sb3_yann import Commissioning, PlantTwin, YannPolicy, improve
 from sb3_yann.commissioning.comparison import predicted_costs
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.wrappers import StageCost
-from twin_samples import observed, observed_env, offset_free_problem
+from twin_samples import POLYNOMIALS, observed, observed_env, observed_log, offset_free_problem
 
 
 def plant() -> StageCost:
@@ -39,10 +39,23 @@ def test_the_twin_predicts_what_episodes_cost_that_it_has_not_seen() -> None:
 
 def test_five_episodes_are_too_few_for_a_small_gain_and_the_answer_says_how_many_more() -> None:
     ours = model()
-    found = improve(ours, observed(), updates=2000, n_starts=20)
+    found = improve(ours, observed(), updates=500, rounds=2, n_starts=20)
     assert not found.accepted and found.interval[0] < 0 < found.interval[1]
     assert "to settle it, log about" in str(found)
     assert ours.actor.mu.network.is_zero()
+
+
+@pytest.mark.nightly
+def test_fifteen_episodes_show_a_gain_that_the_plant_keeps() -> None:
+    mpc, observer = offset_free_problem()
+    episodes = [each[:2] for each in observed_log(15)]
+    twin = PlantTwin.fit(mpc, episodes, observer=observer, residuals=POLYNOMIALS)
+    found = improve(mpc, twin, updates=2000)
+    assert found.accepted and found.interval[1] < -0.01
+    both = found.model, mpc.explicit()
+    ours, its = (evaluate(each, plant, range(3000, 3040)).costs for each in both)
+    low, high = found.interval
+    assert low <= ours.sum() / its.sum() - 1 <= high
 
 
 def test_the_watchdog_is_quiet_and_sees_what_the_observer_smooths() -> None:
