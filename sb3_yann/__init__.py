@@ -30,7 +30,8 @@ _NAMES = {
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified IdentifiedOutputs LinearCost LinearMPC LinearModel "
     "MixedBounds OnlineLaw OnlineLawWarning OutputBounds PiecewiseAffine RateLimits SoftBounds "
-    "StateEstimator Terminal Tracking identify identify_outputs offset_free",
+    "StateEstimator Terminal Tracking identify identify_outputs offset_free "
+    "with_extra",
     "sb3_yann.deployment.checks": "Checks",
     "sb3_yann.deployment.controller": "Controller",
     "sb3_yann.deployment.exporting": "Exported export",

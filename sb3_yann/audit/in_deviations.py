@@ -18,6 +18,9 @@ from sb3_yann.control.mpc.misread_bounds import misread_in_words
 from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers.spaces import require_vector
 
+Map = Callable[[Array], Array]
+"""From an observation to theta."""
+
 
 class InDeviations(gym.Wrapper[Any, Any, Any, Any]):
     """An env in plant units as laws compute with it: it shows theta, and takes u, in deviations.
@@ -28,16 +31,23 @@ class InDeviations(gym.Wrapper[Any, Any, Any, Any]):
         Shows all of theta, and takes inputs, in plant units.
     units : Units
         Of its problem.
+    observation : callable, optional
+        From what the env shows to theta in plant units. By default it shows that.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], units: Units) -> None:
+    def __init__(
+        self, env: gym.Env[Any, Any], units: Units, observation: Map | None = None
+    ) -> None:
         super().__init__(env)
         self.units = units
+        self.observation = observation
         seen: Any = env.observation_space
         taken: Any = env.action_space
         self.taken: spaces.Box = taken
+        far = np.full(len(units.theta_ss), np.inf)
+        low, high = (seen.low, seen.high) if observation is None else (-far, far)
         self.observation_space = spaces.Box(
-            seen.low - units.theta_ss, seen.high - units.theta_ss, dtype=np.float64
+            low - units.theta_ss, high - units.theta_ss, dtype=np.float64
         )
         self.action_space = spaces.Box(
             taken.low - units.u_ss, taken.high - units.u_ss, dtype=np.float64
@@ -46,7 +56,7 @@ class InDeviations(gym.Wrapper[Any, Any, Any, Any]):
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(**kwargs)
-        return self.units.to_deviations(observation), info
+        return self._theta(observation), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step with the operating point put on the action, and taken off the observation."""
@@ -54,22 +64,27 @@ class InDeviations(gym.Wrapper[Any, Any, Any, Any]):
         u = np.clip(self.units.input_to_plant(action), self.taken.low, self.taken.high)
         observation, reward, *ends, info = self.env.step(u.astype(self.taken.dtype))
         terminated, truncated = ends
-        return self.units.to_deviations(observation), float(reward), terminated, truncated, info
+        return self._theta(observation), float(reward), terminated, truncated, info
+
+    def _theta(self, shown: Any) -> Array:
+        return self.units.to_deviations(
+            shown if self.observation is None else self.observation(np.ravel(shown))
+        )
 
 
 def in_deviations(
-    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, observation_given: bool = False
+    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, observation: Map | None = None
 ) -> Callable[[], gym.Env[Any, Any]]:
     """Return a function that makes envs that show theta, and take inputs, in deviations.
 
     Parameters
     ----------
     make : callable
-        Makes an env that shows theta, and takes the inputs, in plant units.
+        Makes an env that takes the inputs in plant units.
     problem : LinearMPC
         Its operating point is taken off.
-    observation_given : bool, default False
-        Whether the user said what the env shows.
+    observation : callable, optional
+        From what it shows to theta in plant units. By default it shows that.
 
     Raises
     ------
@@ -78,7 +93,7 @@ def in_deviations(
     """
     with closing(make()) as env:
         space = require_vector(env, "action_space")
-        require_state_shown(env, observation_given)
+        require_state_shown(env, observation is not None)
     units = ActionUnits.of(problem, space.low, space.high)
     if units is not None and units.kind == "normalized":
         raise ValueError(
@@ -93,11 +108,15 @@ def in_deviations(
             f"the MPC is in plant units, from {problem.u_min.tolist()} to {problem.u_max.tolist()}."
             " Leave x_ss and u_ss out of its model, or take the env in plant units."
         )
-    return partial(_wrapped, make, problem.units) if problem.units.shifted else make
+    if observation is None and not problem.units.shifted:
+        return make
+    return partial(_wrapped, make, problem.units, observation)
 
 
-def _wrapped(make: Callable[[], gym.Env[Any, Any]], units: Units) -> gym.Env[Any, Any]:
-    return InDeviations(make(), units)
+def _wrapped(
+    make: Callable[[], gym.Env[Any, Any]], units: Units, observation: Map | None
+) -> gym.Env[Any, Any]:
+    return InDeviations(make(), units, observation)
 
 
 def require_theta_shown(problem: LinearMPC, theta: Array) -> None:

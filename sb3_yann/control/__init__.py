@@ -18,6 +18,7 @@ from sb3_yann.control.mpc.groups import (
     Terminal,
     Tracking,
 )
+from sb3_yann.control.mpc.extra import with_extra
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.control.mpc.offset_free import offset_free
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
@@ -49,4 +50,5 @@ __all__ = [
     "identify",
     "identify_outputs",
     "offset_free",
+    "with_extra",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from os import PathLike, fspath
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -349,6 +349,21 @@ class PiecewiseAffine(PlantLaw):
         law_of_batch(*self.packed, rows, inputs)
         inputs = self._within_range(inputs, rows)
         return inputs if points.ndim == 2 else inputs[0]
+
+    def widened(
+        self, entries: NDArray[np.intp], theta_min: Array, theta_max: Array
+    ) -> PiecewiseAffine:
+        """Return the law of a theta that also holds ``entries``, which it ignores, and its box."""
+        if not len(entries):
+            return self
+        at = entries - np.arange(len(entries))
+        return replace(
+            self,
+            gains=np.insert(self.gains, at, 0.0, axis=2),
+            A=np.insert(self.A, at, 0.0, axis=1),
+            theta_min=theta_min,
+            theta_max=theta_max,
+        )
 
     def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
         """Return the index of the region in use at theta, one for each row of a batch."""

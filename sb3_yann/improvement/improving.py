@@ -28,6 +28,7 @@ from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
 from sb3_yann.improvement.trial import RULE, Check, Trial
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.checkpoint import all_or_nothing
+from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.policies import (
     StartsAsMPC,
     YannPolicy,
@@ -193,7 +194,7 @@ def improve(
         ``result.export("controller.c")``.
     twin : PlantTwin, gymnasium.Env, str, callable or VecEnv
         A twin, which must be trusted; or a simulator, which shows theta of the model's problem, in
-        plant units where that is. The problem's stage cost counts, and no reward: a
+        plant units where that is, or what the policy's ``observation`` makes theta of. The problem's stage cost counts, and no reward: a
         :class:`CostMismatchWarning` says where that is another one. A function or an id makes as
         many as are played side by side, a given env is copied. The processes of a SubprocVecEnv
         play at once. Within ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, episodes
@@ -272,7 +273,9 @@ def improve(
         found = work.in_twin(twin)
         found = replace(found, source=repr(twin), episodes=len(twin.episodes))
     else:
-        found = replace(work.with_simulator(twin, max_steps), source=name_of(twin))
+        # A simulator is not the env that VecNormalize normalizes.
+        seen = None if model.get_vec_normalize_env() else policy.observation
+        found = replace(work.with_simulator(twin, max_steps, seen), source=name_of(twin))
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}
     prints = fingerprint(policy.actor.state_dict())
@@ -472,10 +475,15 @@ class _Work:
         said = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
         return replace(found, accepted=False, reason=f"{said}: to settle it, {cure}")
 
-    def with_simulator(self, env: Source | VecEnv, max_steps: int | None) -> Improvement:
-        """Learn a model of a simulator, plan in it, imitate, and let the simulator decide."""
+    def with_simulator(
+        self, env: Source | VecEnv, max_steps: int | None, seen: AffineObservation | None
+    ) -> Improvement:
+        """Learn a model of a simulator, plan in it, imitate, and let the simulator decide.
+
+        ``seen`` makes theta of what it shows.
+        """
         self.say("episodes of the MPC; where it is the first time code is compiled, up to a minute")
-        simulator = Simulator(self.problem, env, self.seed, max_steps)
+        simulator = Simulator(self.problem, env, self.seed, max_steps, seen)
         self.say.simulator = simulator
         before: Check | None = None
         note, accepted = "", False

@@ -105,11 +105,13 @@ class Simulator:
     problem : LinearMPC
         Of the policy.
     env : gymnasium.Env, str, callable or VecEnv
-        It shows theta of the problem, and takes its inputs, in plant units.
+        It takes the problem's inputs in plant units.
     seed : int
         Of the episodes.
     max_steps : int, optional
         How many it may take in all.
+    observation : callable, optional
+        From what it shows to theta in plant units. By default it shows that.
 
     Attributes
     ----------
@@ -125,12 +127,17 @@ class Simulator:
     """
 
     def __init__(
-        self, problem: LinearMPC, env: Source | VecEnv, seed: int, max_steps: int | None = None
+        self,
+        problem: LinearMPC,
+        env: Source | VecEnv,
+        seed: int,
+        max_steps: int | None = None,
+        observation: Callable[[Array], Array] | None = None,
     ) -> None:
         self.problem, self.seed, self.max_steps = problem, seed, max_steps
         self.played, self.seconds = 0, 0.0
         self.counted = _Count(np.inf if max_steps is None else max_steps)
-        self.make = in_deviations(maker(env, "twin"), problem)
+        self.make = in_deviations(maker(env, "twin"), problem, observation)
         self.envs = pool_of(env, lambda: _Counted(self.make(), self.counted))
         with self.envs.acquire(1) as (one,):
             self.row, self.unaware = RowLayout(problem, observer_of(one)), below_set_points(one)

@@ -113,15 +113,17 @@ class QuadraticForm(nn.Module):
     """``z -> z' M z``, trainable, for M (k, k) in scaled entries: ``M = D M^ D``.
 
     ``D = sqrt(|diag M|)`` is constant. The raw entries span many orders of magnitude, and equal
-    steps of Adam would flip the smallest ones.
+    steps of Adam would flip the smallest ones. ``scale`` (k,) stands for the root of a zero: one
+    over the size of an entry of z that costs nothing at first.
     """
 
     root: th.Tensor
 
-    def __init__(self, M: Array) -> None:
+    def __init__(self, M: Array, scale: Array | None = None) -> None:
         super().__init__()
         diagonal = np.abs(np.diag(M))
-        root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        one = np.ones_like(diagonal) if scale is None else np.where(scale > 0, scale, 1.0)
+        root = np.where(diagonal > 0, np.sqrt(diagonal), one)
         # Float64: along the law the terms of the form cancel, by a factor of up to some hundreds.
         entries = np.array(M / np.outer(root, root), order="C")
         self.entries = nn.Parameter(th.as_tensor(entries, dtype=th.float64))
@@ -177,13 +179,14 @@ class QuadraticStateActionValue(nn.Module):
         super().__init__()
         m = len(ranges.u_min)
         n = len(M) - m
-        self.quadratic = QuadraticForm(M)
+        scale = np.concatenate([ranges.scale(n), 1 / ranges.u_half])
+        self.quadratic = QuadraticForm(M, scale)
         self.n_before_one = len(ranges.theta_half) if n > len(ranges.theta_half) else 0
         register_constants(
             self,
             to_input=np.concatenate([np.ones(n), ranges.u_half]),
             middle=np.concatenate([np.zeros(n), ranges.u_middle]),
-            network_scale=np.concatenate([ranges.scale(n), 1 / ranges.u_half]),
+            network_scale=scale,
         )
         kept = th.tensor([pinned])
         self.network = ZeroOutputNetwork(
@@ -261,7 +264,7 @@ class AfterstateValue(nn.Module):
         if self.n_before_one:
             self.model = _keeping_one(self.model)
         self.gamma = gamma
-        self.quadratic = QuadraticForm(P)
+        self.quadratic = QuadraticForm(P, ranges.scale(len(P)))
         register_constants(
             self,
             W=W,

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from torch import nn
 
 from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearMPC, with_extra
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +220,50 @@ def to_deviations(given: AffineObservation | None, problem: LinearMPC) -> Affine
         return given
     shifted = AffineObservation.deviation(problem.theta_ss)
     return shifted if given is None else shifted @ given
+
+
+def with_extra_shown(
+    problem: LinearMPC,
+    space: spaces.Space[Any],
+    observation: AffineObservation | None,
+    extra: int,
+) -> tuple[LinearMPC, AffineObservation | None]:
+    """Return the problem with extra signals, and the map from what an env shows to its theta.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Without them.
+    space : gymnasium.spaces.Box
+        Its last entries are the signals, with finite bounds.
+    observation : AffineObservation, optional
+        From the others to theta of the problem.
+    extra : int
+        How many there are.
+    """
+    box: Any = space
+    low, high = (np.ravel(side).astype(np.float64) for side in (box.low, box.high))
+    size = len(low) - extra
+    if size < 1 or not np.all(np.isfinite([low[size:], high[size:]])):
+        raise ValueError(
+            f"extra = {extra}, but the last entries of the observation space end at "
+            f"{low[-extra:].tolist()} and {high[-extra:].tolist()}: networks need finite bounds of "
+            "extra signals. Give the space such bounds, or the problem: with_extra(mpc, low, high)."
+        )
+    found = with_extra(problem, low[size:], high[size:])
+    theta = AffineObservation.identity(problem.n_theta) if observation is None else observation
+    if theta.n_obs != size:
+        raise ValueError(
+            f"The observation has {len(low)} entries, the last {extra} of them extra signals; "
+            f"theta is made of {theta.n_obs} others. See extra= and observation=."
+        )
+    rest = np.setdiff1d(np.arange(found.n_theta), found.extra[-extra:])
+    matrix, offset = np.zeros((found.n_theta, len(low))), np.zeros(found.n_theta)
+    matrix[rest, :size] = theta.matrix
+    offset[rest] = theta.offset
+    matrix[found.extra[-extra:], size:] = np.eye(extra)
+    same = observation is None and np.array_equal(matrix, np.eye(len(low)))
+    return found, None if same else AffineObservation(matrix, offset)
 
 
 def normalized(model: BaseAlgorithm, observations: Any) -> Any:

@@ -48,6 +48,7 @@ from sb3_yann.policy.observations import (
     ObservationSpec,
     as_observation,
     to_deviations,
+    with_extra_shown,
 )
 from sb3_yann.policy.sb3_hooks import (
     KeepsPrecision,
@@ -111,6 +112,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         networks: str | None = None,
         keep_bounds: bool | None = None,
         bounds_margin: float = 0.0,
+        extra: int = 0,
         **sb3_kwargs: Any,
     ) -> None:
         algorithm = sb3_hooks.algorithm_under_construction(lr_schedule)
@@ -122,7 +124,13 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         checks.require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
         self.saved_kwargs = sb3_hooks.own_policy_kwargs(algorithm)
-        if isinstance(problem, str):
+        if check_int("extra", extra, 0):
+            shown = as_observation(observation, self.problem)
+            self.problem, observation = with_extra_shown(
+                self.problem, observation_space, shown, extra
+            )
+            self.saved_kwargs["extra"] = 0
+        if isinstance(problem, str) or extra:
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             self.saved_kwargs["problem"] = self.problem
         self.action_units = checks.as_action_units(self.problem, action_space)
@@ -476,6 +484,10 @@ class YannPolicy(StartsAsMPC, TD3Policy):
         law alone is beyond one, the policy goes no further. The default is True where there are
         hard bounds of states or outputs, or bounds in theta, but for ``infeasible="zero_input"``:
         there the paper's law gives up beyond them, and the networks are to come back.
+    extra : int, default 0
+        The last so many entries of the observation are seen by the networks of actor and critic
+        alone, in half-widths of their bounds in the observation space, which are finite. The policy
+        is then one of :func:`with_extra` of the problem.
     bounds_margin : float, default 0
         What the plant's next state may differ from the model's, in half-widths of the box of theta:
         the policy keeps so far from the bounds, where the law does.

@@ -106,6 +106,17 @@ class ParametricQP:
         b = np.concatenate([np.ones(2 * len(eye)), self.w[bound]])
         return np.vstack([eye, -eye, -self.S[bound]]), b
 
+    def without(self, entries: NDArray[np.intp]) -> ParametricQP:
+        """Return the same program without entries of theta that nothing depends on."""
+        if not len(entries):
+            return self
+        own = {
+            name: np.delete(getattr(self, name), entries, axis=-1)
+            for name in ("F", "S", "theta_min", "theta_max")
+        }
+        K = self.feedback
+        return replace(self, **own, feedback=None if K is None else np.delete(K, entries, axis=1))
+
     def without_short_rows(self, u_size: Array) -> ParametricQP:
         """Return a program of unit rows where rows that U hardly moves bound theta alone.
 

@@ -407,11 +407,21 @@ class LinearMPC(MPCProblem):
             load_kernels()
             limits = self.deviations.u_min, self.deviations.u_max
             with BudgetTimer(budget) as timer:
-                program = self.condensed()
+                program = self.condensed().without(self.extra)
                 law = solve_explicit(program, *limits, self.infeasible, solver, timer)
-            self._laws[solver] = law.on_plant(*self._plant)
+            self._laws[solver] = self._widened(law)
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
+
+    def _widened(self, law: PiecewiseAffine) -> PiecewiseAffine:
+        """Return a law of theta without extra signals as one of theta, on its plant."""
+        own = self.deviations
+        whole = law.widened(self.extra, own.theta_min, own.theta_max)
+        return whole.on_plant(*self._plant)
+
+    def take_laws(self, other: LinearMPC) -> None:
+        """Take over the laws of the same problem without extra signals, as far as solved."""
+        self._laws.update({name: self._widened(law) for name, law in other._laws.items()})
 
     def online(self) -> OnlineLaw:
         """Return the law theta -> u_0 that solves the program at each point: there at once.

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
 from sb3_yann.control.model.labels import labels_of, with_units
@@ -226,6 +227,14 @@ class MPCProblem(ReadOnlyArrays):
         entries = map(bound_entry, self.parametric_bounds)
         rest[self.layout.limits] = [limits[kind][upper][i] for kind, i, upper in entries]
         return rest
+
+    @cached_property
+    def extra(self) -> NDArray[np.intp]:
+        """The entries of theta that the law ignores: measured disturbances that move nothing."""
+        moves = np.any(self.model.E, axis=0)
+        moves[[*self.model.estimated]] = True
+        found = np.flatnonzero(~moves) if not self.disturbances.preview else np.empty(0, np.intp)
+        return np.asarray(self.layout.disturbance.start + found, np.intp)
 
     @property
     def set_points(self) -> dict[int, int]:
