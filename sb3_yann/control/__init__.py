@@ -8,6 +8,7 @@ from sb3_yann.control.model.identify import Identified, identify
 from sb3_yann.control.model.identify_outputs import IdentifiedOutputs, identify_outputs
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.choice import OnlineLawWarning
+from sb3_yann.control.mpc.extra import with_extra
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
     LinearCost,
@@ -18,7 +19,6 @@ from sb3_yann.control.mpc.groups import (
     Terminal,
     Tracking,
 )
-from sb3_yann.control.mpc.extra import with_extra
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.control.mpc.offset_free import offset_free
 from sb3_yann.control.mpc.theta_layout import ThetaLayout

@@ -194,9 +194,10 @@ def improve(
         ``result.export("controller.c")``.
     twin : PlantTwin, gymnasium.Env, str, callable or VecEnv
         A twin, which must be trusted; or a simulator, which shows theta of the model's problem, in
-        plant units where that is, or what the policy's ``observation`` makes theta of. The problem's stage cost counts, and no reward: a
-        :class:`CostMismatchWarning` says where that is another one. A function or an id makes as
-        many as are played side by side, a given env is copied. The processes of a SubprocVecEnv
+        plant units where that is, or what the policy's ``observation`` makes theta of. The
+        problem's stage cost counts, and no reward: a :class:`CostMismatchWarning` says where that
+        is another one. A function or an id makes as many as are played side by side, a given env
+        is copied. The processes of a SubprocVecEnv
         play at once. Within ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, episodes
         are spread over its workers; nothing else changes.
     max_steps : int, optional
@@ -515,7 +516,7 @@ class _Work:
         """Return a model of all episodes so far, and plans in it: of what was lost first."""
         self.say(f"a model of {len(simulator.episodes)} episodes, and {self.n_starts} plans in it")
         model = SimulatorModel.fit(
-            self.problem, simulator.episodes, simulator.row.observer, self.seed + number
+            self.problem, simulator.episodes, simulator.row.estimator, self.seed + number
         )
         order = self.rng.permutation(len(simulator.episodes))
         chosen = [simulator.episodes[i] for i in order]

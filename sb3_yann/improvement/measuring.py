@@ -265,7 +265,9 @@ class _Search:
             began, now = time.monotonic(), todo[: simulator.affordable()]
             if not len(now):
                 raise OutOfStepsError
-            model = SimulatorModel.fit(self.mpc, simulator.episodes, simulator.row.observer, number)
+            model = SimulatorModel.fit(
+                self.mpc, simulator.episodes, simulator.row.estimator, number
+            )
             self.random, self.poor = model.lacks()
             planning = self._planning(model, TwinPlant(model.dynamics), unit)
             loops = simulator.play(planning, [self.seeds[i] for i in now], strict=False)

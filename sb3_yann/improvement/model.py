@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.compare import unsafe_columns
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import Controller
@@ -85,7 +85,7 @@ class SimulatorModel:
         cls,
         problem: LinearMPC,
         episodes: Sequence[Episode],
-        observer: DisturbanceObserver | None,
+        observer: StateEstimator | None,
         seed: int,
     ) -> SimulatorModel:
         """Return the model of some episodes, in rows of the observer's layout."""
@@ -96,7 +96,7 @@ class SimulatorModel:
     @cached_property
     def starts(self) -> Starts:
         """Where episodes begin."""
-        return Starts.of(self.problem, self.episodes, self.dynamics.row.observer)
+        return Starts.of(self.problem, self.episodes, self.dynamics.row.estimator)
 
     @cached_property
     def limits(self) -> Limits:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.row_layout import RowLayout
@@ -51,7 +51,7 @@ class Coordinates:
         cls,
         problem: LinearMPC,
         episodes: Sequence[Episode],
-        observer: DisturbanceObserver | None = None,
+        observer: StateEstimator | None = None,
     ) -> Coordinates:
         """Return those of a log, whose episodes hold rows of this layout."""
         row = RowLayout(problem, observer)
@@ -61,7 +61,9 @@ class Coordinates:
         width = np.maximum(high - low, 1e-6 * half)
         scale = np.maximum(np.abs(seen).max(0), 1e-3 * half)
         units = np.maximum(np.std(seen, axis=0), 1e-6 * half)[: problem.model.n_states]
-        turn = None if observer is not None else _turns([e.thetas[:, row.state] for e in episodes])
+        turn = (
+            None if row.observer is not None else _turns([e.thetas[:, row.state] for e in episodes])
+        )
         return cls(low - MARGIN * width, high + MARGIN * width, scale, units, row, turn)
 
     def scaled(self, features: Array) -> Array:

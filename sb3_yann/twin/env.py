@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_int
 from sb3_yann.compare import EXCESS_ROOM
-from sb3_yann.control import DisturbanceObserver
+from sb3_yann.control import StateEstimator
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.limits import Limits
@@ -72,9 +72,9 @@ class TwinEnv(gym.Env[Single, Single]):
         self._theta: Array | None = None  # a row
 
     @property
-    def observer(self) -> DisturbanceObserver | None:
+    def observer(self) -> StateEstimator | None:
         """The observer that is a part of the twin, None where there is none."""
-        return self.dynamics.row.observer
+        return self.dynamics.row.estimator
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

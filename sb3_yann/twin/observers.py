@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import ROUNDED
 
@@ -22,7 +22,7 @@ class EstimatedDisturbanceWarning(UserWarning):
     """The disturbances of a log move as an observer's estimate does, and no observer is given."""
 
 
-def observer_of(env: Any) -> DisturbanceObserver | None:
+def observer_of(env: Any) -> StateEstimator | None:
     """Return the observer among the wrappers of an env or of a VecEnv, None where there is none.
 
     An id, a class or a function that makes an env has none.
@@ -38,7 +38,7 @@ def observer_of(env: Any) -> DisturbanceObserver | None:
         found = env.get_attr("observer", 0)[0] if env.has_attr("observer") else None
     elif isinstance(env, gym.Env) and env.has_wrapper_attr("observer"):
         found = env.get_wrapper_attr("observer")
-    return found if isinstance(found, DisturbanceObserver) else None
+    return found if isinstance(found, StateEstimator) else None
 
 
 def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:

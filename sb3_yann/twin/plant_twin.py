@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, check_bool, check_int
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import fit_ensemble
@@ -128,7 +128,7 @@ class PlantTwin:
         disturbances: Sequence[ArrayLike] | None = None,
         previous: Sequence[ArrayLike] | None = None,
         time: Sequence[ArrayLike] | None = None,
-        observer: DisturbanceObserver | None = None,
+        observer: StateEstimator | None = None,
         residuals: Sequence[str] = KINDS,
         n_members: int = 5,
         updates: int = 3000,
@@ -151,10 +151,10 @@ class PlantTwin:
         time : sequence of array_like, shape (T + 1,), optional
             When each row of an episode's states was measured, in the unit of ``model.dt``. An
             episode is cut at steps that take less than half or more than one and a half of dt.
-        observer : DisturbanceObserver, optional
-            The one whose estimates x and d of theta are, of all states: that of
-            :class:`ObserveDisturbance`. Without ``disturbances`` states (T + 1, n) are what it
-            measured, and it is run over them.
+        observer : StateEstimator, optional
+            The one whose estimates x and d of theta are: that of :class:`EstimateState`. States
+            that are not all of theta are what it measured, (T + 1, q), and it is run over them:
+            a log of outputs is enough. ``disturbances`` are then the measured ones.
         residuals : sequence, default ("none", "linear", "quadratic", "network")
             What there is to choose from. Networks are tried where nothing else predicts well.
         n_members : int, default 5
@@ -182,8 +182,10 @@ class PlantTwin:
         check_int("updates", updates)
         if isinstance(residuals, str) or not residuals or not {*residuals} <= {*KINDS}:
             raise ValueError(f"residuals = {residuals!r} must be a list of some of {KINDS}.")
-        row, given = RowLayout(problem, observer), (references, disturbances, previous)
-        observed = observer is not None
+        row = RowLayout(problem, observer)
+        if observer is not None and row.observer is None:
+            episodes, disturbances = row.estimated(episodes, disturbances)
+        given, observed = (references, disturbances, previous), row.observer is not None
         log = as_episodes(problem, episodes, *given, observed=observed)
         notes: tuple[str, ...] = ()
         if time is not None:
@@ -315,7 +317,7 @@ class PlantTwin:
     @cached_property
     def starts(self) -> Starts:
         """Where episodes begin."""
-        return Starts.of(self.problem, self.episodes, self.dynamics.row.observer)
+        return Starts.of(self.problem, self.episodes, self.dynamics.row.estimator)
 
     @cached_property
     def limits(self) -> Limits:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control import DisturbanceObserver, LinearMPC, StateEstimator
 
 ROUNDED = 1e-6
 """So near to its bound, relative to their distance, an estimate may lie beyond it."""
@@ -26,52 +28,66 @@ class RowLayout:
     The plant does not know d. The observer steps its estimate from what it measures:
     ``z+ = (I - L C) (A z + B u) + L C x+`` with ``z = [x_hat; d_hat]``.
 
+    Where the measurements do not tell the plant's state, a row is theta, and the estimate itself
+    is what is learnt: ``x_hat+ = A x_hat + B u + E d_hat + residual(x_hat, d_hat, u)``. This
+    residual is ``L_x e``, of the innovations e. So it moves d_hat by ``L_d L_x^+ residual``.
+
     Attributes
     ----------
     problem : LinearMPC
-    observer : DisturbanceObserver, optional
+    estimator : StateEstimator, optional
         Of all states and all disturbances of the problem. It is not stepped.
 
     Raises
     ------
     TypeError, ValueError
-        For an observer of another model, or one whose measurements do not give the state.
+        For an estimator of another model.
     """
 
     problem: LinearMPC
-    observer: DisturbanceObserver | None = None
+    estimator: StateEstimator | None = None
 
     def __post_init__(self) -> None:
-        observer, model = self.observer, self.problem.model
-        if observer is None:
+        estimator, model = self.estimator, self.problem.model
+        if estimator is None:
             return
-        if not isinstance(observer, DisturbanceObserver):
+        if not isinstance(estimator, StateEstimator):
             raise TypeError(
-                f"observer = {observer!r} must be a DisturbanceObserver, e.g. that of "
+                f"observer = {estimator!r} must be a StateEstimator, e.g. that of "
                 "mpc, observer = offset_free(mpc)."
             )
-        its, own = (
-            (each.n_states, each.n_inputs, each.n_disturbances) for each in (observer.model, model)
-        )
-        if its != own:
+        its, own = ((each.n_states, each.n_inputs) for each in (estimator.model, model))
+        blind = model.n_disturbances - len(self.problem.extra)
+        told = estimator.model.n_disturbances
+        if its != own or not blind <= told <= model.n_disturbances:
             raise ValueError(
-                f"observer has {its} states, inputs and disturbances, the problem {own}. Give the "
-                "observer of this problem's disturbances, all of them."
+                f"observer has {(*its, told)} states, inputs and disturbances, the problem "
+                f"{(*own, model.n_disturbances)}. Give the observer of this problem's "
+                "disturbances, all of them."
             )
-        if observer.n_known:
-            raise ValueError(
-                f"The observer is told {observer.n_known} measured disturbances. A twin or a "
-                "simulator of an observer with both kinds of disturbances is not there yet: "
-                "train and compare in the env itself, as ImprovementGuard does."
-            )
-        n = model.n_states
-        for name, matrix in (("C", observer.C), ("gain of the states", observer.gain[:n])):
-            if matrix.shape != (n, n) or not np.linalg.cond(matrix) < SINGULAR:
-                raise ValueError(
-                    f"The observer's {name}, shape {matrix.shape}, cannot be inverted: the log "
-                    "does not tell the plant's state. A twin needs an observer that measures all "
-                    f"{n} states."
-                )
+
+    @cached_property
+    def observer(self) -> DisturbanceObserver | None:
+        """The estimator where it tells the plant's state and all disturbances, else None."""
+        found, n = self.estimator, self.problem.model.n_states
+        if not isinstance(found, DisturbanceObserver):
+            return None
+        square = found.C.shape == (n, n) and found.n_estimated == self._n_disturbances
+        told = square and max(map(np.linalg.cond, (found.C, found.gain[:n]))) < SINGULAR
+        return found if told else None
+
+    @property
+    def _n_disturbances(self) -> int:
+        return self.problem.layout.n_disturbances
+
+    @property
+    def _estimated(self) -> slice:
+        """The entries of disturbances that the estimator moves, where it is the plant's memory."""
+        part = self.problem.layout.disturbance
+        if self.estimator is None or self.observer is not None:
+            return slice(part.stop, part.stop)
+        known = self._n_disturbances - self.estimator.n_estimated
+        return slice(part.start + known, part.stop)
 
     @property
     def size(self) -> int:
@@ -90,7 +106,11 @@ class RowLayout:
     def given(self) -> slice:
         """The entries that an episode prescribes: references, and disturbances if measured."""
         parts = self.problem.layout
-        return parts.constant if self.observer is None else parts.reference
+        if self.observer is not None:
+            return parts.reference
+        if self.estimator is None or not self.estimator.n_estimated:
+            return parts.constant
+        return slice(parts.constant.start, self._estimated.start)
 
     @property
     def _raw(self) -> slice:
@@ -137,6 +157,9 @@ class RowLayout:
         parts = self.problem.layout
         found = np.zeros((self.size, parts.n_states))
         found[self.state] = np.eye(parts.n_states)
+        if self.observer is None and self.estimator is not None:
+            gain, n = self.estimator.gain, parts.n_states
+            found[self._estimated] = gain[n:] @ np.linalg.pinv(gain[:n])
         if self.observer is not None:
             moved = self.observer.gain @ self.observer.C
             found[parts.state] = moved[: parts.n_states]
@@ -159,6 +182,9 @@ class RowLayout:
     def clip(self, rows: Array) -> Array:
         """Clip the shown estimate of d to its bounds, in place; return which is inside of them."""
         if self.observer is None:
+            part, own = self._estimated, self.problem.deviations
+            if part.start < part.stop:
+                rows[..., part] = np.clip(rows[..., part], own.theta_min[part], own.theta_max[part])
             return np.zeros((*rows.shape[:-1], 0), dtype=bool)
         (low, high), raw = self._d, rows[..., self._raw]
         rows[..., self.problem.layout.disturbance] = np.clip(raw, low, high)
@@ -206,6 +232,50 @@ class RowLayout:
         if np.allclose(thetas[0, parts.disturbance], np.clip(0.0, *self._d), atol=1e-12):
             return np.array(rows), actions
         return np.array(rows[1:]), actions[1:]
+
+    def estimated(
+        self, episodes: Iterable[Any], loads: Sequence[Any] | None
+    ) -> tuple[list[Any], list[Array] | None]:
+        """Return episodes of outputs as episodes of estimates, and all disturbances of each.
+
+        Those of theta stay as they are.
+        """
+        pairs = [*episodes]
+        if any(np.ndim(x) == 2 and np.shape(x)[1] == self.problem.n_theta for x, _ in pairs):
+            return pairs, None if loads is None else [*loads]
+        found, disturbances = [], []
+        for i, (outputs, inputs) in enumerate(pairs):
+            y = np.asarray(outputs, np.float64).reshape(len(outputs), -1)
+            known = np.zeros((len(y), 0))
+            if loads is not None:
+                given = np.asarray(loads[i], np.float64)
+                known = np.broadcast_to(
+                    given.reshape(-1, given.shape[-1]), (len(y), given.shape[-1])
+                )
+            x_hat, d_hat = self.run(y, inputs, known)
+            found.append((x_hat, inputs))
+            disturbances.append(np.hstack([known, d_hat]))
+        return found, disturbances if self._n_disturbances else None
+
+    def run(self, outputs: Array, inputs: Array, loads: Array | None = None) -> tuple[Array, Array]:
+        """Return what the estimator makes of outputs (T + 1, q), inputs (T, m) and measured d.
+
+        States (T + 1, n) and estimated disturbances (T + 1, d) within their bounds, all of it in
+        plant units. A reading that is NaN is left out.
+        """
+        assert self.estimator is not None
+        filtered, model = copy.deepcopy(self.estimator), self.estimator.model
+        y = np.asarray(outputs, np.float64) - filtered.C @ model.x_ss
+        u = np.asarray(inputs, np.float64).reshape(len(y) - 1, -1) - model.u_ss
+        told = filtered.n_known
+        d = None if loads is None or not told else loads[:, :told] - model.d_ss[:told]
+        found = [filtered.reset(y[0])]
+        for k in range(len(u)):
+            found.append(filtered.update(y[k + 1], u[k], None if d is None else d[k]))
+        x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
+        bounds, known = self.problem.disturbances, self._n_disturbances - filtered.n_estimated
+        d_hat = np.clip(d_hat + model.d_ss[told:], bounds.d_min[known:], bounds.d_max[known:])
+        return x_hat + model.x_ss, d_hat
 
     def _run(self, thetas: Array, actions: Array) -> Array:
         """Return rows of thetas whose states were measured, and whose d is not known."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 
@@ -31,7 +31,7 @@ class Starts:
     low, high : ndarray, shape (n,)
     first, rows : ndarray, shapes (episodes, size) and (rows, size)
         The first row of each episode, and all of them.
-    observer : DisturbanceObserver, optional
+    observer : StateEstimator, optional
         The twin's, which begins with them.
     """
 
@@ -40,14 +40,14 @@ class Starts:
     high: Array
     first: Array
     rows: Array
-    observer: DisturbanceObserver | None = None
+    observer: StateEstimator | None = None
 
     @classmethod
     def of(
         cls,
         problem: LinearMPC,
         episodes: tuple[Episode, ...],
-        observer: DisturbanceObserver | None = None,
+        observer: StateEstimator | None = None,
     ) -> Starts:
         """Return those of a log."""
         first = np.array([each.thetas[0] for each in episodes])

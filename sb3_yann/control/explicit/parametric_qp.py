@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +110,7 @@ class ParametricQP:
         """Return the same program without entries of theta that nothing depends on."""
         if not len(entries):
             return self
-        own = {
+        own: dict[str, Any] = {
             name: np.delete(getattr(self, name), entries, axis=-1)
             for name in ("F", "S", "theta_min", "theta_max")
         }
