@@ -246,7 +246,7 @@ class RowLayout:
         found, disturbances = [], []
         for i, (outputs, inputs) in enumerate(pairs):
             y = np.asarray(outputs, np.float64).reshape(len(outputs), -1)
-            known = np.zeros((len(y), 0))
+            known: Array = np.zeros((len(y), 0))
             if loads is not None:
                 given = np.asarray(loads[i], np.float64)
                 known = np.broadcast_to(
