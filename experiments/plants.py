@@ -135,23 +135,29 @@ CARBONATE = 5e-5  # mol/L
 FEED, BASE = 3.0e-3, -3.05e-3  # mol/L, charge of what flows in
 
 
-def _charge(ph: float) -> float:
-    """Return the charge that makes a pH, in mol/L."""
+def _charge(ph: float, carbonate: float = CARBONATE) -> float:
+    """Return the charge that makes a pH, in mol/L, beside so much of a buffer."""
     hydrogen = 10.0**-ph
     share = 1 + 2 * 5.62e-11 / hydrogen
     share /= 1 + hydrogen / 4.47e-7 + 5.62e-11 / hydrogen
-    return hydrogen - 1e-14 / hydrogen - CARBONATE * share
+    return hydrogen - 1e-14 / hydrogen - carbonate * share
 
 
 def ph() -> TextbookPlant:
-    """Return a litre of acid, neutralized by a flow of base: its gain changes a hundredfold."""
+    """Return a litre of acid, neutralized by a flow of base: its gain changes a hundredfold.
+
+    A second state, if there is one, is how much of the buffer there is.
+    """
     dt, feed = 10.0, 0.01  # s, L/s
 
     def advance(x: Array, u: Array) -> Array:
         rate = feed + float(u[0])
         end = (feed * FEED + float(u[0]) * BASE) / rate
-        charge = end + (_charge(float(np.clip(x[0], 1.0, 13.0))) - end) * np.exp(-rate * dt)
-        return np.array([brentq(lambda each: _charge(each) - charge, 0.0, 14.0, xtol=1e-12)])
+        buffer = x[1] if len(x) > 1 else CARBONATE
+        charge = _charge(float(np.clip(x[0], 1.0, 13.0)), buffer)
+        charge = end + (charge - end) * np.exp(-rate * dt)
+        after = brentq(lambda each: _charge(each, buffer) - charge, 0.0, 14.0, xtol=1e-12)
+        return np.append(after, x[1:])
 
     rest = np.array([7.0])
     u = np.array([feed * (FEED - _charge(7.0)) / (_charge(7.0) - BASE)])
@@ -192,12 +198,16 @@ def van_de_vusse() -> TextbookPlant:
 
 
 def bioreactor() -> TextbookPlant:
-    """Return a culture that too much food slows down, and too much flow washes out."""
+    """Return a culture that too much food slows down, and too much flow washes out.
+
+    A third state, if there is one, is the food in the feed.
+    """
 
     def slope(x: Array, u: Array) -> Array:
-        cells, food = x.tolist()
+        cells, food, feed = (*x.tolist(), 4.0)[:3]
         growth = 0.53 * food / (0.12 + food + 0.4545 * food * food)
-        return np.array([(growth - u[0]) * cells, (4.0 - food) * u[0] - growth * cells / 0.4])
+        moved = (growth - u[0]) * cells, (feed - food) * u[0] - growth * cells / 0.4, 0.0
+        return np.array(moved[: len(x)])
 
     model = LinearModel.from_dynamics(slope, [1.52, 0.2], [np.nan], 0.5)
     weights = {"Q": np.diag([1, 0]), "R": [[0.1]], "horizon": 5}

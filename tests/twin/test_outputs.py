@@ -1,0 +1,161 @@
+"""Learning where not all states are measured: on the estimator's states and disturbances."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+
+from sb3_yann import (
+    LinearModel,
+    LinearMPC,
+    PlantTwin,
+    Tracking,
+    improve,
+    offset_free,
+    with_extra,
+)
+from sb3_yann._validation import Array
+from sb3_yann.twin.row_layout import RowLayout
+from sb3_yann.wrappers import EstimateState, MeasuredDisturbance, SetPoint
+
+MODEL = LinearModel([[0.7, 0.0], [0.2, 0.8]], [[0.3], [0.0]], dt=1.0, C=[[0, 1]])
+LIMITS = {"theta_min": -4, "theta_max": 4, "u_min": -2, "u_max": 2}
+BASE = LinearMPC(
+    MODEL, Q=np.diag([0, 1]), R=[[0.01]], horizon=4, tracking=Tracking([1], -1.5, 1.5), **LIMITS
+)
+
+
+class Valve(gym.Env[Array, Array]):
+    """A level behind a valve that nobody measures: far open it opens less and less."""
+
+    observation_space = spaces.Box(-9.0, 9.0, (1,), np.float64)
+    action_space = spaces.Box(-2.0, 2.0, (1,), np.float64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin near rest."""
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-0.5, 0.5, 2)
+        self.load = float(self.np_random.uniform(-1, 1))
+        return self.x[1:].copy(), {"disturbance": self.load}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Step the plant."""
+        valve, level = self.x
+        after = 0.7 * valve + 0.3 * float(action[0])
+        moved = 0.8 * level + 0.5 * np.tanh(0.9 * valve) + 0.0 * self.load
+        self.x = np.array([after, moved])
+        return self.x[1:].copy(), 0.0, False, False, {"disturbance": self.load}
+
+
+def plant() -> gym.Env[Any, Any]:
+    """Return the plant with set-points."""
+    return TimeLimit(SetPoint(Valve(), -1.5, 1.5, hold=20), 40)
+
+
+MPC, ESTIMATOR = offset_free(BASE, d_max=1.0)
+
+
+def seen() -> gym.Env[Any, Any]:
+    """Return the plant as the policy sees it."""
+    return EstimateState(plant(), ESTIMATOR, -1, 1)
+
+
+def played(policy: Any, seed: int, push: float = 0.0) -> tuple[Array, Array, Array, Array]:
+    """Return thetas, outputs, inputs and references of an episode."""
+    env, rng = seen(), np.random.default_rng(seed)
+    theta, over = env.reset(seed=seed)[0], False
+    thetas, outputs, inputs = [theta], [env.unwrapped.x[1]], []
+    while not over:
+        u = np.clip(policy(theta) + push * rng.uniform(-1, 1, 1), -2, 2)
+        theta, _, _, over, _ = env.step(u)
+        thetas.append(theta)
+        outputs.append(env.unwrapped.x[1])
+        inputs.append(u)
+    rows = np.array(thetas, np.float64)
+    return rows, np.array(outputs), np.array(inputs), rows[:, 2:3]
+
+
+def law(theta: Array) -> Array:
+    """Return the MPC's input."""
+    return MPC.law().plant_input(np.asarray(theta, np.float64))
+
+
+def error(policy: Any) -> float:
+    """Return the sum of squared errors of the true level, over fifty episodes."""
+    total = 0.0
+    for seed in range(50):
+        _, outputs, _, references = played(policy, seed)
+        total += float(np.sum((outputs[:-1] - references[:-1, 0]) ** 2))
+    return total
+
+
+@pytest.fixture(scope="module")
+def log() -> list[tuple[Array, Array, Array, Array]]:
+    """Return twenty episodes of the MPC, with inputs moved at random."""
+    return [played(law, seed, 0.5) for seed in range(500, 520)]
+
+
+def test_a_row_steps_its_estimate_of_d_as_the_estimator_does(log: Any) -> None:
+    """What the states' residual is, moves it: the innovation is told by either."""
+    row = RowLayout(MPC, ESTIMATOR)
+    assert row.observer is None and row.size == MPC.n_theta
+    for thetas, _, inputs, _ in log[:3]:
+        linear = np.hstack([thetas[:-1], inputs]) @ row.linear.T
+        residual = (thetas[1:] - linear)[:, row.state]
+        after = linear + residual @ row.spread.T
+        np.testing.assert_allclose(after[:, [0, 1, 3]], thetas[1:, [0, 1, 3]], atol=2e-6)
+
+
+def test_a_log_of_outputs_is_a_log_of_the_estimates(log: Any) -> None:
+    """The estimator is run over it; a reading that is missing is predicted."""
+    options: dict[str, Any] = {"observer": ESTIMATOR, "n_members": 2, "residuals": ["quadratic"]}
+    r = [each[3] for each in log]
+    outputs = [(each[1][:, None], each[2]) for each in log]
+    told = PlantTwin.fit(MPC, outputs, references=r, **options)
+    known = PlantTwin.fit(MPC, [(each[0], each[2]) for each in log], **options)
+    for one, other in zip(told.episodes, known.episodes, strict=True):
+        np.testing.assert_allclose(one.thetas, other.thetas, atol=2e-6)
+    assert told.trusted == known.trusted
+    outputs[0][0][7] = np.nan
+    lacking = PlantTwin.fit(MPC, outputs, references=r, **options)
+    assert np.isfinite(lacking.episodes[0].thetas).all()
+    assert not np.array_equal(lacking.episodes[0].thetas[7:], told.episodes[0].thetas[7:])
+
+
+def test_improve_learns_on_estimates_in_a_simulator() -> None:
+    """The true level follows its set-points better, and no worse where they are near."""
+    found = improve(MPC, seen, rounds=2, n_starts=20, updates=2000)
+    assert found.accepted, found
+    assert error(lambda theta: found.model.predict(theta)[0]) < 0.97 * error(law)
+
+
+def test_improve_learns_from_a_log_of_outputs(log: Any) -> None:
+    """Its twin is one of the estimator's states."""
+    outputs, r = [(each[1][:, None], each[2]) for each in log], [each[3] for each in log]
+    twin = PlantTwin.fit(MPC, outputs, references=r, observer=ESTIMATOR)
+    assert twin.trusted, twin.report()
+    found = improve(MPC, twin, n_starts=20, rounds=2, updates=2000)
+    assert found.accepted, found
+    assert error(lambda theta: found.model.predict(theta)[0]) < 0.99 * error(law)
+
+
+def test_measured_disturbances_stay_beside_estimated_ones() -> None:
+    """Those are given, these are moved: extra signals and an estimator in one simulator."""
+    mpc, estimator = offset_free(with_extra(BASE, -1, 1), d_max=1.0)
+    assert mpc.layout.names == ("x[0]", "x[1]", "r[0]", "d[0]", "d[1]")
+    row = RowLayout(mpc, estimator)
+    assert row.given == slice(2, 4)
+
+    def make() -> gym.Env[Any, Any]:
+        told = MeasuredDisturbance(SetPoint(Valve(), -1.5, 1.5, hold=20), -1, 1)
+        return EstimateState(TimeLimit(told, 40), estimator, -1, 1)
+
+    found = improve(mpc, make, rounds=1, n_starts=10, updates=500)
+    assert found.steps > 0 and found.change <= 0
