@@ -15,13 +15,12 @@ from sb3_yann import (
     LinearMPC,
     PlantTwin,
     Tracking,
-    improve,
     offset_free,
     with_extra,
 )
 from sb3_yann._validation import Array
 from sb3_yann.twin.row_layout import RowLayout
-from sb3_yann.wrappers import EstimateState, MeasuredDisturbance, SetPoint
+from sb3_yann.wrappers import EstimateState, SetPoint
 
 MODEL = LinearModel([[0.7, 0.0], [0.2, 0.8]], [[0.3], [0.0]], dt=1.0, C=[[0, 1]])
 LIMITS = {"theta_min": -4, "theta_max": 4, "u_min": -2, "u_max": 2}
@@ -87,15 +86,6 @@ def law(theta: Array) -> Array:
     return MPC.law().plant_input(np.asarray(theta, np.float64))
 
 
-def error(policy: Any) -> float:
-    """Return the sum of squared errors of the true level, over fifty episodes."""
-    total = 0.0
-    for seed in range(50):
-        _, outputs, _, references = played(policy, seed)
-        total += float(np.sum((outputs[:-1] - references[:-1, 0]) ** 2))
-    return total
-
-
 @pytest.fixture(scope="module")
 def log() -> list[tuple[Array, Array, Array, Array]]:
     """Return twenty episodes of the MPC, with inputs moved at random."""
@@ -129,33 +119,9 @@ def test_a_log_of_outputs_is_a_log_of_the_estimates(log: Any) -> None:
     assert not np.array_equal(lacking.episodes[0].thetas[7:], told.episodes[0].thetas[7:])
 
 
-def test_improve_learns_on_estimates_in_a_simulator() -> None:
-    """The true level follows its set-points better, and no worse where they are near."""
-    found = improve(MPC, seen, rounds=2, n_starts=20, updates=2000)
-    assert found.accepted, found
-    assert error(lambda theta: found.model.predict(theta)[0]) < 0.97 * error(law)
-
-
-def test_improve_learns_from_a_log_of_outputs(log: Any) -> None:
-    """Its twin is one of the estimator's states."""
-    outputs, r = [(each[1][:, None], each[2]) for each in log], [each[3] for each in log]
-    twin = PlantTwin.fit(MPC, outputs, references=r, observer=ESTIMATOR)
-    assert twin.trusted, twin.report()
-    found = improve(MPC, twin, n_starts=20, rounds=2, updates=2000)
-    assert found.accepted, found
-    assert error(lambda theta: found.model.predict(theta)[0]) < 0.99 * error(law)
-
-
 def test_measured_disturbances_stay_beside_estimated_ones() -> None:
     """Those are given, these are moved: extra signals and an estimator in one simulator."""
     mpc, estimator = offset_free(with_extra(BASE, -1, 1), d_max=1.0)
     assert mpc.layout.names == ("x[0]", "x[1]", "r[0]", "d[0]", "d[1]")
     row = RowLayout(mpc, estimator)
     assert row.given == slice(2, 4)
-
-    def make() -> gym.Env[Any, Any]:
-        told = MeasuredDisturbance(SetPoint(Valve(), -1.5, 1.5, hold=20), -1, 1)
-        return EstimateState(TimeLimit(told, 40), estimator, -1, 1)
-
-    found = improve(mpc, make, rounds=1, n_starts=10, updates=500)
-    assert found.steps > 0 and found.change <= 0
