@@ -71,7 +71,9 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
 
 @cache
 def _say(keep: bool) -> None:
-    """Say once what takes the time."""
+    """Say once, to a person at a terminal, what takes the time."""
+    if not sys.stderr.isatty():
+        return
     how_often = (
         "once after an installation" if keep else "at each start, for its folder takes no file"
     )
