@@ -37,14 +37,6 @@ def test_the_twin_predicts_what_episodes_cost_that_it_has_not_seen() -> None:
     np.testing.assert_allclose(predicted_costs(found, episodes, law), played.costs, rtol=2e-3)
 
 
-def test_five_episodes_are_too_few_for_a_small_gain_and_the_answer_says_how_many_more() -> None:
-    ours = model()
-    found = improve(ours, observed(), updates=500, rounds=2, n_starts=20)
-    assert not found.accepted and found.interval[0] < 0 < found.interval[1]
-    assert "to settle it, log about" in str(found)
-    assert ours.actor.mu.network.is_zero()
-
-
 @pytest.mark.nightly
 def test_fifteen_episodes_show_a_gain_that_the_plant_keeps() -> None:
     mpc, observer = offset_free_problem()
