@@ -406,7 +406,7 @@ class DualProgram:
 
     def solve(self, theta: Array, soft: bool = False) -> Answers:
         """Return what comes of rows (batch, n); where ``soft``, constraints give way."""
-        from sb3_yann.control._kernels.online import solve_batch
+        from sb3_yann.control._kernels.online import SOLVED, solve_batch
 
         rows = len(self.d0)
         most = max(1, rows if soft else min(rows, self.n_variables))
@@ -418,6 +418,8 @@ class DualProgram:
             np.zeros(len(theta), np.int64),
         )
         solve_batch(theta, self.D, self.d0, self.gram, extra, most, *vars(found).values())
+        if soft:  # bounds of inputs never give way, and may contradict each other
+            found.sizes[found.status != SOLVED] = 0
         return found
 
     def inputs(self, theta: Array, found: Answers) -> Array:

@@ -234,7 +234,7 @@ def solve_batch(
 
     ``d = d0 + theta D`` with D (n, rows), gram (rows, rows); ``extra`` (rows,) softens constraints.
     Written are multipliers and active sets (batch, most), which hold ``most`` constraints at most,
-    their sizes and the status (batch,). Where that is not SOLVED, softened programs have none.
+    their sizes and the status (batch,).
     """
     rows = len(d0)
     soft = bool(np.any(extra > 0))
@@ -272,7 +272,7 @@ def solve_batch(
                 break
             size = found
             _slacks(d, gram, own_set, lam, size, slack)
-        sizes[at] = size if status[at] == SOLVED or not soft else 0
+        sizes[at] = size
 
 
 @compiled(

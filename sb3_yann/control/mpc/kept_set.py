@@ -91,7 +91,9 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     size = np.abs(F[:, problem.layout.state]).sum(1)
     size = np.where(size > 0, size, 1.0)
     F, g = F / size[:, None] / half, g / size
-    now = hard_rows(problem, ("u", "du", "mixed") if problem.layout.bounds else ("mixed",))
+    # Inputs and rates within fixed bounds, and inputs within those of theta, are clipped anyway.
+    rate_moves = any(name.startswith("du") for name in problem.layout.bounds)
+    now = hard_rows(problem, ("du", "mixed") if rate_moves else ("mixed",))
     rows = np.vstack([np.hstack([F @ A, F @ B, g[:, None]]), np.column_stack(now)])
     return KeptSet(F, g, rows, steps, settled or (ends and steps == problem.horizon))
 
