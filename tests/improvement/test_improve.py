@@ -293,7 +293,7 @@ def test_set_points_are_followed_for_less() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::sb3_yann.audit.finding.CostMismatchWarning")
+@pytest.mark.filterwarnings("ignore::sb3_yann.CostMismatchWarning")
 def test_an_observer_is_a_part_of_the_model() -> None:
     mpc, make = offset_free_problem()[0], lambda: observed_env(Calm(20))
     model = DDPG(YannPolicy, make(), device="cpu", policy_kwargs={"problem": mpc})
