@@ -245,7 +245,9 @@ class OnlineLaw(PlantLaw):
             softened = self.dual.solve(again, soft=True)
             u[outside] = self.dual.inputs(again, softened)
         u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
-        u = self._within_range(np.clip(u, self.u_min, self.u_max), rows)
+        u = np.clip(u, self.u_min, self.u_max)
+        # A solution keeps them by itself: whatever else is in the batch, its bits stay.
+        u[outside] = self._within_range(u[outside], rows[outside])
         return u, feasible, found, softened
 
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:

@@ -51,11 +51,11 @@ def test_a_policy_starts_as_the_law_and_its_critic_keeps_bellmans_equation(
     assert np.abs((played - law.plant_input(theta)) / mpc.u_half).max() < 2e-6  # float32's room
 
     own, (A, B) = mpc.deviations, mpc.prediction
-    rest = np.zeros(mpc.n_theta)
+    rest = np.array(mpc.theta_rest)
     for _ in range(500):
         rest = A @ rest + B @ law(rest)
     near = rest + 1e-3 * rng.uniform(-1, 1, (30, mpc.n_theta)) * mpc.theta_half
-    near[:, own.layout.limits] = 0.0
+    near[:, own.layout.limits] = rest[own.layout.limits]
     u = law(near)
     middle = (own.u_max + own.u_min) / 2
 

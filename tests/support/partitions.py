@@ -78,7 +78,7 @@ def reordered(law: PiecewiseAffine, order: Array) -> PiecewiseAffine:
     neighbors = law.neighbors
     if neighbors.size:
         neighbors = place[neighbors[np.concatenate([rows[region] for region in order])]]
-    return dataclasses.replace(
+    found = dataclasses.replace(
         law,
         gains=law.gains[order],
         offsets=law.offsets[order],
@@ -87,3 +87,4 @@ def reordered(law: PiecewiseAffine, order: Array) -> PiecewiseAffine:
         starts=np.cumsum([0, *[len(b) for _, b in parts[:-1]]]),
         neighbors=neighbors,
     )
+    return found.on_plant(law.model, law.theta_ss, law.rate, law.moving)
