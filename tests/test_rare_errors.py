@@ -58,13 +58,13 @@ def with_two_outputs() -> ObserveDisturbance:
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: headroom(scalar_mpc(), 3), TypeError, "env_or_twin = 3 must be a single gym"),
+        (lambda: headroom(scalar_mpc(), 3), TypeError, "env = 3 must be the id of an environment"),
         (
             lambda: headroom(scalar_mpc(), NoCopy(scalar_mpc())),
             TypeError,
             r"cannot be copied \(a licence of one seat\). Pass a function that makes",
         ),
-        (lambda: improve("m.zip", None), TypeError, "model = 'm.zip' must be a DDPG or TD3 model"),
+        (lambda: improve("m.zip", None), TypeError, "model = 'm.zip' must be a model with a YannPolicy"),
         (lambda: offset_free(3), TypeError, "mpc = 3 must be a LinearMPC"),
         (lambda: DisturbanceObserver("A"), TypeError, "model = 'A' must be a LinearModel, e.g."),
         (lambda: PlantTwin.fit("cstr", []), TypeError, "problem = 'cstr' must be a LinearMPC"),

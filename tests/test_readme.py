@@ -13,7 +13,7 @@ import torch
 
 from sb3_yann import LinearModel
 from sb3_yann.improvement import model
-from sb3_yann.twin import selection
+from sb3_yann.twin import plant_twin
 from sb3_yann.twin.ensemble import fit_ensemble
 
 ROOT = Path(__file__).parents[1]
@@ -92,7 +92,7 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, quick_fits) -> None:
 @pytest.fixture
 def quick_fits(monkeypatch) -> None:
     """Let twins be of polynomials, and fit the networks of a simulator's model for a while only."""
-    monkeypatch.setattr(selection, "ROWS", 10**9)
+    monkeypatch.setattr(plant_twin, "ROWS", 10**9)
     monkeypatch.setattr(model, "fit_ensemble", partial(fit_ensemble, updates=300))
 
 

@@ -246,8 +246,9 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
-        taken = f"{self.steps:,} steps of the guard's simulator."
-        return f"{summary_of(self.state, self.player.policy)}\n{taken}"
+        state = self.state
+        lines = summary_of(state, self.player.policy)
+        return f"{lines}\n{self.steps:,} steps of the guard's simulator."
 
     @property
     def steps(self) -> int:

@@ -367,6 +367,15 @@ class LinearModel(LinearSystem):
 
         Inputs on their way, the last states of a model with dead time, are named after the inputs
         where names and units are given of the others only.
+
+        Parameters
+        ----------
+        state_names, input_names : sequence of str
+            One for each, or none.
+        units : mapping of name to unit, or sequence of str
+            Of states and inputs.
+        time_unit : str, optional
+            Of ``dt``.
         """
         if past := past_inputs(self):
             state_names, units = completed(self, past, state_names, input_names, units)
