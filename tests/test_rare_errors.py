@@ -64,7 +64,11 @@ def with_two_outputs() -> ObserveDisturbance:
             TypeError,
             r"cannot be copied \(a licence of one seat\). Pass a function that makes",
         ),
-        (lambda: improve("m.zip", None), TypeError, "model = 'm.zip' must be a model with a YannPolicy"),
+        (
+            lambda: improve("m.zip", None),
+            TypeError,
+            "model = 'm.zip' must be a model with a YannPolicy",
+        ),
         (lambda: offset_free(3), TypeError, "mpc = 3 must be a LinearMPC"),
         (lambda: DisturbanceObserver("A"), TypeError, "model = 'A' must be a LinearModel, e.g."),
         (lambda: PlantTwin.fit("cstr", []), TypeError, "problem = 'cstr' must be a LinearMPC"),
