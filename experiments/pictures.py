@@ -59,7 +59,7 @@ def save_in_short(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
             style = {"color": COLORS[k], "linestyle": STYLES[k], "label": label}
             axes.plot(np.arange(1, len(shares) + 1), np.sort(shares), **style)
             words = {"color": COLORS[k], "transform": axes.transAxes}
-            axes.text(0.05, 0.92 - 0.08 * k, f"mean {100 * mean:+.1f} %", **words)
+            axes.text(0.05, 0.92 - 0.08 * k, f"mean cost {100 * mean:+.1f} %", **words)
         axes.axhline(1, color="black", linewidth=1, label=MPC)
         axes.set(title=name, xlabel="starts, sorted for each")
         axes.grid(alpha=0.3)

@@ -206,8 +206,9 @@ class Log:
         episode : str, optional
             A column that changes from one episode to the next.
         time : str, optional
-            A column of times in the unit of ``dt``, or of time stamps as of ISO 8601 with ``dt`` in
-            seconds; an episode ends where a step takes another.
+            A column of times in the unit of ``dt``, or of ISO 8601 time stamps: then ``dt`` is in
+            seconds, or in the ``time_unit`` "min", "h" or "d". An episode ends where a step takes
+            another time.
         delimiter : str, default ","
             Between two columns.
         time_unit : str, optional
@@ -259,7 +260,11 @@ class Log:
         ends[1:] |= no_state | no_input
         times = None
         if time is not None:
-            times = np.array([_time(path, k, row, columns[time]) for k, row in enumerate(content)])
+            unit = time_unit or _name_and_unit(columns[time])[1]
+            pairs = [_time(path, k, row, columns[time], unit) for k, row in enumerate(content)]
+            times = np.array([each for each, _ in pairs])
+            if any(stamped for _, stamped in pairs):
+                time_unit = unit or "s"
         edges = pairwise(np.flatnonzero(ends))
         parts = [slice(first, stop) for first, stop in edges if stop - first > 1]
         if not parts:
@@ -281,6 +286,10 @@ class Log:
             units=units if any(units) else (),
             time_unit=time_unit or _name_and_unit(columns[time] if time else "")[1],
         )
+
+
+SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
+"""In a unit of time."""
 
 
 def cut_at_gaps(
@@ -354,17 +363,20 @@ def _number(path: object, row: int, content: dict[str, str], name: str) -> float
         raise ValueError(f"{path}, row {row + 2}: {name} is {text!r}, expected a number.") from None
 
 
-def _time(path: object, row: int, content: dict[str, str], name: str) -> float:
-    """Return a time as it is given, a time stamp in seconds."""
+def _time(
+    path: object, row: int, content: dict[str, str], name: str, unit: str
+) -> tuple[float, bool]:
+    """Return a time as it is given, an ISO 8601 time stamp in the unit, and which of them it is."""
     try:
-        return _number(path, row, content, name)
+        return _number(path, row, content, name), False
     except ValueError:
         try:
             stamp = datetime.fromisoformat(content[name].strip())
         except ValueError:
             pass
         else:
-            return (stamp - datetime(1970, 1, 1, tzinfo=stamp.tzinfo)).total_seconds()
+            passed = (stamp - datetime(1970, 1, 1, tzinfo=stamp.tzinfo)).total_seconds()
+            return passed / SECONDS.get(unit, 1), True
         raise
 
 

@@ -186,3 +186,13 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(
         Log.from_csv(path, ["T [C]"], ["valve"], dt=10)
     with pytest.raises(TypeError, match="time_unit = 3 must be a str"):
         model.named(time_unit=3)
+
+
+@pytest.mark.parametrize(("dt", "unit", "found"), [(120, "", "s"), (2, "min", "min")])
+def test_time_stamps_are_in_the_unit_of_dt(dt, unit, found, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    stamps = [f"2026-03-01T08:{2 * k:02d}:00" for k in range(20)]
+    rows = "".join(f"{stamp},{k % 3},{k % 2}\n" for k, stamp in enumerate(stamps))
+    path.write_text("at,T,valve\n" + rows, encoding="utf-8")
+    log = Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at", time_unit=unit)
+    assert (len(log.episodes[0]), log.time_unit, log.lost_steps) == (19, found, 0)

@@ -82,7 +82,7 @@ def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
     indices: Tables = {"starts": starts, "watched": data["watched"].astype(np.int64)}
     indices |= {"source": data["source"], "missing": data["missing"]}
     if "est_gain" in data:
-        names = ("est_step", "est_rest", "est_first", "est_C", "est_gain")
+        names = ("est_next", "est_rest", "est_first", "est_C", "est_gain")
         numbers |= {name: data[name] for name in names}
         numbers["input_scale"], numbers["input_shift"] = data["est_input"]
         numbers["est_min"], numbers["est_max"] = data["est_box"]
@@ -166,7 +166,7 @@ class Cost:
             program = rows * n + steps_of(data) * most * (rows + 2 * most)
         products += 2 * data["kept"].size
         filtering = sum(
-            data[name].size for name in ("est_step", "est_C", "est_gain") if name in data
+            data[name].size for name in ("est_next", "est_C", "est_gain") if name in data
         )
         return cls(
             numbers=sum(each.size for each in [*numbers.values(), *search_numbers.values()]),

@@ -81,7 +81,7 @@ def _shapes_of_estimator(
         "missing": (n_read,),
     }
     if size:
-        shapes |= {"est_step": (size, size + m + k + 1), "est_rest": (size, q + m + k + 1)}
+        shapes |= {"est_next": (size, size + m + k + 1), "est_rest": (size, q + m + k + 1)}
         shapes |= {"est_first": (size, q + 1), "est_C": (q, size), "est_gain": (size, q)}
         shapes |= {"est_input": (2, m), "est_loads": (k,), "est_box": (2, size)}
     return [*shapes.items()]
@@ -410,7 +410,7 @@ class Controller:
         loads, rest = self._good[data["est_loads"]], data["obs_rest"][:q]
         with np.errstate(over="ignore", invalid="ignore"):
             if self._estimate is not None:
-                found = data["est_step"] @ [*self._estimate, *u, *self._loads, 1.0]
+                found = data["est_next"] @ [*self._estimate, *u, *self._loads, 1.0]
                 left = y - data["est_C"] @ found
                 found = found + data["est_gain"] @ np.where(np.isfinite(left), left, 0.0)
             elif told:

@@ -71,7 +71,7 @@ def estimator_arrays(
     names = [*_output_names(estimator, seen), *(seen[i] for i in read)]
     scale = 1 / units.scale
     return {
-        "est_step": _affine(step, np.concatenate([x, driven]), x),
+        "est_next": _affine(step, np.concatenate([x, driven]), x),
         "est_rest": _affine(estimator.resting, np.concatenate([y, driven]), x),
         "est_first": _affine(smallest, y, x),
         "est_C": estimator.C_aug,

@@ -132,7 +132,7 @@ class Run:
         noise = np.random.default_rng(0).normal(size=(50, q))
         readings[:, :q] = 1e-3 * noise * (np.abs(data["est_C"]) @ spread)
         scale, shift = data["est_input"]
-        step = data["est_step"].copy()
+        step = data["est_next"].copy()
         step[:, -1] += step[:, size : size + len(scale)] @ shift
         step[:, size : size + len(scale)] *= scale
         return cls.of_readings(

@@ -124,8 +124,8 @@ class Improvement:
 
     def report(self) -> str:
         """Return in words what was accepted, or why nothing was, and what it took."""
-        passed = sum(each.accepted for each in self.checks)
-        taken = f"{passed} of {len(self.checks)} checks passed."
+        tried = len(self.checks)
+        taken = f"{tried} candidate{'s' * (tried != 1)} tried."
         if self.steps:
             taken += f" {self.steps:,} steps of the simulator."
         if not self.accepted:

@@ -260,7 +260,7 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
     low, high, u_ss = problem.u_min.tolist(), problem.u_max.tolist(), problem.model.u_ss
     advice = (
         "They must be the same: build the LinearMPC with the bounds of the env, or rescale actions "
-        "to [-1, 1] in all entries."
+        "to [-1, 1] in all entries; retarget(model, mpc, env=) takes an env of the new bounds."
     )
     if np.any(u_ss) and ActionUnits.of(problem.deviations, action_space.low, action_space.high):
         advice = (

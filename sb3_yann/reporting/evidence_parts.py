@@ -111,7 +111,7 @@ def improve_part(subject: Subject) -> Part:
         finding = make_finding(False, text)
     rows = []
     for k, each in enumerate(found, start=1):
-        checks = f"{sum(check.accepted for check in each.checks)} of {len(each.checks)}"
+        checks = str(len(each.checks))
         place = f"{each.where}: {each.source}"
         rows.append([str(k), place, str(each.episodes), checks, each.report()])
     settings = [[name.replace("_", " "), str(value)] for name, value in found[-1].settings.items()]
@@ -123,7 +123,7 @@ def improve_part(subject: Subject) -> Part:
     content = [
         paragraph(finding.text),
         paragraph(how),
-        table(["", "in", "episodes", "checks passed", "what came of it"], rows),
+        table(["", "in", "episodes", "candidates", "what came of it"], rows),
         tag("h3", "Settings of the last improvement"),
         table(["setting", "value"], settings),
     ]

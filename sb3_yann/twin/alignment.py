@@ -47,7 +47,10 @@ PACES = 1, 2, 3, 4, 5
 """So many samples of the model may lie between two rows."""
 LEAST_ROWS = 20
 """Rows of a regression on the law, at least."""
-CONFIRM = "If its units were checked, and the plant or its controller is so: units_confirmed=True."
+CONFIRM = (
+    "If its units were checked, and the plant or its controller is so: "
+    "PlantTwin.fit(..., units_confirmed=True)."
+)
 ROW_NAMES = {-1: "the row before", 0: "the same row", 1: "the row after"}
 
 

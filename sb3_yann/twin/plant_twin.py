@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.model.labels import labels_of
+from sb3_yann.log import SECONDS, Log
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.env import TwinEnv
@@ -182,6 +183,8 @@ class PlantTwin:
         check_int("updates", updates)
         if isinstance(residuals, str) or not residuals or not {*residuals} <= {*KINDS}:
             raise ValueError(f"residuals = {residuals!r} must be a list of some of {KINDS}.")
+        if isinstance(episodes, Log):
+            _require_same_sampling(episodes, problem)
         row = RowLayout(problem, observer)
         if observer is not None and row.observer is None:
             episodes, disturbances = row.estimated(episodes, disturbances)
@@ -339,3 +342,16 @@ class PlantTwin:
         """
         self.require_trust()
         return TwinEnv(self.dynamics, self.episodes, self.starts, self.limits, member)
+
+
+def _require_same_sampling(log: Log, problem: LinearMPC) -> None:
+    """Raise where a log has another sampling time than the model: a twin steps as its MPC does."""
+    model = problem.model
+    units = [SECONDS.get(each.time_unit, 0) for each in (log, model)]
+    its, own = (log.dt, model.dt) if 0 in units else (log.dt * units[0], model.dt * units[1])
+    if abs(its - own) > 0.01 * own:
+        raise ValueError(
+            f"The log is sampled every {log.dt:g} {log.time_unit}".rstrip()
+            + f", the model of the MPC every {model.step_length}. Identify the model at the log's "
+            "sampling time, or, where only the unit differs, name it: time_unit= of both."
+        )

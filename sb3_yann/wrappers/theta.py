@@ -378,7 +378,10 @@ class EstimateState(Appending):
         high: ArrayLike | None = None,
     ) -> None:
         if not isinstance(observer, StateEstimator):
-            raise TypeError(f"observer = {observer!r} must be a StateEstimator.")
+            raise TypeError(
+                f"observer is a {type(observer).__name__}, and must be a StateEstimator: "
+                "identify_outputs(...).estimator(), or the second of offset_free(mpc)."
+            )
         free = np.full(observer.n_estimated, np.inf)
         low, high = -free if low is None else low, free if high is None else high
         self.measured: Any = _below(env, MeasuredDisturbance)

@@ -184,8 +184,9 @@ def test_structured_text_in_closed_loop_is_python(rates, tmp_path) -> None:
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_the_self_test_runs_a_closed_loop_and_can_fail(precision, tmp_path) -> None:
     observer = problem()[1]
-    export(policy(), tmp_path / "plant.c", estimator=observer, precision=precision)
-    code = tmp_path / "plant.c"
+    # A name that begins like tables of the code.
+    export(policy(), tmp_path / "est.c", estimator=observer, precision=precision)
+    code = tmp_path / "est.c"
     assert self_test(tmp_path) == 0
     text = code.read_text()
     for old, factor in (("est_gain[j][i] * x[i]", "0.9"), ("state->output[i] * input", "1.01")):
@@ -195,7 +196,7 @@ def test_the_self_test_runs_a_closed_loop_and_can_fail(precision, tmp_path) -> N
 
 
 def self_test(folder: Path) -> int:
-    sources = [str(folder / "plant.c"), str(folder / "plant_selftest.c")]
+    sources = [str(folder / "est.c"), str(folder / "est_selftest.c")]
     guards = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     program = str(folder / "test")
     subprocess.run([COMPILERS[0], *STRICT, *guards, *sources, "-lm", "-o", program], check=True)

@@ -506,7 +506,7 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
 def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     passed = Check(1, True, "", -0.021, 0.0004, True, -0.015, 0.003)
     refused = Check(2, False, "2 starts with violations", -0.03, 0.0, False)
-    said = "-1.50 % (± 0.30) {}, +0.04 % from the worst start. 1 of 2 checks passed."
+    said = "-1.50 % (± 0.30) {}, +0.04 % from the worst start. 2 candidates tried."
     found = Improvement((refused, passed), -0.021, accepted=True)
     assert found.reason == "" and str(found) == found.report()
     assert found.report() == (
@@ -523,7 +523,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     )
     assert Improvement((refused,), 0.0, accepted=False).report() == (
         "Nothing better was found: 2 starts with violations. The model is as it was. "
-        "0 of 1 checks passed."
+        "1 candidate tried."
     )
     small = Check(1, True, "", -4e-4, 0.0, True)
     assert "a gain of 0.04 % in the twin is too small, or not sure" in str(

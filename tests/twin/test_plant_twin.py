@@ -12,6 +12,8 @@ from sb3_yann import (
     AffineObservation,
     ImprovementGuard,
     LinearModel,
+    LinearMPC,
+    Log,
     NoActionNoise,
     PlantTwin,
     RateLimits,
@@ -241,3 +243,15 @@ def test_of_a_buffer_what_is_asked_for_reaches_the_fit() -> None:
     assert found.kind.startswith("linear") and len(found.dynamics.members) == 2
     assert repr(found).startswith("PlantTwin(linear, shrinkage") and "3 episodes" in repr(found)
     assert "2 members" in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("dt", "unit", "own_unit"), [(2.0, "", ""), (1.0, "s", "min"), (59.0, "s", "min")]
+)
+def test_a_log_of_another_sampling_time_is_refused(dt: float, unit: str, own_unit: str) -> None:
+    model = LinearModel([[0.9]], [[0.5]], 1.0, time_unit=own_unit)
+    mpc = LinearMPC(model, Q=[[1]], R=[[1]], horizon=3, x_min=-5, x_max=5, u_min=-1, u_max=1)
+    rng = np.random.default_rng(0)
+    log = Log.from_arrays(rng.normal(size=(31, 1)), rng.normal(size=(30, 1)), dt, time_unit=unit)
+    with pytest.raises(ValueError, match=f"sampled every {dt:g}.*, the model of the MPC every 1"):
+        PlantTwin.fit(mpc, log)

@@ -20,6 +20,7 @@ from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, so
 from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.linearization.simulator import borrow
 from sb3_yann.control.model.identify import Identified
+from sb3_yann.control.model.identify_outputs import IdentifiedOutputs
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability, simulation
@@ -82,7 +83,7 @@ class LinearMPC(MPCProblem):
 
     Parameters
     ----------
-    model : LinearModel or Identified
+    model : LinearModel, Identified or IdentifiedOutputs
         The prediction model, n states and m inputs; or what `identify` returns.
     Q : array_like, shape (n, n)
         Weight of the state, symmetric positive semi-definite.
@@ -142,7 +143,7 @@ class LinearMPC(MPCProblem):
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
-        model: LinearModel | Identified,
+        model: LinearModel | Identified | IdentifiedOutputs,
         *,
         Q: ArrayLike,
         R: ArrayLike,
@@ -166,7 +167,7 @@ class LinearMPC(MPCProblem):
         parametric_bounds: Sequence[str] = (),
         control_horizon: int | Sequence[int] | None = None,
     ) -> None:
-        if isinstance(model, Identified):
+        if isinstance(model, Identified | IdentifiedOutputs):
             model = model.model
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")

@@ -65,7 +65,9 @@ def steady_states(
     free = linalg.null_space(equations, rcond=1e-10)
     weight = linalg.block_diag(Q, R) * np.outer(unit, unit)
     curvature = free.T @ weight @ free
-    inverse = np.linalg.pinv(curvature, rcond=1e-12, hermitian=True)
+    # What costs nothing leaves the squares of rounding, 1e-32 of the weights: no curvature.
+    rounding = 1e-24 * np.abs(weight).max() / max(np.abs(curvature).max(initial=0.0), 1e-300)
+    inverse = np.linalg.pinv(curvature, rcond=max(1e-12, rounding), hermitian=True)
     solution = solution - free @ inverse @ (free.T @ weight @ solution)
     solution = solution * unit[:, None]
     return SteadyStates(solution[:n], solution[n:])

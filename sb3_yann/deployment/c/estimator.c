@@ -32,7 +32,7 @@ static void estimate(yann_state *state, const real y[N_OBS], int begins, int tol
     }
 #endif
     if (!begins) {
-        affine(N_ESTIMATES, N_ESTIMATES + N_INPUTS + N_LOADS, &est_step[0][0], x, found);
+        affine(N_ESTIMATES, N_ESTIMATES + N_INPUTS + N_LOADS, &est_next[0][0], x, found);
         for (int i = 0; i < N_OUTPUTS; i++) {
             x[i] = y[i];
             for (int j = 0; j < N_ESTIMATES; j++) {

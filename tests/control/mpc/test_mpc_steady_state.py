@@ -13,6 +13,7 @@ from sb3_yann import (
     LinearModel,
     LinearMPC,
     OutputBounds,
+    RateLimits,
     Tracking,
 )
 
@@ -159,3 +160,25 @@ def test_a_reference_of_another_shape_is_named() -> None:
 def test_a_regulator_rests_at_the_origin() -> None:
     x, u = servo(tracking=None).steady_state()
     assert (x.tolist(), u.tolist()) == ([0, 0], [0])
+
+
+@pytest.mark.parametrize("horizon", [1, 5, 10])
+def test_of_inputs_that_cost_their_moves_alone_the_least_norm_is_taken(horizon: int) -> None:
+    mpc = LinearMPC(
+        LinearModel([[0.8]], [[0.3, 0.2]], 1),
+        Q=[[1]],
+        R=np.zeros((2, 2)),
+        horizon=horizon,
+        u_min=-1,
+        u_max=1,
+        theta_min=-1,
+        theta_max=1,
+        tracking=Tracking([0], -0.5, 0.5),
+        rate=RateLimits(R_du=np.eye(2)),
+    )
+    np.testing.assert_allclose(mpc.steady_states.u.ravel(), np.array([0.3, 0.2]) * 0.2 / 0.13)
+    law, x, u = mpc.online(), 0.0, np.zeros(2)
+    for _ in range(80):
+        u = law([x, 0.3, *u])
+        x = 0.8 * x + np.array([0.3, 0.2]) @ u
+    np.testing.assert_allclose(x, 0.3, atol=1e-9)
