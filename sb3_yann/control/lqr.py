@@ -119,7 +119,8 @@ def _why_no_solution(A: Array, B: Array) -> str:
         )
     sizes = np.abs(np.hstack([A, B]))
     return (
-        "The Riccati equation has a stabilizing solution, but rounding hides it: the model is "
-        f"badly scaled, with entries of A and B from {sizes[sizes > 0].min():.2g} to "
-        f"{sizes.max():.2g} in size. Give states and inputs units in which they move alike."
+        "Rounding leaves no stabilizing solution of the Riccati equation. Either an input costs "
+        "its moves alone: give it a weight in R, or take gamma < 1. Or the model is badly scaled, with "
+        f"entries of A and B from {sizes[sizes > 0].min():.2g} to {sizes.max():.2g} in size: give "
+        "states and inputs units in which they move alike."
     )
