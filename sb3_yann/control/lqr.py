@@ -120,7 +120,7 @@ def _why_no_solution(A: Array, B: Array) -> str:
     sizes = np.abs(np.hstack([A, B]))
     return (
         "Rounding leaves no stabilizing solution of the Riccati equation. Either an input costs "
-        "its moves alone: give it a weight in R, or take gamma < 1. Or the model is badly scaled, with "
-        f"entries of A and B from {sizes[sizes > 0].min():.2g} to {sizes.max():.2g} in size: give "
-        "states and inputs units in which they move alike."
+        "its moves alone: give it a weight in R, or take gamma < 1. Or the model is badly scaled, "
+        f"with entries of A and B from {sizes[sizes > 0].min():.2g} to {sizes.max():.2g} in size: "
+        "give states and inputs units in which they move alike."
     )
