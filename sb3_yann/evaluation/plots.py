@@ -510,7 +510,7 @@ def _draw_differences(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) ->
         style = _style(number, entry >= problem.n_theta)
         _draw_rows(axes, rows[:, :steps] - base[:, :steps], problem.model.dt, style, "_nolegend_")
     axes.axhline(0, color="black", linewidth=0.8)
-    axes.set_ylabel(f"minus {first}")
+    axes.set_ylabel("difference")
     axes.grid(alpha=0.3)
 
 
