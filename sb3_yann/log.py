@@ -376,7 +376,12 @@ def _time(
             pass
         else:
             passed = (stamp - datetime(1970, 1, 1, tzinfo=stamp.tzinfo)).total_seconds()
-            return passed / SECONDS.get(unit, 1), True
+            if unit not in ("", *SECONDS):
+                raise ValueError(
+                    f"{path} has time stamps, and time_unit = {unit!r}: expected one of "
+                    f"{[*SECONDS]}, that of dt."
+                ) from None
+            return passed / SECONDS[unit or "s"], True
         raise
 
 

@@ -196,3 +196,5 @@ def test_time_stamps_are_in_the_unit_of_dt(dt, unit, found, tmp_path: Path) -> N
     path.write_text("at,T,valve\n" + rows, encoding="utf-8")
     log = Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at", time_unit=unit)
     assert (len(log.episodes[0]), log.time_unit, log.lost_steps) == (19, found, 0)
+    with pytest.raises(ValueError, match="time_unit = 'hours': expected one of"):
+        Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at", time_unit="hours")

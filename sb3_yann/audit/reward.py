@@ -158,7 +158,8 @@ class Line:
     @classmethod
     def through(cls, steps: Steps) -> Line:
         """Return the line by least squares, through the origin where that does as well."""
-        x, y = -steps.cost, steps.rewards
+        x = -steps.cost
+        y = steps.rewards
         if not len(y):
             return cls(np.nan, np.nan, np.nan)
         if np.ptp(x) <= 1e-12 * np.abs(x).max() or np.ptp(y) <= 1e-12 * np.abs(y).max():

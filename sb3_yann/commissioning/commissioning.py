@@ -228,7 +228,9 @@ class Commissioning:
 
     def _decide(self, plant: Plant) -> None:
         """Learn from the plant, compare it with what was predicted, and say who acts from here."""
-        journal, number, before = self.journal, len(self.batches) + 1, self.journal.state
+        journal = self.journal
+        number = len(self.batches) + 1
+        before = journal.state
         by_policy = any(each for _, each in journal.batch)
         who, within = (before.policy, before.max_correction) if by_policy else ("MPC", 0.0)
         alarms = sum(each.alarm is not None for each, _ in journal.batch)
@@ -271,7 +273,8 @@ class Commissioning:
         twin = self._fit(numbers, seed) if len(numbers) > 1 else None
         known = twin if twin is not None and twin.trusted else None
         costs = compare(self.journal, plant, before, known or before)
-        state, said = self.journal.state, ""
+        state = self.journal.state
+        said = ""
         if known is not None:
             self.twin, self.watchdog = known, Watchdog.of(known)
             state = replace(state, twin=numbers, twin_seed=seed)

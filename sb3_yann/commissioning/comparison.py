@@ -18,14 +18,11 @@ from sb3_yann.control.mpc.bound_excess import (
     bound_excess,
     excess_of_episodes,
 )
+from sb3_yann.improvement.trial import RULE
 from sb3_yann.twin.plant_twin import PlantTwin
 
-ENOUGH = 10
-"""Pairs after which a policy that shows no gain is given up."""
-SIGNIFICANCE = 0.05
-"""Probability that a policy that is no better is ever kept, over all looks at it."""
-LEAST_GAIN = 0.001
-"""As a fraction of the MPC's cost: what gains surely less is not worth more episodes."""
+PAIRS_TO_GIVE_UP = 10
+"""So many that show no gain end a trial."""
 MOST = 0.05
 """What a policy may cost more than the MPC in any case, as a fraction of the MPC's cost."""
 OWN = 0.95
@@ -81,7 +78,8 @@ def compare(
     before, now : PlantTwin, optional
         The twin that was in force, and the one that has learnt from the batch.
     """
-    problem, by_policy = plant.problem, any(each for _, each in journal.batch)
+    problem = plant.problem
+    by_policy = any(each for _, each in journal.batch)
     quiet = [each for each, own in journal.batch if not own and not each.alarm and not each.excited]
     acted = [each for each, own in journal.batch if own] if by_policy else quiet
     if not acted:
@@ -140,7 +138,8 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
         return f"{alarms} of its {len(played)} episodes had an alarm"
     if not costs.difference.pairs:
         return "no pair of episodes tells what it costs"
-    more, room = costs.difference.mean, costs.difference.room(SIGNIFICANCE)
+    more = costs.difference.mean
+    room = costs.difference.room(RULE.significance)
     if not more <= min(room, MOST * abs(costs.mpc)):  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
@@ -154,13 +153,14 @@ def is_kept(costs: Costs) -> bool:
 
     All looks at a policy together err with a probability of 5 % at most.
     """
-    return costs.difference.is_below_zero(level_of_look(SIGNIFICANCE, costs.look))
+    return costs.difference.is_below_zero(level_of_look(RULE.significance, costs.look))
 
 
 def is_hopeless(costs: Costs) -> bool:
     """Return whether more pairs would hardly show a gain that counts."""
-    more, least = costs.difference, LEAST_GAIN * abs(costs.mpc)
-    return bool(more.pairs >= ENOUGH and more.mean - more.error > -least / 2)
+    more = costs.difference
+    least = RULE.least_gain * abs(costs.mpc)
+    return bool(more.pairs >= PAIRS_TO_GIVE_UP and more.mean - more.error > -least / 2)
 
 
 def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
