@@ -61,13 +61,13 @@ class Log:
     Attributes
     ----------
     episodes : tuple of Episode
-        At least two steps in all.
+        At least two steps in all. States that are read now and then are NaN in between.
     dt : float
         Sampling time.
     state_names, input_names, disturbance_names : tuple of str
         Empty where nobody named them.
     lost_steps : int
-        Steps left out, since they took another time than ``dt``.
+        Steps left out: beside gaps, or of another time than ``dt``.
     units : tuple of str
         Of states, inputs and disturbances in turn; empty where no header names them.
     time_unit : str
@@ -106,7 +106,7 @@ class Log:
             if size
         ]
         steps = sum(len(each) for each in self.episodes)
-        lost = f"; {self.lost_steps} steps of another length left out" if self.lost_steps else ""
+        lost = f"; {self.lost_steps} steps at gaps left out" if self.lost_steps else ""
         return (
             f"Log({len(self)} episode{'s' * (len(self) > 1)}, {steps:,} steps of dt = {self.dt:g}"
             f"{f' {self.time_unit}' if self.time_unit else ''}; "
@@ -123,6 +123,37 @@ class Log:
         """The numbers n, m and d of states, inputs and disturbances."""
         first = self.episodes[0]
         return first.states.shape[1], first.inputs.shape[1], first.disturbances.shape[1]
+
+    @property
+    def every(self) -> tuple[int, ...]:
+        """Each state is read every so many samples, on average; 1 where none is missing."""
+        read = np.concatenate([np.isfinite(each.states) for each in self.episodes])
+        counts = read.sum(axis=0).tolist()
+        rows = len(read)
+        return tuple(1 if k == rows else max(2, round(rows / max(k, 1))) for k in counts)
+
+    def with_all_states(self) -> Log:
+        """Return the log cut where a state is not read.
+
+        Raises
+        ------
+        ValueError
+            If no two samples in a row have all states: the message names those read now and then.
+        """
+        if max(self.every) == 1:
+            return self
+        found = _stretches(self.episodes, np.zeros(len(self.every), bool))
+        episodes = [self.episodes[i].part(a, b) for i, a, b in found]
+        if sum(map(len, episodes)) < 2:
+            names = self.state_names or [f"x[{i}]" for i in range(len(self.every))]
+            rare = [f"{a} every {k}" for a, k in zip(names, self.every, strict=True) if k > 1]
+            raise ValueError(
+                f"Read now and then: {', '.join(rare)} samples. A model of states needs all of "
+                "them at each sample. Pass the log to identify_outputs, and an estimator to what "
+                "needs states (PlantTwin.fit(mpc, log, observer=...)), or leave them out of states."
+            )
+        lost = sum(map(len, self.episodes)) - sum(map(len, episodes))
+        return replace(self, episodes=tuple(episodes), lost_steps=self.lost_steps + lost)
 
     @classmethod
     def from_arrays(
@@ -156,21 +187,36 @@ class Log:
         ValueError
             For shapes that do not fit, or numbers that are not finite.
         """
-        x = as_matrices("states", states)
-        u = as_matrices("actions", inputs)
-        d: list[Array] = [np.zeros((len(each), 0)) for each in u]
-        if disturbances is not None:
-            d = as_matrices("disturbances", disturbances)
-        for name, parts in (("actions", u), ("disturbances", d)):
-            _require_one_state_more(name, parts, x)
-        if sum(map(len, u)) < 2:
+        given = {"states": states, "actions": inputs, "disturbances": disturbances}
+        return cls._of(episodes_of(given), dt, time, time_unit)
+
+    @classmethod
+    def with_gaps(
+        cls, outputs: Arrays, inputs: Arrays, dt: float, disturbances: Arrays | None = None
+    ) -> Log:
+        """Return the log of arrays, cut where an entry is NaN that is read in most samples."""
+        given = {"outputs": outputs, "inputs": inputs, "disturbances": disturbances}
+        records = episodes_of(given, gaps=True)
+        episodes = [records[i].part(a, b) for i, a, b in _stretches(records)]
+        lost = sum(map(len, records)) - sum(map(len, episodes))
+        if sum(map(len, episodes)) < 2:
             raise ValueError(
-                f"states has shape {x[0].shape} and actions {u[0].shape}: one step tells nothing. "
-                "Rows are samples and columns states or inputs; transpose a log that has them "
-                "otherwise."
+                "outputs and inputs hold no two rows in a row without a missing entry."
+            )
+        return replace(cls._of(episodes, dt), lost_steps=lost)
+
+    @classmethod
+    def _of(
+        cls, episodes: list[Episode], dt: float, time: Arrays | None = None, time_unit: str = ""
+    ) -> Log:
+        if sum(map(len, episodes)) < 2:
+            first = episodes[0]
+            raise ValueError(
+                f"states has shape {first.states.shape} and actions {first.inputs.shape}: one step "
+                "tells nothing. Rows are samples and columns states or inputs; transpose a log "
+                "that has them otherwise."
             )
         dt = check_positive("dt", dt)
-        episodes = [Episode(*parts) for parts in zip(x, u, d, strict=True)]
         lost = 0
         if time is not None:
             episodes, lost = _without_gaps(episodes, time, dt)
@@ -218,7 +264,8 @@ class Log:
         ------
         ValueError
             For a column that is not there or there twice, a row that holds no number where it
-            should, or one that is longer than the header. Rows without any reading end an episode.
+            should, or one that is longer than the header. An episode ends where a reading is
+            missing, but for states that are read now and then, as a laboratory's: these stay NaN.
         """
         for name, given in (("states", states), ("inputs", inputs)):
             if isinstance(given, str) or not given:
@@ -254,32 +301,30 @@ class Log:
         if episode is not None:
             labels = np.array([row[columns[episode]] for row in content])
             ends[1:-1] |= labels[1:] != labels[:-1]
-        no_state = ~np.isfinite(table[:, :n]).all(axis=1)
-        no_input = ~np.isfinite(table[:, n:]).all(axis=1)
-        ends[:-1] |= no_state
-        ends[1:] |= no_state | no_input
+        edges = pairwise(np.flatnonzero(ends).tolist())
+        parts = [slice(first, stop) for first, stop in edges if stop - first > 1]
+        records = [
+            Episode(table[part, :n], table[part, n : n + m][:-1], table[part, n + m :][:-1])
+            for part in parts
+        ]
+        kept = _stretches(records)
+        if not kept:
+            raise ValueError(f"{path} holds no two rows in a row with all of {wanted}.")
         times = None
         if time is not None:
             unit = time_unit or _name_and_unit(columns[time])[1]
             pairs = [_time(path, k, row, columns[time], unit) for k, row in enumerate(content)]
-            times = np.array([each for each, _ in pairs])
             if any(stamped for _, stamped in pairs):
                 time_unit = unit or "s"
-        edges = pairwise(np.flatnonzero(ends))
-        parts = [slice(first, stop) for first, stop in edges if stop - first > 1]
-        if not parts:
-            raise ValueError(f"{path} holds no two rows in a row with all of {wanted}.")
-        log = cls.from_arrays(
-            [table[part, :n] for part in parts],
-            [table[part, n : n + m][:-1] for part in parts],
-            dt,
-            disturbances=[table[part, n + m :][:-1] for part in parts] if disturbances else None,
-            time=None if times is None else [times[part] for part in parts],
-        )
+            instants = np.array([each for each, _ in pairs])
+            times = [instants[parts[i]][a : b + 1] for i, a, b in kept]
+        log = cls._of([records[i].part(a, b) for i, a, b in kept], dt, times)
+        beside = sum(map(len, records)) - sum(b - a for _, a, b in kept)
         names = [_name_and_unit(each)[0] for each in wanted]
         units = tuple(_name_and_unit(each)[1] for each in wanted)
         return replace(
             log,
+            lost_steps=log.lost_steps + beside,
             state_names=tuple(names[:n]),
             input_names=tuple(names[n : n + m]),
             disturbance_names=tuple(names[n + m :]),
@@ -292,35 +337,45 @@ SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
 """In a unit of time."""
 
 
-def cut_at_gaps(
-    outputs: Arrays, inputs: Arrays, dt: float, disturbances: Arrays | None = None
-) -> Log:
-    """Return the log of arrays as of `Log.from_arrays`, cut where an entry is NaN."""
-    given = {"outputs": outputs, "inputs": inputs, "disturbances": disturbances}
+RARE = 2 / 3
+"""Share of the samples below which isolated readings make a state one that is read now and then."""
+
+
+def _stretches(
+    episodes: Sequence[Episode], rare: NDArray[np.bool_] | None = None
+) -> list[tuple[int, int, int]]:
+    """Return episode, first and stop of all runs of steps in which nothing is missing.
+
+    States that are read now and then may be, by default those of isolated readings.
+    """
+    if rare is None:
+        read: NDArray[np.bool_] = np.concatenate([np.isfinite(each.states) for each in episodes])
+        # A reading whose sample before has none begins a run; episodes count as one.
+        runs = np.sum(read[1:] & ~read[:-1], axis=0) + read[0]
+        count = read.sum(axis=0)
+        rare = (0 < count) & (count < RARE * len(read)) & (runs > count / 2)
+    found = []
+    for i, each in enumerate(episodes):
+        there = np.isfinite(each.states[:, ~rare]).all(axis=1)
+        whole = there[:-1] & there[1:] & np.isfinite(each.driven).all(axis=1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))
+        found += [(i, int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return found
+
+
+def episodes_of(given: dict[str, Arrays | None], *, gaps: bool = False) -> list[Episode]:
+    """Return episodes of states, inputs and disturbances by name, with NaN where allowed."""
     parts = {
-        name: as_matrices(name, values, gaps=True)
+        name: as_matrices(name, values, gaps=gaps)
         for name, values in given.items()
         if values is not None
     }
-    y = parts["outputs"]
+    x, *driven = parts.values()
     for name in [*parts][1:]:
-        _require_one_state_more(name, parts[name], y)
-    episodes = []
-    for i, states in enumerate(y):
-        driven = [parts[name][i] for name in [*parts][1:]]
-        reading: NDArray[np.bool_] = np.all(np.isfinite(states), axis=1)
-        step = np.all(np.isfinite(np.hstack(driven)), axis=1) & reading[:-1] & reading[1:]
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], step, [False]]).astype(int)))
-        episodes += [
-            Episode(states[a : b + 1], *(each[a:b] for each in driven))
-            if len(driven) > 1
-            else Episode(states[a : b + 1], driven[0][a:b], np.zeros((b - a, 0)))
-            for a, b in zip(edges[::2], edges[1::2], strict=True)
-        ]
-    lost = sum(len(each) - 1 for each in y) - sum(map(len, episodes))
-    if sum(map(len, episodes)) < 2:
-        raise ValueError("outputs and inputs hold no two rows in a row without a missing entry.")
-    return Log(tuple(episodes), check_positive("dt", dt), lost_steps=lost)
+        _require_one_state_more(name, parts[name], x)
+    if len(driven) < 2:
+        driven.append([np.zeros((len(each), 0)) for each in driven[0]])
+    return [Episode(*each) for each in zip(x, *driven, strict=True)]
 
 
 def split_episodes(

@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_yann import identify
+from sb3_yann import (
+    LinearModel,
+    LinearMPC,
+    PlantTwin,
+    StateEstimator,
+    Tracking,
+    identify,
+    identify_outputs,
+)
 from sb3_yann.log import Episode, Log
 from sb3_yann.log import _without_gaps as without_gaps
 from sb3_yann.log import split_episodes as split
@@ -106,8 +114,61 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(tmp_path) -> None:
         [0.7],
         [0.8],
     ]
-    assert log.lost_steps == 1 and log.state_names == ("level", "T")
+    assert log.lost_steps == 3 and log.state_names == ("level", "T")
+    assert log.every == (1, 1) and log.with_all_states() is log
     assert log.episodes[0].disturbances.tolist() == [[7], [7]]
+
+
+def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1, 1, 300), 4)
+    x = np.zeros((1201, 2))
+    for k in range(1200):
+        x[k + 1] = [[0.9, 0.0], [0.2, 0.7]] @ x[k] + [0.3 * u[k], 0.0]
+    shown = x + 0.01 * rng.normal(size=x.shape)
+    rows = [
+        f"{shown[k, 0]:.6f},{'' if k % 10 else f'{shown[k, 1]:.6f}'},{u[min(k, 1199)]:.6f}"
+        for k in range(1201)
+    ]
+    rows[700] = f",,{u[700]:.6f}"
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["T,quality,valve", *rows]), encoding="utf-8")
+    log = Log.from_csv(path, ["T", "quality"], ["valve"], dt=1)
+    assert [len(each) for each in log.episodes] == [699, 499]
+    assert (log.every, log.lost_steps) == ((1, 10), 2)
+    found = identify_outputs(log)
+    assert found.every == (1, 10)
+    assert "Read now and then: quality every 10 samples" in found.report()
+    guess = found.predict(x, u[:, None], ahead=20)
+    assert np.std((guess - x[20:])[40:], axis=0).max() < 0.05  # x moves by .7 and .5
+    with pytest.raises(ValueError, match=r"quality every 10 samples.*identify_outputs"):
+        identify(log)
+    mpc = LinearMPC(
+        LinearModel([[0.9, 0], [0.2, 0.7]], [[0.3], [0]], 1),
+        Q=np.eye(2),
+        R=[[1]],
+        horizon=2,
+        u_min=-1,
+        u_max=1,
+        theta_min=-9,
+        theta_max=9,
+        tracking=Tracking([0], -1, 1),
+    )
+    with pytest.raises(ValueError, match=r"quality every 10 samples.*PlantTwin.fit\(mpc, log, obs"):
+        PlantTwin.fit(mpc, log)
+    observer = StateEstimator(mpc.model, [0, 1], every=[1, 10])
+    given = {"references": [[0.0], [0.0]], "observer": observer, "residuals": ["linear"]}
+    assert len(PlantTwin.fit(mpc, log, **given).episodes) == 2
+
+
+@pytest.mark.filterwarnings("ignore:u.0. has no effect")
+def test_a_state_that_is_often_read_is_cut_where_it_is_missing(tmp_path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{'' if k % 5 == 4 else np.sin(k)},{np.sin(3 * k)}" for k in range(40)]
+    path.write_text("\n".join(["T,valve", *rows]), encoding="utf-8")
+    log = Log.from_csv(path, ["T"], ["valve"], dt=1)
+    assert {len(each) for each in log.episodes} == {3} and log.every == (1,)
+    assert identify(log).model.n_states == 1
 
 
 def test_a_csv_file_that_does_not_fit_is_named(tmp_path) -> None:

@@ -185,6 +185,7 @@ class PlantTwin:
             raise ValueError(f"residuals = {residuals!r} must be a list of some of {KINDS}.")
         if isinstance(episodes, Log):
             _require_same_sampling(episodes, problem)
+            episodes = episodes if observer is not None else episodes.with_all_states()
         row = RowLayout(problem, observer)
         if observer is not None and row.observer is None:
             episodes, disturbances = row.estimated(episodes, disturbances)

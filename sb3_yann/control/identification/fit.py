@@ -54,6 +54,7 @@ def fit_log(
     delay: int | str | Sequence[int] = 0,
 ) -> LogFit:
     """Return the least-squares fit to a log; options as of `identify`."""
+    log = log.with_all_states()
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
     episodes, sizes = list(log.episodes), log.sizes
     measured = sizes[2] > 0
@@ -83,7 +84,7 @@ def fit_log(
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
     notes = [*system.notes, *_memory_notes(delays, sizes, system.u_ss), *quality, *shrunk, *late]
     if log.lost_steps:
-        notes.append(f"{log.lost_steps} steps that took another time than dt were left out.")
+        notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
     return LogFit(replace(system, notes=tuple(notes)), found, fits, tuple(delays))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.dead_time import MAX_DELAY
@@ -262,3 +263,56 @@ def predicted(
     for step in range(1, ahead):
         x = x @ model.A.T + moved[step : step + rows]
     return np.asarray(x @ model.C.T + model.y_0)
+
+
+RIDGE = 1e-3
+"""Of the number of readings: filtered signals depend on each other."""
+
+
+def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Episode]:
+    """Return episodes whose slow outputs, read now and then, have a value at each sample.
+
+    That is a linear function of the other outputs and the inputs, filtered by several time
+    constants, and what it leaves at the readings, drawn straight from one to the next.
+    """
+    y = [each.states for each in episodes]
+    driven = [each.driven for each in episodes]
+    gaps = np.mean(~np.isfinite(np.concatenate(y)[:, slow]))
+    longest = 8 / max(1 - gaps, 1e-3)
+    constants = np.exp2(np.arange(max(3, int(np.log2(longest)) + 1), dtype=np.float64))
+    parts = [_filtered(a[:, ~slow], b, constants) for a, b in zip(y, driven, strict=True)]
+    rows = np.concatenate(parts)
+    center, scale = rows.mean(axis=0), rows.std(axis=0)
+    scale[scale == 0] = 1.0
+    parts = [(each - center) / scale for each in parts]
+    rows = np.concatenate(parts)
+    filled = [each.copy() for each in y]
+    for i in np.flatnonzero(slow):
+        wanted = np.concatenate([each[:, i] for each in y])
+        at = np.isfinite(wanted)
+        mean = wanted[at].mean()
+        gram = rows[at].T @ rows[at] + RIDGE * at.sum() * np.eye(rows.shape[1])
+        weights = np.linalg.solve(gram, rows[at].T @ (wanted[at] - mean))
+        for part, each in zip(parts, filled, strict=True):
+            guess = mean + part @ weights
+            seen = np.flatnonzero(np.isfinite(each[:, i]))
+            left = each[seen, i] - guess[seen]
+            rest = np.interp(np.arange(len(guess)), seen, left) if len(seen) else 0.0
+            each[:, i] = guess + rest
+    return [replace(each, states=x) for each, x in zip(episodes, filled, strict=True)]
+
+
+def _filtered(fast: Array, driven: Array, constants: Array) -> Array:
+    """Return (T + 1, k): fast outputs now and filtered, and inputs of before, filtered."""
+    before = np.vstack([driven[:1], driven])  # the first input acts from the second sample on
+    signals = np.hstack([fast, before])
+    found = [signals]
+    for constant in constants:
+        pole = np.exp(-1 / constant)
+        now = signals[0]
+        rows = np.empty_like(signals)
+        for k, each in enumerate(signals):
+            now = pole * now + (1 - pole) * each
+            rows[k] = now
+        found.append(rows)
+    return np.hstack(found)

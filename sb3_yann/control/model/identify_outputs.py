@@ -23,9 +23,14 @@ from sb3_yann.control.identification.innovations import (
     shifted,
 )
 from sb3_yann.control.identification.least_squares import WEAK, Regression, pole_note, regress
-from sb3_yann.control.identification.outputs import AHEAD, Structure, fit_structure, predicted
+from sb3_yann.control.identification.outputs import (
+    AHEAD,
+    Structure,
+    fit_structure,
+    predicted,
+    stand_ins,
+)
 from sb3_yann.control.identification.residuals import listed
-from sb3_yann.control.identification.slow import read_log
 from sb3_yann.control.linear_system import names
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
@@ -177,7 +182,7 @@ def identify_outputs(
     ----------
     outputs : Log, or array_like, shape (T + 1, q), or a sequence of such
         A log whose states are the outputs; or one record or several. Rows with NaN are gaps, but
-        for outputs that are read in fewer than four of five samples: these need not be there.
+        for outputs that are read in fewer than two of three samples: these need not be there.
     inputs : array_like, shape (T, m), or a sequence of such
         As they were executed: row k acts between rows k and k + 1 of the outputs.
     dt : float
@@ -214,14 +219,15 @@ def identify_outputs(
         given = {"inputs": inputs, "dt": dt, "disturbances": disturbances}
         if beside := [name for name, value in given.items() if value is not None]:
             raise TypeError(f"{beside} is given, but the log has its own: leave it out.")
-        log, read = outputs, list(outputs.episodes)
-        every: tuple[int, ...] = (1,) * log.sizes[0]
+        log = outputs
     elif inputs is None or dt is None:
         raise TypeError("identify_outputs takes a Log, or outputs and inputs with dt=.")
     else:
-        log, read, every = read_log(outputs, inputs, dt, disturbances)
+        log = Log.with_gaps(outputs, inputs, dt, disturbances)
     wanted = None if isinstance(order, str) and order == "auto" else check_int("order", order, 1)
-    episodes, (q, m, d) = list(log.episodes), log.sizes
+    (q, m, d), read, every = log.sizes, list(log.episodes), log.every
+    slow = np.array(every) > 1
+    episodes = stand_ins(read, slow) if slow.any() else read
     require_moving(episodes, log.sizes)
     try:
         plain = regress(episodes, log.sizes, None, 0.0)
@@ -405,7 +411,5 @@ def _notes(
             "not linear over this log: record closer to the operating point."
         )
     if log.lost_steps:
-        notes.append(
-            f"{log.lost_steps} steps beside gaps, or of another time than dt, are left out."
-        )
+        notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
     return [*notes, pole_note(step, n)]

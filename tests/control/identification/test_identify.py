@@ -127,7 +127,7 @@ def test_rows_that_are_missing_are_noticed_by_their_time() -> None:
     kept = np.setdiff1d(np.arange(401), [7, 100, 101, 250])
     found = identify(x[kept], u[kept[:-1]], dt=0.5, time=time[kept])
     np.testing.assert_allclose(found.model.A, A, atol=1e-8)
-    assert "3 steps that took another time than dt were left out" in found.model.report()
+    assert "3 steps at gaps, or of another time than dt, are left out" in found.model.report()
     assert np.abs(identify(x[kept], u[kept[:-1]], dt=0.5).model.A - A).max() > 1e-3
 
 
@@ -401,4 +401,4 @@ def test_the_notes_stand_in_their_order_and_a_ridge_that_is_given_is_told_once()
     time = np.arange(401.0)
     time[201:] += 3
     last = identify(x, u, dt=1, time=time).model.notes[-1]
-    assert last == "1 steps that took another time than dt were left out."
+    assert last == "1 steps at gaps, or of another time than dt, are left out."
