@@ -127,7 +127,7 @@ class Log:
     @property
     def every(self) -> tuple[int, ...]:
         """Each state is read every so many samples, on average; 1 where none is missing."""
-        read = np.concatenate([np.isfinite(each.states) for each in self.episodes])
+        read = np.isfinite(np.concatenate([each.states for each in self.episodes]))
         counts = read.sum(axis=0).tolist()
         rows = len(read)
         return tuple(1 if k == rows else max(2, round(rows / max(k, 1))) for k in counts)
@@ -349,15 +349,16 @@ def _stretches(
     States that are read now and then may be, by default those of isolated readings.
     """
     if rare is None:
-        read: NDArray[np.bool_] = np.concatenate([np.isfinite(each.states) for each in episodes])
+        read = np.isfinite(np.concatenate([each.states for each in episodes]))
         # A reading whose sample before has none begins a run; episodes count as one.
-        runs = np.sum(read[1:] & ~read[:-1], axis=0) + read[0]
-        count = read.sum(axis=0)
+        runs = np.sum(read[1:] > read[:-1], axis=0) + read[0]
+        count = np.sum(read, axis=0)
         rare = (0 < count) & (count < RARE * len(read)) & (runs > count / 2)
     found = []
     for i, each in enumerate(episodes):
-        there = np.isfinite(each.states[:, ~rare]).all(axis=1)
-        whole = there[:-1] & there[1:] & np.isfinite(each.driven).all(axis=1)
+        there: NDArray[np.bool_] = np.all(np.isfinite(each.states[:, ~rare]), axis=1)
+        told = np.isfinite(each.driven).all(axis=1)
+        whole = np.all([there[:-1], there[1:], told], axis=0)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))
         found += [(i, int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return found
