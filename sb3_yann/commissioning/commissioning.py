@@ -21,13 +21,14 @@ from sb3_yann.commissioning.comparison import (
     compare,
     excess_of_mpc,
     is_kept,
+    rows_of_pairs,
     why_taken_back,
 )
 from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal, Verdict
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
-from sb3_yann.compare import allowed_excess
+from sb3_yann.compare import allowed_excess, summary_lines
 from sb3_yann.improvement import improve
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.rollout import Source, one_env
@@ -188,8 +189,27 @@ class Commissioning:
         return self.batches
 
     def report(self) -> str:
-        """Return the batches as a table."""
-        return self.journal.report()
+        """Return the batches as a table, and what the pairs of the policy on trial show."""
+        journal, state = self.journal, self.journal.state
+        verdict, rows = "The MPC acts.", {}
+        if journal.accepted:
+            verdict = f"The policy of {state.policy} is on trial."
+            if state.is_kept:
+                verdict = f"The policy of {state.policy} surely costs less than the MPC, and acts."
+            rows = rows_of_pairs(journal, self.policy.problem)
+        ours = [each for each, by in zip(journal.episodes, journal.by_policy, strict=True) if by]
+        every = sum(len(each.actions) for each in journal.episodes)
+        violations = sum(each.violations for each in journal.episodes)
+        of_policies = sum(each.violations for each in ours)
+        more = self._size_of_batch()
+        return summary_lines(
+            f"{journal.report()}\n{verdict}",
+            **rows,
+            violations=f"{of_policies} steps of policies, {violations - of_policies} of the MPC",
+            steps=f"{every:,} of the plant in {len(journal.episodes)} episodes, {len(ours)} begun "
+            "by policies",
+            next=f"run(batches={len(self.batches) + 1}) plays {more} episodes more",
+        )
 
     def _play(self, plant: Plant) -> None:
         journal = self.journal
@@ -218,9 +238,10 @@ class Commissioning:
         journal.add(played, acts)
 
     def _batch_is_over(self) -> bool:
-        journal = self.journal
-        count = self.batch * 2 ** (len(journal.batches) - journal.state.anew)
-        return len(journal.batch) >= count or self._changed
+        return len(self.journal.batch) >= self._size_of_batch() or self._changed
+
+    def _size_of_batch(self) -> int:
+        return int(self.batch * 2 ** (len(self.batches) - self.journal.state.anew))
 
     @property
     def _changed(self) -> bool:
@@ -265,7 +286,7 @@ class Commissioning:
                 Batch(*sizes, who, within, *shown, costs.difference.pairs, verdict, reason), state
             )
         if self.verbose:
-            print(self.report().splitlines()[-1])
+            print(self.journal.report().splitlines()[-1])
 
     def _learn(self, plant: Plant, number: int) -> tuple[Costs, CommissioningState, Verdict, str]:
         """Decide by the pairs, fit the twin anew, and improve where no policy is on trial."""

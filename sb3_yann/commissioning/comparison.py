@@ -10,7 +10,7 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.journal import Journal
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
-from sb3_yann.compare import Difference, allowed_excess, level_of_look
+from sb3_yann.compare import Difference, allowed_excess, level_of_look, paired_rows
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import (
     BoundExcess,
@@ -146,6 +146,16 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     if is_hopeless(costs):
         return f"{costs.difference.pairs} pairs show no gain"
     return ""
+
+
+def rows_of_pairs(journal: Journal, problem: LinearMPC) -> dict[str, str]:
+    """Return what the pairs of the policy on trial cost, in words; the interval has all looks."""
+    if not journal.pairs:
+        return {"change": "no pair of episodes has been played yet"}
+    pays_own = pays_its_own(problem, journal.episodes)
+    ours, its = (_costs(problem, each, pays_own) for each in zip(*journal.pairs, strict=True))
+    level = level_of_look(RULE.significance, len(journal.trial))
+    return paired_rows(ours, its, level=level, in_turns=True)
 
 
 def is_kept(costs: Costs) -> bool:

@@ -399,10 +399,10 @@ def loops_figure(
 ) -> Figure:
     """Return a figure of quantities over time, in plant units, with limits and set-points.
 
-    Up to six episodes are lines. Of more, a line is their median and a band holds 80 % of them, and
-    what has a set-point is drawn as its distance from it; a panel below holds the differences of
-    the other controllers from the first one, where all were played from the same starts. Where
-    some episodes have ended, the others count.
+    Up to six episodes are lines. Of more, a line is their median and a band holds 80 % of them; a
+    panel below holds the differences of the other controllers from the first one, where all were
+    played from the same starts. Where set-points differ between episodes, the distance from them is
+    drawn. Where some episodes have ended, the others count.
 
     Parameters
     ----------
@@ -473,27 +473,26 @@ def _draw_loops(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
     n = problem.n_theta
     reference = problem.set_points.get(entry, entry)
     label = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
-    many = max(len(each.costs) for each in runs.values()) > MAX_LINES
+    set_points = np.empty((0, 0))
+    if reference != entry:  # the last one belongs to a step that is not taken
+        set_points = np.unique(_rows(next(iter(runs.values())), reference, n)[:, :-1], axis=0)
+    differ = len(set_points) > 1
     every = []
     for number, (name, episodes) in enumerate(runs.items()):
         rows = _rows(episodes, entry, n)
-        if reference != entry and many:
-            # The last set-point belongs to a step that is not taken.
+        if differ:
             rows = rows[:, :-1] - _rows(episodes, reference, n)[:, :-1]
         _draw_rows(axes, rows, problem.model.dt, _style(number, entry >= n), name)
         every.append(rows[np.isfinite(rows)])
-    if reference != entry and many:
+    if differ:
         axes.axhline(0, **SET_POINT)  # type: ignore[arg-type]
         axes.set_ylabel(f"{label}\nless its set-point")
         axes.grid(alpha=0.3)
         return
-    if reference != entry:
-        rows = np.unique(_rows(next(iter(runs.values())), reference, n)[:, :-1], axis=0)
-        time = problem.model.dt * np.arange(rows.shape[1])
-        for k, row in enumerate(rows):
-            name = "set-point" if k == 0 else "_nolegend_"
-            axes.plot(time, row, drawstyle="steps-post", label=name, **SET_POINT)  # type: ignore[arg-type]
-        every.append(rows[np.isfinite(rows)])
+    for row in set_points:
+        time = problem.model.dt * np.arange(len(row))
+        axes.plot(time, row, drawstyle="steps-post", label="set-point", **SET_POINT)  # type: ignore[arg-type]
+        every.append(row[np.isfinite(row)])
     data = np.concatenate(every) if sum(map(len, every)) else np.array([0.0, 1.0])
     _draw_limits(axes, problem, entry, float(data.min()), float(data.max()))
     axes.set_ylabel(label)

@@ -246,9 +246,7 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
-        state = self.state
-        lines = summary_of(state, self.player.policy)
-        return f"{lines}\n{self.steps:,} steps of the guard's simulator."
+        return summary_of(self.state, self.player.policy, self.steps)
 
     @property
     def steps(self) -> int:

@@ -19,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann._validation import Array, check_type
-from sb3_yann.compare import Scores, Starts
+from sb3_yann.compare import Scores, Starts, less_safe, paired_rows, summary_lines
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import StartsAsMPC
 
@@ -324,52 +324,53 @@ ADVICE = {
 """What helps against a reason for a refusal that holds such words: the first one that does."""
 
 
-def summary_of(state: GuardState, policy: StartsAsMPC) -> str:
+def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
     """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
-    decisions, n_starts = state.decisions, len(state.settings["seeds"])
-    cost = state.evidence.mean_cost(state.evidence.scores)
-    mpc_cost = state.evidence.mean_cost(state.evidence.starts.mpc)
-    more = "less" if cost < mpc_cost else "more"
-    change = relative_change(cost, mpc_cost)
-    size = f"{100 * abs(change):.2g} % {more}" if math.isfinite(change) else more
-    line = f"costs {cost:.6g}, {size} than the MPC's {mpc_cost:.6g}, on {n_starts} starts."
+    decisions, starts = state.decisions, state.evidence.starts
+    played = slice(starts.n_hard, len(state.evidence.scores.costs))
+    ours = state.evidence.scores.at(played)
+    mpc = starts.mpc.at(played)
+    verdict = "The policy accepted last is better than the MPC."
     if state.accepted.has_networks_of(state.evidence.mpc):
-        line = f"is the MPC: it costs {mpc_cost:.6g} on {n_starts} starts."
-    elif abs(cost - mpc_cost) <= 1e-3 * abs(mpc_cost):
-        line = (
-            f"is not the MPC, and gains nothing: it costs {cost:.6g} on {n_starts} starts, the MPC "
-            f"{mpc_cost:.6g}."
-        )
-    lines = [f"The policy accepted last {line}"]
-    if lost := state.evidence.lost:
-        lines.append(
-            f"Of the final starts it loses {len(lost)} by more than the margin, which the rule "
-            f"allows: seeds {', '.join(map(str, lost[:10]))}{', ...' * (len(lost) > 10)}."
-        )
+        verdict = "The policy accepted last is the MPC."
+    elif not ours.costs.mean() < mpc.costs.mean() - 1e-3 * abs(mpc.costs.mean()):
+        verdict = "The policy accepted last is not the MPC, and gains nothing."
     if not state.accepted.is_actor_of(policy):
-        lines.append(
-            "The model's policy is another one, which no guard has accepted: "
+        verdict += (
+            " The model's policy is another one, which no guard has accepted: "
             "restore_accepted(model) gives it the accepted one."
         )
-    if not decisions:
-        updates, needed = int(policy.critic_updates), policy.critic_warmup
-        lines.append("The guard has tried no candidate yet.")
-        if updates <= needed:
-            lines.append(
-                f"The critic has had {updates} updates, and the actor moves after critic_warmup = "
-                f"{needed}. Train longer, or lower critic_warmup."
-            )
-        return "\n".join(lines)
+    less = int(less_safe(ours.unsafe, mpc.unsafe, starts.tolerance.excess_room).any(axis=1).sum())
+    violations = f"more than the MPC's from {less} of {len(ours.costs)} starts"
+    if lost := state.evidence.lost:
+        violations += (
+            f"; of the final starts {len(lost)} cost more by more than the margin, which the rule "
+            f"allows: seeds {', '.join(map(str, lost[:10]))}{', ...' * (len(lost) > 10)}"
+        )
     counts = Counter(each.verdict for each in decisions)
-    lines.append(
-        f"Candidates: {counts['accepted']} accepted, {counts['accepted in part']} in part, "
-        f"{counts['rejected']} refused, in {decisions[-1].episode} episodes."
-    )
     refused = [each.reason for each in decisions if each.verdict == "rejected"]
     kinds = [next((words for words in ADVICE if words in why), why) for why in refused]
+    candidates = refusals = more = ""
+    if decisions:
+        candidates = (
+            f"{counts['accepted']} accepted, {counts['accepted in part']} in part, "
+            f"{counts['rejected']} refused, in {decisions[-1].episode} episodes"
+        )
+    elif (updates := int(policy.critic_updates)) <= (needed := policy.critic_warmup):
+        more = (
+            f"the critic has had {updates} updates, and the actor moves after critic_warmup = "
+            f"{needed}: train longer, or lower critic_warmup"
+        )
     if kinds:
         kind, times = Counter(kinds).most_common(1)[0]
-        lines.append(f"Refused most often ({times} times): {refused[kinds.index(kind)]}.")
-        if kind in ADVICE:
-            lines.append(f"What may help: {ADVICE[kind]}.")
-    return "\n".join(lines)
+        refusals = f"most often ({times} times): {refused[kinds.index(kind)]}"
+        more = ADVICE.get(kind, "")
+    return summary_lines(
+        verdict,
+        **paired_rows(ours.costs, mpc.costs),
+        violations=violations,
+        steps=f"{steps:,} of the guard's simulator" if steps else "",
+        candidates=candidates or "none was tried yet",
+        refused=refusals,
+        next=more,
+    )

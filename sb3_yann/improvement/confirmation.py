@@ -115,8 +115,10 @@ class Pairs:
             reason += "small a gain, or not sure"
         worst = float((self.policy - self.mpc).max()) / mean if count else np.inf
         safe = not less_safe(self.unsafe, self.unsafe_of_mpc).any()
+        of_mean = Difference.of((self.policy - self.mpc) / mean)
+        interval = (of_mean.mean - of_mean.room(level), of_mean.mean + of_mean.room(level))
         shown = self.change, worst, safe, gain.mean, gain.error
-        return Check(number, not reason, reason, *shown, final=final)
+        return Check(number, not reason, reason, *shown, final=final, interval=interval)
 
     @property
     def ride_a_bound(self) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_yann._validation import Array
+from sb3_yann.compare import change_in_percent, paired_rows, summary_lines
 from sb3_yann.control import LinearMPC
 
 LITTLE = 0.005
@@ -107,38 +108,36 @@ class Headroom:
 
     def report(self) -> str:
         """Return the figures, and what to do, in words."""
-        mpc, best = self.mpc_costs.mean(), self.best_costs.mean()
-        each = 100 * (self.best_costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
         parts = (
-            ("offset, what a disturbance observer gains", self.offset),
-            ("model error beyond that", self.model_error),
-            ("nonlinearity and constraints", self.nonlinearity),
+            f"{100 * part + 0.0:+.2f} % {name}"
+            for name, part in (
+                ("with a disturbance observer", -self.offset),
+                ("more with a re-identified model", -self.model_error),
+                ("more by nonlinearity and constraints", -self.nonlinearity),
+            )
         )
-        lines = [
-            f"By its own stage cost the MPC costs {mpc:.5g} from {len(self.mpc_costs)} starts of "
-            f"{self.source}; the best that was found {best:.5g}: "
-            f"{0.0 - 100 * self.total:+.2f} % +- "
-            f"{100 * self.standard_error:.2f} (from {each.min():+.2f} to {each.max():+.2f} % by "
-            "start).",
-            *(f"  {name}: {0.0 - 100 * part:+.2f} %" for name, part in parts),
-            f"An MPC with a disturbance observer{self._as_played(self.observer_played)}",
-            f"An MPC with a re-identified model{self._as_played(self.reidentified_played)}",
-            f"Verdict: {self.verdict}; {self._advice()}",
-            *([f"{self.steps:,} steps of the env. {self.note}".strip()] if self.steps else []),
-        ]
-        return "\n".join(lines)
+        steps = f"{self.steps:,} of the env. {self.note}".strip() if self.steps else self.note
+        return summary_lines(
+            f"Verdict: {self.verdict}. By its own stage cost, from starts of {self.source}:",
+            **paired_rows(self.best_costs, self.mpc_costs),
+            of_that=", ".join(parts),
+            observer=self._as_played(self.observer_played),
+            new_model=self._as_played(self.reidentified_played),
+            steps=steps,
+            next=self._advice(),
+        )
 
     __str__ = report
 
     def _as_played(self, costs: Array | None) -> str:
         """Return what came of another MPC, losses included."""
         if costs is None:
-            return " was not played."
+            return "not played"
         each = (costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
-        dearer = np.count_nonzero(each > ROUNDING)
+        more = np.count_nonzero(each > ROUNDING)
         return (
-            f", as it was played: {0.0 - 100 * gain(self.mpc_costs, costs):+.2f} %, from the worst "
-            f"start {100 * each.max():+.2f} %; {dearer} of {len(costs)} starts cost more."
+            f"{change_in_percent(-gain(self.mpc_costs, costs))} as it was played, worst start "
+            f"{change_in_percent(each.max())} of its own cost; {more} of {len(costs)} cost more"
         )
 
     def _advice(self) -> str:

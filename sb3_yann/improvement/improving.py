@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._validation import check_bool, check_int
+from sb3_yann.compare import change_in_percent, summary_lines
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
 from sb3_yann.improvement.confirmation import ENOUGH, FIRST_LOOK, LOOKS, Pairs, confirm
@@ -101,7 +102,7 @@ class Improvement:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Where the last policy's change on the plant lies with 90 %, as a twin's log has it."""
+        """Where the last policy's change lies with 90 %: in the simulator, or on a twin's plant."""
         known = [each.interval for each in self.checks if each.interval is not None]
         return known[-1] if known else (-np.inf, np.inf)
 
@@ -123,24 +124,27 @@ class Improvement:
         return f"Nothing better was found: {said or f'no gain in {self.where}'}."
 
     def report(self) -> str:
-        """Return in words what was accepted, or why nothing was, and what it took."""
-        tried = len(self.checks)
-        taken = f"{tried} candidate{'s' * (tried != 1)} tried."
-        if self.steps:
-            taken += f" {self.steps:,} steps of the simulator."
+        """Return in words what was accepted, or why nothing was, what it took, and what next."""
+        tried = f"{len(self.checks)} candidate{'s' * (len(self.checks) != 1)} tried"
+        steps = f"{self.steps:,} of the simulator, {tried}" if self.steps else tried
+        source = "twin" if self.where == "the twin" else "env"
         if not self.accepted:
-            return f"{self.reason} The model is as it was. {taken}"
+            more = f"print(headroom(mpc, {source})) shows what can be gained, and how"
+            return summary_lines(f"{self.reason} The model is as it was.", steps=steps, next=more)
         last = next((each for each in reversed(self.checks) if each.accepted), None)
-        said = f"Accepted: {100 * self.change:+.2f} % of the MPC's stage cost in {self.where}"
+        interval = last.interval if last is not None else None
+        change = change_in_percent(self.change, interval if source == "env" else None)
+        rows = {"change": f"{change} of the MPC's mean cost in {self.where}"}
+        if source == "twin" and interval is not None:
+            low, high = (100 * each for each in interval)
+            rows["change"] += f"; on the plant {low:+.2f} to {high:+.2f} % (90 %)"
         if last is not None:
-            twin = self.where == "the twin"
-            if last.interval is not None:
-                low, high = (100 * each for each in last.interval)
-                return f"{said}, {low:+.2f} to {high:+.2f} % on the plant (90 %). {taken}"
-            whose = "on episodes like the log's" if twin else "of an episode's own on average"
-            said += f", {100 * last.logged:+.2f} % (± {100 * last.error:.2f}) {whose}"
-            said += f", {100 * last.worst:+.2f} % from the worst start"
-        return f"{said}. {taken}"
+            rows["worst_start"] = f"{change_in_percent(last.worst)} of the MPC's mean cost"
+            rows["violations"] = "no more than the MPC's" if last.safe else "more than the MPC's"
+        more = (
+            'report(model, "report.html", env=env), then Commissioning(model, plant, shadow=True)'
+        )
+        return summary_lines("Accepted: a better policy.", **rows, steps=steps, next=more)
 
     __str__ = report
 

@@ -59,8 +59,8 @@ class Check:
     final : bool
         Whether it decided in the end.
     interval : tuple of float, optional
-        In a twin, where the change on the plant lies, with 90 %: see :meth:`PlantTwin.forecast`.
-        Then ``logged`` and ``error`` are its forecast and the half-width.
+        Where the change lies, with 90 %. In a simulator over all looks; in a twin on the plant, see
+        :meth:`PlantTwin.forecast`: then ``logged`` and ``error`` are its forecast and half-width.
     """
 
     iteration: int

@@ -305,13 +305,19 @@ def require_theta(
             "offset)}."
         )
     if observation is None:
-        if shape != (problem.n_theta,):
-            raise ValueError(
-                f"The observation has shape {shape}, but the law of the problem {takes}. Give the "
-                "problem of this plant, or the map from an observation to theta: "
-                "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
+        if shape == (problem.n_theta,):
+            return
+        more = 0 if shape is None or len(shape) != 1 else shape[0] - problem.n_theta
+        advice = "Give the problem of this plant, or the map from an observation to theta: "
+        if more > 0:
+            advice = (
+                f"If the last {more} are extra signals for the networks, say policy_kwargs="
+                f"{{'extra': {more}}}. Else give the map from an observation to theta: "
             )
-        return
+        raise ValueError(
+            f"The observation has shape {shape}, but the law of the problem {takes}. {advice}"
+            "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
+        )
     given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"
     if shape is None or observation.n_obs != np.prod(shape):
         raise ValueError(

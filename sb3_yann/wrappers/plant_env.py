@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import ArrayLike
+from scipy import linalg
 
 from sb3_yann._validation import Array, check_bounds, check_int, check_type
 from sb3_yann.control import DisturbanceObserver, LinearMPC
@@ -17,6 +19,8 @@ from sb3_yann.wrappers.stage_cost import StageCost
 from sb3_yann.wrappers.theta import ObserveDisturbance, PreviousInput, SetPoint
 
 Slope = Callable[[Array, Array], ArrayLike]
+UNITS_OF_TIME = (24.0, 60.0, 1000.0, 1440.0, 3600.0, 86400.0)
+"""How often milliseconds, seconds, minutes, hours and days go into one another."""
 
 
 class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -96,6 +100,16 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
             )
         check_int("substeps", substeps)
         env: Any = Equations(f, mpc, start, substeps)
+        if ratio := ratio_of_time_units(env._slope, mpc):
+            faster = ratio < 1
+            times = 1 / ratio if faster else ratio
+            warnings.warn(
+                f"f(x, u) is {times:g} times as {'fast' if faster else 'slow'} as the model of the "
+                f"MPC, whose dt = {mpc.model.dt:g}{f' {mpc.model.time_unit}'.rstrip()}. If f is in "
+                "another unit of time than dt, pass lambda x, u: np.asarray(f(x, u)) "
+                f"{'/' if faster else '*'} {times:g}.",
+                stacklevel=2,
+            )
         if layout.n_references:
             r = mpc.tracking
             env = SetPoint(env, r.r_min, r.r_max, hold=hold, preview=r.preview)
@@ -109,6 +123,39 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         limit = check_int("max_episode_steps", max_episode_steps)
         self.mpc = mpc
         super().__init__(TimeLimit(StageCost(env, mpc), limit))
+
+
+def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) -> float | None:
+    """Return by what a unit of time explains that f and the model differ; None where none does.
+
+    Compared are the effects of state and input on the next state, in half-widths of their boxes. A
+    plant that is not its model is no reason: the model must be far off, by five times at least, and
+    nearly right with another unit.
+    """
+    model, n = mpc.model, mpc.model.n_states
+    point = np.concatenate([model.x_ss, model.u_ss])
+    half = np.concatenate([mpc.theta_half[mpc.layout.state], mpc.u_half])
+    size = np.where(np.isfinite(half) & (half > 0), half, 1.0)
+    with np.errstate(all="ignore"):
+        ahead, behind = (
+            np.array([slope(*np.split(point + side * each, [n])) for each in np.diag(size)])
+            for side in (1e-4, -1e-4)
+        )
+        rates = np.zeros((point.size, point.size))
+        rates[:n] = ((ahead - behind) / 2e-4 / size[:n]).T
+    effects = np.hstack([model.A - np.eye(n), model.B]) * size / size[:n, None]
+    if not (np.all(np.isfinite(rates)) and np.any(effects)):
+        return None
+
+    def error(ratio: float) -> float:
+        with np.errstate(all="ignore"):
+            held = linalg.expm(ratio * model.dt * rates)[:n] - np.eye(n, point.size)
+            found = np.linalg.norm(held - effects) / np.linalg.norm(effects)
+        return float(np.nan_to_num(found, nan=np.inf))
+
+    ratios = [*UNITS_OF_TIME, *(1 / each for each in UNITS_OF_TIME)]
+    best = min(ratios, key=error)
+    return best if error(1.0) > 0.8 and error(best) < 0.2 else None
 
 
 class Equations(gym.Env[Array, Array]):

@@ -140,7 +140,7 @@ def test_a_reward_is_a_number_or_none() -> None:
 def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:
     env, problem = Rewarded(OTHER["a profit"]), mpc()
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
-        assert "By its own stage cost the MPC costs" in str(headroom(problem, env, n_starts=2))
+        assert "By its own stage cost" in str(headroom(problem, env, n_starts=2))
     assert [each.filename for each in found] == [__file__]
     model = DDPG("YannPolicy", env, policy_kwargs={"problem": problem}, device="cpu")
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:

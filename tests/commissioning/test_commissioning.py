@@ -241,6 +241,9 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     assert run.policy.max_correction == bound
     monkeypatch.setattr(commissioning, "is_kept", lambda _: False)
     assert run.run(3)[-1].verdict == "stays"  # it has been kept
+    table, _, rest = run.report().partition("The policy of batch 1 surely costs less than the MPC")
+    assert len(table.splitlines()) == 4 and "\n  change       " in rest
+    assert rest.endswith("\n  next         run(batches=4) plays 40 episodes more")
 
 
 def test_weights_that_nobody_accepted_never_act() -> None:

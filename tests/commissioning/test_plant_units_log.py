@@ -52,7 +52,7 @@ def test_a_log_in_the_plants_units_improves_a_policy_that_acts_in_them(tmp_path)
     assert twin.trusted
     model = DDPG("YannPolicy", OwnCart(), policy_kwargs={"problem": mpc}, seed=0)
     found = improve(model, twin, updates=1000, n_starts=10)
-    assert found.accepted and str(found).startswith("Accepted: -")
+    assert found.accepted and str(found).startswith("Accepted: a better policy.")
     model.save(tmp_path / "model")
     again = DDPG.load(tmp_path / "model", env=OwnCart())
     ours, before = (evaluate(each, OwnCart, range(100, 120)) for each in (again, law))

@@ -103,7 +103,9 @@ def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
     assert set(line.get_ydata()) == {13.0}
 
 
-def test_of_many_what_has_a_set_point_is_drawn_as_its_distance_from_it() -> None:
+def test_where_set_points_differ_the_distance_from_them_is_drawn() -> None:
+    axes = plot_loop(tank(tracking=Tracking([0], 10, 14)), {"MPC": episodes(3, size=2)}, "level")
+    assert axes.get_ylabel() == "level (m)\nless its set-point"
     played = episodes(9, size=2)
     for k, x in enumerate(played.observations):
         x[:, 1], x[-1, 1] = x[0, 0] + 0.5 + k / 100, 21.0

@@ -290,39 +290,44 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
     others = [decision("rejected", 39.0, "mean cost 5"), decision("accepted", 39.0)]
     decisions = [*refused, *others, decision("accepted in part", 30.0, "half")]
     assert said_of(decisions, 12) == [
-        "The policy accepted last costs 30, 25 % less than the MPC's 40, on 12 starts.",
-        "Candidates: 1 accepted, 1 in part, 3 refused, in 7 episodes.",
-        f"Refused most often (2 times): seed 3: {kind}, by 3.",
-        f"What may help: {ADVICE[kind]}.",
+        "The policy accepted last is better than the MPC.",
+        "  change       -25.00 % (-25.00 to -25.00 %, 90 %); mean cost 30 over 12 episodes, MPC 40",
+        "  worst start  -25.00 % of the MPC's mean cost",
+        "  violations   more than the MPC's from 0 of 12 starts",
+        "  candidates   1 accepted, 1 in part, 3 refused, in 7 episodes",
+        f"  refused      most often (2 times): seed 3: {kind}, by 3",
+        f"  next         {ADVICE[kind]}",
     ]
 
 
 @pytest.mark.parametrize(
     ("last", "words"),
     [
-        (decision("accepted", 41.0), "costs 41, 2.5 % more than the MPC's 40"),
-        (decision("rejected", 40.0, "x"), "is not the MPC, and gains nothing: it costs 40 on 5"),
-        (decision("accepted", -2.0, mpc=0.0), "costs -2, less than the MPC's 0"),
-        (decision("accepted", -50.0, mpc=-40.0), "costs -50, 25 % less than the MPC's -40"),
+        (decision("accepted", 41.0), ("gains nothing", "+2.50 %", "mean cost 41", "MPC 40")),
+        (decision("rejected", 40.0, "x"), ("is not the MPC, and gains nothing", "+0.00 %")),
+        (decision("accepted", -2.0, mpc=0.0), ("is better", "  mean cost -2 over 5 episodes")),
+        (decision("accepted", -50.0, mpc=-40.0), ("is better", "-25.00 %", "MPC -40")),
     ],
     ids=["more", "as much", "an MPC that costs nothing", "negative costs"],
 )
 def test_the_change_is_against_the_size_of_the_mpc_s_cost(last, words) -> None:
-    assert words in said_of([last])[0]
+    verdict, change, *_ = said_of([last])
+    assert all(each in f"{verdict} {change}" for each in words)
 
 
 def test_the_final_starts_that_the_rule_lets_it_lose_are_listed() -> None:
     said = said_of([decision("accepted", 30.0)], lost=(7, 12))
-    assert said[1] == (
-        "Of the final starts it loses 2 by more than the margin, which the rule allows: "
-        "seeds 7, 12."
+    assert said[3].endswith(
+        "of the final starts 2 cost more by more than the margin, which the rule allows: seeds 7, "
+        "12"
     )
 
 
 def test_nothing_was_tried_and_why() -> None:
-    mpc = "The policy accepted last is the MPC: it costs 40 on 5 starts."
-    assert said_of([], is_mpc=True) == [mpc, "The guard has tried no candidate yet."]
-    assert "had 3 updates, and the actor moves after" in said_of([], is_mpc=True, updates=3)[2]
+    said = said_of([], is_mpc=True)
+    assert said[0] == "The policy accepted last is the MPC."
+    assert said[-1] == "  candidates   none was tried yet"
+    assert "had 3 updates, and the actor moves after" in said_of([], is_mpc=True, updates=3)[-1]
 
 
 def test_a_changed_policy_is_never_called_the_mpc() -> None:
@@ -331,8 +336,8 @@ def test_a_changed_policy_is_never_called_the_mpc() -> None:
     better(model.policy)
     train(model, 2, guard)
     said = guard.summary()
-    assert "is the MPC" not in said and "% less than the MPC's" in said
-    assert "tried no candidate yet" in said and "critic_warmup = 99" in said
+    assert "is better than the MPC" in said
+    assert "none was tried yet" in said and "critic_warmup = 99" in said
     other, guard = build(gradient_steps=0), make_guard(Slide)
     train(other, 2, At([], better), guard)
     assert "accepted last is the MPC" in guard.summary()

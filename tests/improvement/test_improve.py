@@ -93,7 +93,7 @@ def test_its_steps_are_counted_and_its_envs_closed() -> None:
     made = Counted.made
     found = improve(model, Counted, **FEW)
     assert found.steps == Counted.steps > 0
-    assert f"{found.steps:,} steps of the simulator" in str(found)
+    assert f"{found.steps:,} of the simulator" in str(found)
     assert Counted.closed == Counted.made - made
     # The first episode is played twice, and the input is pushed once from five starts.
     assert 20 * (found.episodes + 1) + 5 == found.steps
@@ -412,7 +412,7 @@ def test_on_the_reactor_a_log_of_five_episodes_is_enough(tmp_path) -> None:
     found = improve(model, twin, n_starts=20, updates=1000)
     assert found.accepted and found.change < -0.01 and found.where == "the twin"
     assert found.steps == 0 and found.episodes == 5
-    assert "of the MPC's stage cost in the twin" in str(found)
+    assert "of the MPC's mean cost in the twin" in str(found)
     plain = DDPG("YannPolicy", "CSTR-v0", device="cpu")
     ours, mpc = (evaluate(each, "CSTR-v0", range(500, 530)) for each in (model, plain))
     assert np.mean(ours.costs) < 0.99 * np.mean(mpc.costs)
@@ -506,25 +506,25 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
 def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     passed = Check(1, True, "", -0.021, 0.0004, True, -0.015, 0.003)
     refused = Check(2, False, "2 starts with violations", -0.03, 0.0, False)
-    said = "-1.50 % (± 0.30) {}, +0.04 % from the worst start. 2 candidates tried."
     found = Improvement((refused, passed), -0.021, accepted=True)
     assert found.reason == "" and str(found) == found.report()
-    assert found.report() == (
-        "Accepted: -2.10 % of the MPC's stage cost in the twin, "
-        + said.format("on episodes like the log's")
-    )
+    assert found.report().splitlines()[:5] == [
+        "Accepted: a better policy.",
+        "  change       -2.10 % of the MPC's mean cost in the twin",
+        "  worst start  +0.04 % of the MPC's mean cost",
+        "  violations   no more than the MPC's",
+        "  steps        2 candidates tried",
+    ]
     sure = replace(passed, interval=(-0.03, -0.002))
-    assert "-3.00 to -0.20 % on the plant (90 %)" in str(Improvement((sure,), -0.021, True))
-    there = Improvement((refused, passed), -0.021, accepted=True, where="the simulator", steps=5000)
-    assert there.report() == (
-        "Accepted: -2.10 % of the MPC's stage cost in the simulator, "
-        + said.format("of an episode's own on average")
-        + " 5,000 steps of the simulator."
-    )
-    assert Improvement((refused,), 0.0, accepted=False).report() == (
-        "Nothing better was found: 2 starts with violations. The model is as it was. "
-        "1 candidate tried."
-    )
+    twin = Improvement((sure,), -0.021, True)
+    assert "in the twin; on the plant -3.00 to -0.20 % (90 %)" in str(twin)
+    there = str(replace(twin, where="the simulator", steps=5000))
+    assert "change       -2.10 % (-3.00 to -0.20 %, 90 %) of the MPC's mean cost" in there
+    assert "steps        5,000 of the simulator, 1 candidate tried" in there
+    assert Improvement((refused,), 0.0, accepted=False).report().splitlines()[:2] == [
+        "Nothing better was found: 2 starts with violations. The model is as it was.",
+        "  steps        1 candidate tried",
+    ]
     small = Check(1, True, "", -4e-4, 0.0, True)
     assert "a gain of 0.04 % in the twin is too small, or not sure" in str(
         Improvement((small,), 0.0, accepted=False)

@@ -210,6 +210,8 @@ def test_what_has_no_finite_bounds_is_refused() -> None:
     env.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
     with pytest.raises(ValueError, match="finite bounds of extra signals"):
         build(env=env)
+    with pytest.raises(ValueError, match=r"'extra': 1\}"):
+        build(extra=0)
     with pytest.raises(ValueError, match="must lie below high"):
         with_extra(tank(), 1, 1)
     with pytest.raises(ValueError, match="extra = -1"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,18 @@ def test_it_rests_where_the_model_does_and_begins_in_its_box() -> None:
     assert info["state"].tolist() == x.tolist()
     starts = np.array([env.reset(seed=k)[0] for k in range(50)])
     assert 325 <= starts.min() < 335 and 365 < starts.max() <= 375
+
+
+@pytest.mark.parametrize(("faster", "words"), [
+    (60, "60 times as fast as the model of the MPC, whose dt = 1. "), (1 / 3600, "* 3600."),
+    (5, ""), (-60, ""),
+])  # fmt: skip
+def test_equations_in_another_unit_of_time_are_named(faster, words) -> None:
+    mpc = LinearMPC(TANK, **WEIGHTS, **BOX)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        PlantEnv(lambda x, u: faster * 1.1 * slope(x, u), mpc)
+    assert len(found) == bool(words) and all(words in str(each.message) for each in found)
 
 
 def test_it_is_integrated_exactly() -> None:

@@ -178,12 +178,14 @@ def _sampling(model: LinearSystem) -> list[str]:
     if min(moving, default=np.inf) < SLOW_SAMPLING or period < 6:
         lines.append(
             "  Slow: a mode dies out or swings round within a few samples, where no input can act "
-            "on it. Sample faster, or leave it out of the model."
+            "on it. Sample faster, or leave it out of the model. Is dt in the unit of time of "
+            "the equations, or of the log?"
         )
     elif min(moving, default=0.0) > FAST_SAMPLING and period > 2 * np.pi * FAST_SAMPLING:
         lines.append(
             "  Fast: even the fastest mode hardly moves in one sample, and a short horizon sees "
-            "little of the plant. Sample slower, or lengthen the horizon."
+            "little of the plant. Sample slower, or lengthen the horizon. Is dt in the unit of "
+            "time of the equations, or of the log?"
         )
     return lines
 
