@@ -473,7 +473,7 @@ def _draw_loops(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
     n = problem.n_theta
     reference = problem.set_points.get(entry, entry)
     label = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
-    set_points = np.empty((0, 0))
+    set_points: Array = np.empty((0, 0))
     if reference != entry:  # the last one belongs to a step that is not taken
         set_points = np.unique(_rows(next(iter(runs.values())), reference, n)[:, :-1], axis=0)
     differ = len(set_points) > 1
