@@ -16,7 +16,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from test_whole_controller import CHECKS, InPython, loop, noisy_steps, problem
+from test_whole_controller import (
+    CHECKS,
+    WITH_EXTRA,
+    InPython,
+    loop,
+    noisy_steps,
+    policy,
+    problem,
+)
 
 from deployed import COMPILERS, STRICT, needs_compiler, observations, policy_of, with_faults
 from sb3_yann import Controller, export
@@ -307,11 +315,14 @@ class InALoop:
 
 
 @needs_library
-def test_with_its_estimator_it_is_the_controller_in_closed_loop(opened):
-    mpc, observer = problem()
-    instance, controller = opened(mpc, estimator=observer, checks=CHECKS)
+@pytest.mark.parametrize("extra", [False, True])
+def test_with_its_estimator_it_is_the_controller_in_closed_loop(opened, extra):
+    mpc, observer = problem(extra=extra)
+    given = policy(extra=True) if extra else mpc
+    checks = WITH_EXTRA if extra else CHECKS
+    instance, controller = opened(given, estimator=observer, checks=checks)
     steps = noisy_steps(400)
-    wanted, said = loop(InPython(controller), steps)
-    found, own = loop(InALoop(instance), steps)
+    wanted, said = loop(InPython(controller), steps, extra)
+    found, own = loop(InALoop(instance), steps, extra)
     np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)
     assert own == said

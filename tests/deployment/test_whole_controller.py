@@ -22,6 +22,7 @@ from sb3_yann import (
     Tracking,
     export,
     offset_free,
+    with_extra,
 )
 from sb3_yann._validation import Array
 from sb3_yann.deployment.controller import MODES, Status
@@ -37,8 +38,11 @@ BEGIN = np.array([52.0, 2.0, 297.0])
 
 
 @cache
-def problem(rates: bool = False) -> tuple[LinearMPC, StateEstimator]:
-    """Return an offset-free MPC of three states, two of them shown, with a measured load."""
+def problem(rates: bool = False, extra: bool = False) -> tuple[LinearMPC, StateEstimator]:
+    """Return an offset-free MPC of three states, two of them shown, with a measured load.
+
+    An extra signal, if there is one, lies between 0 and 1.
+    """
     model = LinearModel(A, B, 1.0, X_SS, U_SS, E=LOAD, d_ss=[1.0], C=C)
     mpc = LinearMPC(
         model,
@@ -53,12 +57,12 @@ def problem(rates: bool = False) -> tuple[LinearMPC, StateEstimator]:
         disturbances=DisturbanceBounds(0.0, 2.0),
         rate=RateLimits(-0.5, 0.5) if rates else None,
     )
-    return offset_free(mpc)
+    return offset_free(with_extra(mpc, 0, 1) if extra else mpc)
 
 
 @cache
-def policy(rates: bool = False) -> YannPolicy:
-    mpc = problem(rates)[0]
+def policy(rates: bool = False, extra: bool = False) -> YannPolicy:
+    mpc = problem(rates, extra)[0]
     mpc.explicit()
     return disturbed(mpc, 0.05, networks="shared")
 
@@ -82,17 +86,26 @@ def noisy_steps(count: int) -> list[tuple[Any, ...]]:
     return found
 
 
-CHECKS = Checks([-1e3] * 5, [1e3] * 5, missing=[2, 8, 0, 0, 0], hold=3, recover=4, late_after=1.95)
+def checks_of(size: int) -> Checks:
+    wide = np.full(size, 1e3)
+    missing = [2, 8, *[0] * (size - 2)]
+    return Checks(-wide, wide, missing=missing, hold=3, recover=4, late_after=1.95)
 
 
-def loop(controller: Any, steps: list[tuple[Any, ...]]) -> tuple[Array, list[tuple[int, int]]]:
+CHECKS = checks_of(5)
+WITH_EXTRA = checks_of(6)
+
+
+def loop(
+    controller: Any, steps: list[tuple[Any, ...]], extra: bool = False
+) -> tuple[Array, list[tuple[int, int]]]:
     """Return inputs (T, 2), and status and mode, of a plant that the model does not quite know."""
     x, u = BEGIN, U_SS
     inputs, said = [], []
-    for noise, load, reference, elapsed, request, manual, anew in steps:
+    for k, (noise, load, reference, elapsed, request, manual, anew) in enumerate(steps):
         if anew:
             controller.begin()
-        shown = np.array([*(C @ x + noise), *reference, load])
+        shown = np.array([*(C @ x + noise), *reference, load, *[np.sin(k) ** 2] * extra])
         u, status, mode = controller.step(shown, elapsed, request, u if anew else manual)
         inputs.append(u)
         said.append((status, mode))
@@ -146,16 +159,25 @@ class InStructuredText:
 
 
 @needs_compiler
-@pytest.mark.parametrize("rates", [False, True])
-@pytest.mark.parametrize("kind", ["problem", "policy"])
-def test_C_in_closed_loop_is_python_over_1000_samples(kind, rates, tmp_path) -> None:
-    mpc, observer = problem(rates)
-    given = mpc if kind == "problem" else policy(rates)
-    compiled = InC(given, tmp_path, estimator=observer, checks=CHECKS)
+@pytest.mark.parametrize(
+    ("kind", "rates", "extra"),
+    [
+        ("problem", False, False),
+        ("problem", True, False),
+        ("policy", False, False),
+        ("policy", True, False),
+        ("policy", False, True),
+    ],
+)
+def test_C_in_closed_loop_is_python_over_1000_samples(kind, rates, extra, tmp_path) -> None:
+    mpc, observer = problem(rates, extra)
+    given = mpc if kind == "problem" else policy(rates, extra)
+    checks = WITH_EXTRA if extra else CHECKS
+    compiled = InC(given, tmp_path, estimator=observer, checks=checks)
     python = InPython(compiled.compiled.controller)
     steps = noisy_steps(1000)
-    wanted, said = loop(python, steps)
-    found, own = loop(compiled, steps)
+    wanted, said = loop(python, steps, extra)
+    found, own = loop(compiled, steps, extra)
     np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)  # of a range of 4
     assert [each[0] for each in own] == [each[0] for each in said]
     met = Status(0)
@@ -166,16 +188,16 @@ def test_C_in_closed_loop_is_python_over_1000_samples(kind, rates, tmp_path) -> 
     assert sum(mode == 0 for _, mode in said) > 200  # a value of every seventh step is no fault
 
 
-@pytest.mark.parametrize("rates", [False, True])
-def test_structured_text_in_closed_loop_is_python(rates, tmp_path) -> None:
-    observer = problem(rates)[1]
-    options = {"estimator": observer, "checks": CHECKS}
-    export(policy(rates), tmp_path / "plant.npz", **options)
-    export(policy(rates), tmp_path / "plant.st", **options)
+@pytest.mark.parametrize(("rates", "extra"), [(False, False), (True, False), (False, True)])
+def test_structured_text_in_closed_loop_is_python(rates, extra, tmp_path) -> None:
+    given, observer = policy(rates, extra), problem(rates, extra)[1]
+    options = {"estimator": observer, "checks": WITH_EXTRA if extra else CHECKS}
+    export(given, tmp_path / "plant.npz", **options)
+    export(given, tmp_path / "plant.st", **options)
     block = InStructuredText((tmp_path / "plant.st").read_text())
     steps = noisy_steps(400)
-    wanted, said = loop(InPython(Controller.load(tmp_path / "plant.npz")), steps)
-    found, own = loop(block, steps)
+    wanted, said = loop(InPython(Controller.load(tmp_path / "plant.npz")), steps, extra)
+    found, own = loop(block, steps, extra)
     np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)
     assert own == said
 
@@ -234,6 +256,22 @@ def test_it_is_the_estimator_and_the_law_of_the_wrapped_env(tmp_path) -> None:
         found = observer.update(y, inputs[k - 1] - U_SS, [0.0]) if k else observer.reset(y)
         theta = [*(found[0] + X_SS), 51.0, 301.0, 1.0, *np.clip(found[1], low, high)]
         np.testing.assert_allclose(inputs[k], law.plant_input(np.array(theta)), atol=1e-9)
+
+
+def test_networks_see_an_extra_signal_beside_the_estimates(tmp_path) -> None:
+    given, observer = policy(extra=True), problem(extra=True)[1]
+    export(given, tmp_path / "plant.npz", estimator=observer)
+    controller = Controller.load(tmp_path / "plant.npz")
+    assert controller.obs_names == ("x[0]", "x[2]", "r[0]", "r[1]", "d[0]", "d[1]")
+    y = np.array([50.5, 299.0])
+    inputs = []
+    for feed in (0.0, 1.0):
+        controller.reset()
+        inputs.append(controller([*y, 51.0, 301.0, 1.0, feed]))
+        x_hat, d_hat = observer.reset(y - C @ X_SS)
+        theta = np.array([*(x_hat + X_SS), 51.0, 301.0, 1.0, feed, *d_hat])
+        np.testing.assert_allclose(inputs[-1], given.predict(theta)[0], atol=1e-5)
+    assert np.abs(inputs[1] - inputs[0]).max() > 1e-3
 
 
 def test_a_start_goes_on_from_the_plants_present_input(tmp_path) -> None:

@@ -18,15 +18,19 @@ from sb3_yann import (
     Controller,
     DisturbanceBounds,
     DisturbanceObserver,
+    ImprovementGuard,
     LinearModel,
     LinearMPC,
+    NoActionNoise,
     NonFiniteWarning,
     PlantTwin,
     RateLimits,
     Tracking,
     export,
+    headroom,
     improve,
     offset_free,
+    report,
     retarget,
     with_extra,
 )
@@ -269,10 +273,14 @@ def test_retarget_keeps_what_was_learnt_of_a_signal() -> None:
     np.testing.assert_allclose(apart[0][inside], apart[1][inside], atol=1e-4)
 
 
-def test_improve_learns_what_a_signal_does() -> None:
-    """In a simulator and from a log: most of what the MPC loses that does not know the feed."""
+def test_improve_learns_what_a_signal_does(tmp_path: Any) -> None:
+    """In a simulator and from a log: most of what the MPC loses that does not know the feed.
+
+    Headroom is that of who knows it, the guard keeps what was learnt, the page names the signal.
+    """
     mpc = with_extra(tank(), *FEED)
-    found = improve(mpc, Tank, rounds=2, updates=1500)
+    model = build(problem=mpc, extra=0)
+    found = improve(model, Tank, rounds=2, updates=1500)
     assert found.accepted
     costs = []
     told = LinearModel([[0.8]], [[0.5]], dt=1.0, x_ss=[10], u_ss=[3], E=[[0.02]], d_ss=[295])
@@ -311,6 +319,13 @@ def test_improve_learns_what_a_signal_does() -> None:
     assert least < 0.8 * base
     for each in costs:
         assert base - each > 0.5 * (base - least)
+    room = headroom(mpc, Tank, n_starts=5)
+    assert room.total > 0.2
+    guard = ImprovementGuard(Tank, n_eval_episodes=10, n_new_starts=0, n_final_starts=10)
+    model.learn(25, callback=[NoActionNoise(), guard])
+    assert "accepted last is the MPC" not in guard.summary()
+    page = report(model, tmp_path / "tank.html", env=Tank(), headroom=room, seeds=range(3))
+    assert "d[0]" in page.read_text(encoding="utf-8")
 
 
 def test_an_observer_is_told_what_its_model_ignores() -> None:
