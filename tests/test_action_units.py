@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.control.mpc.misread_bounds import misread_entry
 from sb3_yann.units import ActionUnits
 
 MODEL = LinearModel(np.eye(2) / 2, np.eye(2), 1.0, x_ss=[1, 0], u_ss=[300, -2])
@@ -40,10 +39,10 @@ COLD = LinearMPC(
     "shown", [[0, 0], [2.5, 9], [1, 0]], ids=["inside", "outside anyway", "at rest"]
 )
 def test_plant_units_are_not_taken_for_deviations(shown: list[float]) -> None:
-    assert misread_entry(MPC, np.array([shown])) is None
+    assert MPC.shown_as_deviation(np.array([shown])) == ""
 
 
 def test_the_state_that_lies_at_zero_is_found() -> None:
-    assert misread_entry(COLD, np.array([[0.2, -0.5], [-0.2, 1]])) == 1
-    assert misread_entry(COLD, np.array([[1.2, -30.5]])) is None
-    assert misread_entry(COLD, np.zeros((0, 2))) is None
+    assert COLD.shown_as_deviation(np.array([[0.2, -0.5], [-0.2, 1]])).startswith("x[1] = -0.5 is")
+    assert COLD.shown_as_deviation(np.array([[1.2, -30.5]])) == ""
+    assert COLD.shown_as_deviation(np.zeros((0, 2))) == ""

@@ -72,7 +72,7 @@ def two_tanks() -> LinearMPC:
 
 
 def too_large() -> None:
-    with patch("sb3_yann.control.mpc.choice.LARGE", 0):
+    with patch("sb3_yann.control.mpc.linear_mpc.LARGE", 0):
         two_tanks().law()
 
 

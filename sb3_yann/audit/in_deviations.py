@@ -14,7 +14,6 @@ from gymnasium import spaces
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
-from sb3_yann.control.mpc.misread_bounds import misread_in_words
 from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers.spaces import require_vector
 
@@ -125,7 +124,7 @@ def require_theta_shown(problem: LinearMPC, theta: Array) -> None:
     Nor may references and measured disturbances lie beyond their box in nearly all steps.
     """
     shown = problem.units.to_plant(theta)
-    if words := misread_in_words(problem, shown):
+    if words := problem.shown_as_deviation(shown):
         raise ValueError(f"The env is not that of the MPC. {words}")
     room = 1e-3 * problem.theta_half
     most = 0.9  # share of the rows that must speak for it

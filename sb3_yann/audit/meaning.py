@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.audit.reward import CostMismatchWarning
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.rollout import Trajectories
 from sb3_yann.wrappers import SetPoint
 

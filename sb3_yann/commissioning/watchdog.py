@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_array
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.log import pieces
 from sb3_yann.twin.plant_twin import PlantTwin

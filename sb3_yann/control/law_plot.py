@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._drawing import COLORS, REST, axes_or_new, legend_beside
 from sb3_yann._validation import Array, check_array, half_widths
-from sb3_yann.control.model.labels import labels_of, with_units
+from sb3_yann.control.linear_system import labels_of, with_units
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,13 +1,14 @@
-"""The matrices of a linear plant about an operating point, and their sampling."""
+"""The matrices of a linear plant about an operating point: sampling, names and units."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sb3_yann._validation import Array, ReadOnlyArrays
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_positive, is_text
 
 LARGEST_EXPONENT = 709.0
 """Beyond it the exponential function exceeds what numbers hold."""
@@ -126,3 +127,225 @@ def _why_not_sampled(A: Array, dt: float) -> str:
         f"to be sampled: its pole {shown:g} times dt is {shown * dt:g}. Look at the unit of time, "
         f"sample about every {1 / abs(pole):.2g}, or leave the mode out of the model."
     )
+
+
+Units = Mapping[str, str] | Sequence[str]
+
+
+def as_names(what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
+    """Return so many different names, or none."""
+    if isinstance(given, str) or not all(isinstance(each, str) for each in given):
+        raise TypeError(f"{what} = {given!r} must be a list of str, one for each of the {size}.")
+    found = tuple(given)
+    if found and (len(found) != size or len(set(found)) != size or not all(found)):
+        raise ValueError(
+            f"{what} = {list(found)} must be {size} different names, or none: leave it out."
+        )
+    _require_text(what, found)
+    return found
+
+
+def _require_text(what: str, given: Sequence[str]) -> None:
+    """Raise where a name holds what files in XML, HTML and UTF-8 cannot."""
+    for each in given:
+        if not all(map(is_text, each)):
+            raise ValueError(
+                f"{what}: {each!r} holds a character that is no text. Leave out line ends, escape "
+                "sequences and other control characters."
+            )
+
+
+def require_different(labels: Sequence[str]) -> None:
+    """Raise ValueError if a name stands for a state and for an input."""
+    if both := sorted({each for each in labels if labels.count(each) > 1}):
+        raise ValueError(f"{both} name a state and an input: each needs a name of its own.")
+
+
+def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
+    """Return the unit of each state and input, "" where there is none.
+
+    Labels are the names of both, ``x[0]`` where there are no others.
+    """
+    if isinstance(given, Mapping):
+        if unknown := [each for each in given if each not in labels]:
+            raise ValueError(f"units has {unknown}, but the names are {list(labels)}.")
+        given = [given.get(each, "") for each in labels]
+    if isinstance(given, str) or not all(isinstance(each, str) for each in given):
+        raise TypeError(f"units = {given!r} must map names to str, or list one for each.")
+    found = tuple(given)
+    if found and len(found) != len(labels):
+        raise ValueError(f"units = {list(found)} must have one entry for each of {list(labels)}.")
+    _require_text("units", found)
+    return found if any(found) else ()
+
+
+def as_unit(what: str, given: str) -> str:
+    """Return one unit, which may be empty."""
+    if not isinstance(given, str):
+        raise TypeError(f"{what} = {given!r} must be a str, such as 's'.")
+    _require_text(what, [given])
+    return given
+
+
+def labels_of(model: LinearSystem) -> tuple[list[str], list[str]]:
+    """Return the names of states and of inputs, ``x[0]`` and ``u[0]`` where none is given."""
+    plain = names((model.n_states, model.n_inputs))
+    n = model.n_states
+    return list(model.state_names) or plain[:n], list(model.input_names) or plain[n:]
+
+
+def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
+    """Return the names of states and inputs, each with its unit in parentheses where it has one."""
+    states, inputs = labels_of(model)
+    units = model.units or ("",) * (len(states) + len(inputs))
+    whole = [
+        f"{name} ({unit})" if unit else name
+        for name, unit in zip([*states, *inputs], units, strict=True)
+    ]
+    return whole[: len(states)], whole[len(states) :]
+
+
+def missing_observer(model: LinearSystem) -> str:
+    """Return what a law or a policy of this model lacks; empty where nothing is estimated."""
+    if not model.estimated:
+        return ""
+    which = [f"d[{i}]" for i in model.estimated]
+    verb = "is" if len(which) == 1 else "are"
+    return (
+        f"{', '.join(which)} {verb} estimated: the DisturbanceObserver is no part of the law or "
+        "the policy. Whoever calls it runs the observer, and passes its x_hat and d_hat."
+    )
+
+
+def past_inputs(model: LinearSystem) -> list[tuple[int, str]]:
+    """Return the number of the input, and the lag as in ``(k-1)``, of each last state named so."""
+    inputs, found = labels_of(model)[1], list[tuple[int, str]]()
+    for label in reversed(model.state_names):
+        name, lag, rest = label.partition("(k-")
+        if name not in inputs or not rest.removesuffix(")").isdigit():
+            break
+        found.insert(0, (inputs.index(name), lag + rest))
+    return found
+
+
+def completed(
+    model: LinearSystem,
+    past: Sequence[tuple[int, str]],
+    state_names: Sequence[str],
+    input_names: Sequence[str],
+    units: Units,
+) -> tuple[Sequence[str], Units]:
+    """Return names of states and units with those of inputs on their way, where they are left out.
+
+    ``past`` are the last states of a model with dead time: numbers of inputs, and lags.
+    """
+    own, m = model.n_states - len(past), model.n_inputs
+    named = len(input_names) == m
+    if not isinstance(state_names, str) and len(state_names) == own and own:
+        inputs = list(input_names) if named else labels_of(model)[1]
+        state_names = [*state_names, *(inputs[j] + lag for j, lag in past)]
+    if not isinstance(units, str | Mapping) and len(units) == own + m:
+        of_inputs = list(units[own:])
+        units = [*units[:own], *(of_inputs[j] for j, _ in past), *of_inputs]
+    return state_names, units
+
+
+def from_control(
+    system: Any, dt: float | None, disturbances: Sequence[int | str]
+) -> tuple[Array, Array, Array, Array | None, float, list[str]]:
+    """Return A, B, E, C, the sampling time and notes; see `LinearModel.from_statespace`."""
+    import control
+
+    if not isinstance(system, control.StateSpace):
+        raise TypeError(
+            f"system = {system!r} must be a control.StateSpace. Convert a transfer function with "
+            "control.ss(...), but mind that its states then are no measured quantities."
+        )
+    step, continuous = _sample_time(system.dt, dt)
+    chosen = [_input(system, each) for each in disturbances]
+    inputs = [i for i in range(system.ninputs) if i not in chosen]
+    A, both = check_array("A", system.A, ("n", "n")), check_array("B", system.B, ("n", "m"))
+    B, E = both[:, inputs], both[:, chosen]
+    if continuous:
+        A, B, E = zero_order_hold(A, B, E, step)
+    sampled = "sampled with a zero-order hold" if continuous else "taken as it is, discrete"
+    notes = [f"From a control.StateSpace, {sampled}.", *_output_notes(system, A)]
+    C = None if np.array_equal(system.C, np.eye(len(A))) else check_array("C", system.C, ("q", "n"))
+    return A, B, E, C, step, notes
+
+
+def to_control(model: LinearSystem) -> Any:
+    """Return the `control.StateSpace` of `LinearModel.to_statespace`."""
+    import control
+
+    states, inputs = labels_of(model)
+    driven = np.hstack([model.B, model.E])
+    labels = [*inputs, *names((0, 0, model.n_disturbances))]
+    plain = {
+        "states": [_label(each) for each in states],
+        "inputs": [_label(each) for each in labels],
+    }
+    C = model.shown
+    if model.C is None:
+        plain["outputs"] = plain["states"]
+    D = np.zeros((len(C), driven.shape[1]))
+    return control.ss(model.A, driven, C, D, model.dt, **plain)
+
+
+def _label(name: str) -> str:
+    """Return a name that python-control takes: it forbids dots."""
+    return name.replace(".", "_")
+
+
+def _sample_time(own: float | bool | None, dt: float | None) -> tuple[float, bool]:
+    """Return the sampling time, and whether the system is continuous.
+
+    python-control's 0 is continuous, True discrete without a sampling time, None not stated.
+    """
+    if own is None:
+        raise ValueError(
+            "system.dt is None: continuous or discrete? Make it with control.ss(A, B, C, D, 0) or "
+            "control.ss(A, B, C, D, dt)."
+        )
+    given = None if dt is None else check_positive("dt", dt)
+    if own is not True and own > 0:
+        if given is not None and not np.isclose(given, own, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"dt = {given:g}, but the system is discrete with dt = {own:g}, and is not sampled "
+                "anew. Leave dt out, or pass the continuous system."
+            )
+        return float(own), False
+    if given is None:
+        kind = "discrete, without a sampling time" if own is True else "continuous"
+        raise ValueError(f"dt is not given, and the system is {kind}. Pass dt=...")
+    return given, own is not True
+
+
+def _input(system: Any, name: int | str) -> int:
+    """Return the number of an input."""
+    labels = list(system.input_labels)
+    if isinstance(name, str) and name in labels:
+        return int(labels.index(name))
+    if isinstance(name, (int, np.integer)) and 0 <= name < len(labels):
+        return int(name)
+    raise ValueError(f"disturbances: {name!r} is no input, neither number nor label, of {labels}.")
+
+
+def _output_notes(system: Any, A: Array) -> list[str]:
+    """Return notes on outputs that are not the states."""
+    import control
+
+    C, n = np.asarray(system.C), len(A)
+    notes = []
+    if np.any(system.D):
+        notes.append("D is not zero and was dropped: the outputs it feeds are not used.")
+    if np.array_equal(C, np.eye(n)):
+        return notes
+    rank = int(np.linalg.matrix_rank(control.obsv(A, C)))
+    seen = f", which is not possible: the outputs show {rank} of {n} directions of the state"
+    impossible = seen if rank < n else ""
+    notes.append(
+        "C is not the identity: the law depends on the states, not on the outputs y = C x. "
+        f"Estimate them by a StateEstimator{impossible}."
+    )
+    return notes

@@ -24,10 +24,20 @@ from sb3_yann.control.explicit.parametric_qp import (
     slack_costs,
     solvable,
 )
-from sb3_yann.control.law import INFEASIBLE, PlantLaw, as_points, bounds_of
+from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine, PlantLaw, as_points, bounds_of
 
 if TYPE_CHECKING:
     from sb3_yann._numba import Integers
+
+
+class OnlineLawWarning(UserWarning):
+    """A problem has no explicit law within the budget, and its program is solved online instead.
+
+    Examples
+    --------
+    >>> issubclass(OnlineLawWarning, UserWarning)
+    True
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,6 +321,10 @@ class OnlineLaw(PlantLaw):
         """Leave out what follows from the rest, and what is remembered."""
         derived = ("dual", "known", "program", "scaled", "half", "_first_rows", "_has_warned")
         return {name: each for name, each in vars(self).items() if name not in derived}
+
+
+Law = PiecewiseAffine | OnlineLaw
+LAWS = ("auto", "explicit", "online")
 
 
 @dataclass(frozen=True, eq=False)

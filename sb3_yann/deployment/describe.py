@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine, StateEstimator
-from sb3_yann.control.model.labels import labels_of, missing_observer
+from sb3_yann.control.linear_system import labels_of, missing_observer
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMATS

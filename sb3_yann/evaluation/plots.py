@@ -17,7 +17,7 @@ from sb3_yann._validation import Array, check_array, check_choice, check_type
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.law_plot import plot_law
-from sb3_yann.control.model.labels import labels_of, with_units
+from sb3_yann.control.linear_system import labels_of, with_units
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.rollout import Trajectories, as_played
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.compare import less_safe
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
-from sb3_yann.control.mpc.offset_free import SHARE
+from sb3_yann.control.mpc.augmented import SHARE
 from sb3_yann.improvement.gains import UNKNOWN, Headroom, gain, verdict_of
 from sb3_yann.improvement.model import SimulatorModel, task_of
 from sb3_yann.improvement.simulator import OutOfStepsError, Simulator, of_law

@@ -17,8 +17,8 @@ from torch import nn
 
 from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.law import PiecewiseAffine
-from sb3_yann.control.mpc.choice import Law
-from sb3_yann.control.mpc.kept_set import KeptSet
+from sb3_yann.control.mpc.invariant_sets import KeptSet
+from sb3_yann.control.online import Law
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
 Rate = tuple[Array, Array]

@@ -17,7 +17,6 @@ from torch import nn
 
 from sb3_yann._validation import Array, check_int
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.mpc.misread_bounds import misread_in_words
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.observations import (
@@ -283,7 +282,7 @@ def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
     theta : ndarray, shape (batch, n_theta)
         What the policy made of its first observations, in deviations.
     """
-    if words := misread_in_words(problem, problem.units.to_plant(theta)):
+    if words := problem.shown_as_deviation(problem.units.to_plant(theta)):
         warnings.warn(words, stacklevel=4)
 
 

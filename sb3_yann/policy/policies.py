@@ -29,7 +29,7 @@ from sb3_yann._validation import (
 )
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
-from sb3_yann.control.mpc.choice import LAWS
+from sb3_yann.control.online import LAWS
 from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import checks, sb3_hooks

@@ -10,7 +10,7 @@ from scipy import stats
 from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_in_words
 from sb3_yann.compare import INPUT_STEP, less_safe
-from sb3_yann.control.model.labels import with_units
+from sb3_yann.control.linear_system import with_units
 from sb3_yann.evaluation.plots import (
     inputs_of,
     loops_figure,

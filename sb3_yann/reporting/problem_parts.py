@@ -13,7 +13,7 @@ import torch as th
 from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.model.labels import labels_of, missing_observer, with_units
+from sb3_yann.control.linear_system import labels_of, missing_observer, with_units
 from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
 from sb3_yann.reporting.html import Html, join, lines, number, paragraph, picture, table, tag

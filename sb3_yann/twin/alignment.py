@@ -21,7 +21,7 @@ from scipy.optimize import least_squares, linear_sum_assignment
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.dynamics import Coordinates, law_of
 from sb3_yann.twin.log import Episode
 

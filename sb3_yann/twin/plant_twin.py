@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.control import LinearMPC, StateEstimator
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.log import SECONDS, Log
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import fit_ensemble

@@ -8,7 +8,7 @@ from decimal import ROUND_CEILING, Context
 import numpy as np
 
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.log import Episode, records
 from sb3_yann.twin.trust import ALONE, Trust
 

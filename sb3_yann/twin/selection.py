@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.forecast import Judge, surely_worse
 from sb3_yann.twin.log import Episode

@@ -9,7 +9,7 @@ from stable_baselines3 import DDPG, TD3
 from policy_samples import POLICIES, build, scalar_mpc, starts, updates, with_full_buffer
 from sb3_yann import LinearMPC, OnlineLawWarning, YannPolicy
 from sb3_yann.control import OnlineLaw
-from sb3_yann.control.mpc import choice
+from sb3_yann.control.mpc import linear_mpc
 from sb3_yann.networks import SharedYannLayer
 from weights import is_mpc
 
@@ -53,7 +53,7 @@ def test_it_is_saved_with_its_law_and_loaded_without_a_search(options, tmp_path,
 def test_the_search_that_found_no_law_is_not_repeated_when_a_model_is_loaded(
     tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(choice, "REGIONS", 1)
+    monkeypatch.setattr(linear_mpc, "REGIONS", 1)
     with pytest.warns(OnlineLawWarning, match="law='online'"):
         model = build(DDPG, scalar_mpc())
     assert isinstance(model.actor.mu, SharedYannLayer)

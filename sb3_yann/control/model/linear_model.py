@@ -18,21 +18,23 @@ from sb3_yann._validation import (
     to_float,
 )
 from sb3_yann.control.identification.fit import fit_log
-from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
-from sb3_yann.control.linearization.dynamics import linearize_dynamics
-from sb3_yann.control.linearization.linearize import linearize_env
-from sb3_yann.control.model.labels import (
+from sb3_yann.control.linear_system import (
+    LinearSystem,
     Units,
     as_names,
     as_unit,
     as_units,
     completed,
+    from_control,
+    names,
     past_inputs,
     require_different,
+    to_control,
     with_units,
+    zero_order_hold,
 )
+from sb3_yann.control.linearization.linearize import linearize_dynamics, linearize_env
 from sb3_yann.control.model.report import describe
-from sb3_yann.control.model.statespace import from_control, to_control
 from sb3_yann.log import Arrays, Log
 
 if TYPE_CHECKING:

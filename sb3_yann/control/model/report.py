@@ -6,8 +6,7 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.linear_system import LinearSystem, combination
-from sb3_yann.control.model.labels import labels_of, with_units
+from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
 UNREACHED, HARDLY_REACHED = 1e-6, 1e-3

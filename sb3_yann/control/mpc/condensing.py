@@ -12,7 +12,7 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.problem import MPCProblem
 
 GROWTH = 1e3

@@ -18,7 +18,7 @@ from sb3_yann._validation import (
     check_symmetric,
     to_float,
 )
-from sb3_yann.control.mpc._arguments import Bounds, Given, as_softness
+from sb3_yann.control.mpc.arguments import Bounds, Given, as_softness
 
 Outputs = ArrayLike | Sequence[int]
 HalfSpaces = tuple[ArrayLike, ArrayLike]
@@ -450,7 +450,7 @@ class Terminal(ReadOnlyArrays):
         ``(F, g)`` of shapes (c, n) and (c,) for ``F x_N <= g``, or (c, n_theta) for
         ``F theta_N <= g`` (its u_prev is ``u_{N-1}``). "invariant" is the set in which the gain of
         the cost keeps all hard constraints for ever:
-        :func:`~sb3_yann.control.mpc.terminal_set.invariant_set`.
+        :func:`~sb3_yann.control.mpc.invariant_sets.invariant_set`.
 
     Examples
     --------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann import _validation as check
 from sb3_yann._validation import Array, check_array, check_bounds, check_symmetric, to_float
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
+from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, SolveBudget
+from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
 from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine
@@ -22,11 +24,9 @@ from sb3_yann.control.linearization.simulator import borrow
 from sb3_yann.control.model.identify import Identified
 from sb3_yann.control.model.identify_outputs import IdentifiedOutputs
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.mpc import _arguments as arguments
-from sb3_yann.control.mpc import reachability, simulation
-from sb3_yann.control.mpc import value as near_rest
-from sb3_yann.control.mpc._arguments import Given
-from sb3_yann.control.mpc.choice import LAWS, Law, choose
+from sb3_yann.control.mpc import arguments, at_rest
+from sb3_yann.control.mpc.arguments import Given
+from sb3_yann.control.mpc.at_rest import Value
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
@@ -41,18 +41,23 @@ from sb3_yann.control.mpc.groups import (
     parametric_box,
     parametric_names,
 )
-from sb3_yann.control.mpc.kept_set import KeptSet, kept_set
-from sb3_yann.control.mpc.misread_bounds import Range, warn_of_misread_bounds
+from sb3_yann.control.mpc.invariant_sets import KeptSet, hard_rows, invariant_set, kept_set
 from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
-from sb3_yann.control.mpc.terminal_set import hard_rows, invariant_set
-from sb3_yann.control.mpc.value import Value
-from sb3_yann.control.online import OnlineLaw, steepness
+from sb3_yann.control.online import LAWS, Law, OnlineLaw, OnlineLawWarning, steepness
 
 if TYPE_CHECKING:
     from sb3_yann.control.linearization.simulator import Maker
 
 G = TypeVar("G")
+EFFORT = 1.0
+"""What "auto" spends on an explicit law, in what about a second does, by what it counts."""
+REGIONS = 5000
+"""The most regions of a law that "auto" takes."""
+LARGE = 50_000
+"""Constraints times parameters beyond which a single region takes long, and none is looked for."""
+ONLINE_CHOSEN = "_online_chosen"
+"""Notes in a problem that its online law was chosen, and travels with it."""
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -201,13 +206,15 @@ class LinearMPC(MPCProblem):
         fallback = arguments.softened_box(x, soft.x)
         theta = arguments.theta_box(layout, (theta_min, theta_max), fallback, rest)
         states = theta[0][:n], theta[1][:n]
-        ranges = [
-            Range("x", *x, model.x_ss), Range("theta", *states, model.x_ss),
-            Range("u", *u, model.u_ss), Range("d", d.d_min, d.d_max, model.d_ss),
-            Range("r", tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
-            Range("y", outputs.y_min, outputs.y_max, outputs.C @ model.x_ss),
-        ]  # fmt: skip
-        warn_of_misread_bounds(model, ranges, layout.has_constants)
+        ranges = {
+            "x": (*x, model.x_ss),
+            "theta": (*states, model.x_ss),
+            "u": (*u, model.u_ss),
+            "d": (d.d_min, d.d_max, model.d_ss),
+            "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
+            "y": (*y, outputs.C @ model.x_ss),
+        }
+        arguments.warn_of_misread_bounds(model, ranges, layout.has_constants)
         arguments.warn_of_unused_softness(soft.x, x, states)
         arguments.warn_of_drift(model, *states)
         checked = (
@@ -282,14 +289,26 @@ class LinearMPC(MPCProblem):
 
         A theta0 in deviations, where the plant has others, is refused.
         """
-        return simulation.simulate(self, self.law(), theta0, steps)
+        law = self.law()
+        shown = check_array("theta0", theta0, (self.n_theta,))
+        if words := self.shown_as_deviation(shown[None]):
+            raise ValueError(f"theta0 = {shown.tolist()}: {words}")
+        count = check.check_int("steps", steps, hint="It counts the inputs that are played.")
+        A, B = self.prediction
+        thetas = np.empty((count + 1, self.n_theta))
+        inputs = np.empty((count, self.model.n_inputs))
+        thetas[0] = self.units.to_deviations(shown)
+        for k in range(count):
+            inputs[k] = law(thetas[k])
+            thetas[k + 1] = A @ thetas[k] + B @ inputs[k]
+        return self.units.to_plant(thetas), self.units.input_to_plant(inputs)
 
     def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:
         """Tell whether the steady state for r (p,) and d (d,) lies within the bounds of x, u and y.
 
         Both may be batches; None is the operating point. Soft bounds count too.
         """
-        return reachability.is_reachable(self, r, d)
+        return at_rest.is_reachable(self, r, d)
 
     def steady_state(self, r: Given = None, d: Given = None) -> tuple[Array, Array]:
         """Return x_s (n,) and u_s (m,) for the reference r (p,) and disturbance d (d,).
@@ -302,7 +321,7 @@ class LinearMPC(MPCProblem):
         ValueError
             If it lies beyond a bound of x, u or y.
         """
-        return reachability.steady_state(self, r, d)
+        return at_rest.steady_state(self, r, d)
 
     def stage_cost(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the stage cost, without penalties, at theta (..., n_theta) and u (..., m)."""
@@ -350,7 +369,7 @@ class LinearMPC(MPCProblem):
         region in which the model rests under the law, and needs a gamma below 1.
         """
         gamma = check.check_discount(gamma)  # before the law, which may take long
-        return near_rest.value(self.deviations, self.law(), gamma)
+        return at_rest.value(self.deviations, self.law(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
         """Return M (n_theta + m, n_theta + m): ``[theta; u]' M [theta; u]`` is the cost of u now.
@@ -363,7 +382,7 @@ class LinearMPC(MPCProblem):
     def state_action_terms(self, gamma: float) -> Value:
         """Return the terms of the same cost of ``[theta; u]``, as :meth:`value_terms` does."""
         gamma = check.check_discount(gamma)
-        return near_rest.state_action_value(self.deviations, self.law(), gamma)
+        return at_rest.state_action_value(self.deviations, self.law(), gamma)
 
     def explicit(
         self,
@@ -439,7 +458,35 @@ class LinearMPC(MPCProblem):
         :class:`OnlineLawWarning`. The effort is counted, not clocked: the choice is the same on
         every machine, whatever else that does.
         """
-        return choose(self, self._laws, check.check_choice("kind", kind, LAWS))
+        check.check_choice("kind", kind, LAWS)
+        if kind == "auto" and self._laws:
+            return next(iter(self._laws.values()))
+        if kind == "explicit":
+            return self.explicit()
+        if kind == "auto" and ONLINE_CHOSEN not in vars(self):
+            found = self._found_soon()
+            if isinstance(found, PiecewiseAffine):
+                return found
+            warnings.warn(
+                f"The program will be solved online, at each point. {found} To skip the search, "
+                "and this warning, choose problem.law('online'), or law='online' of a policy.",
+                OnlineLawWarning,
+                stacklevel=2,
+            )
+        vars(self)[ONLINE_CHOSEN] = True
+        return self.online()
+
+    def _found_soon(self) -> PiecewiseAffine | str:
+        """Return the explicit law if it is found within a small budget, else why it is not."""
+        rows, n = self.condensed().S.shape
+        if rows * n > LARGE:
+            return f"It has {rows} constraints on {n} parameters, too many to look for regions."
+        try:
+            return self._solved(SolveBudget(region_limit=REGIONS, effort_limit=EFFORT))
+        except ExplicitLimitError as error:
+            return f"{error} Or call problem.explicit() before, which has no limit by default."
+        except ExplicitSolutionError as error:
+            return str(error)
 
     @cached_property
     def _online(self) -> OnlineLaw:

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
-from sb3_yann.control.model.labels import labels_of, with_units
+from sb3_yann.control.linear_system import labels_of, with_units
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.error_coordinates import ErrorSystem, error_system
 from sb3_yann.control.mpc.groups import (
@@ -261,6 +261,32 @@ class MPCProblem(ReadOnlyArrays):
             previous = inputs[: self.layout.n_previous]
             found[self.layout.previous] = [f"previous {each}" for each in previous]
         return tuple(found)
+
+    def shown_as_deviation(self, shown: ArrayLike) -> str:
+        """Return which entry of theta (steps, n_theta) is shown as a deviation; empty for none.
+
+        Nearly all rows lie outside the box of the law, and inside with the operating point put on.
+        All states must say so together, and lie nearer to zero than to the operating point.
+        """
+        rows, point = np.asarray(shown, np.float64), self.theta_ss
+        if not len(rows) or not np.any(point):
+            return ""
+        reach = self.theta_half
+        low, high = self.theta_min - 1e-6 * reach, self.theta_max + 1e-6 * reach
+        within = [(low <= each) & (each <= high) for each in (rows, rows + point)]
+        n, end = self.model.n_states, self.layout.previous.start
+        for first, last in ((0, n), *((i, i + 1) for i in range(n, end) if point[i])):
+            is_in, would_be = (np.mean(each[:, first:last].all(axis=1)) for each in within)
+            # By how much nearer to zero than to the operating point, in half-widths.
+            nearer = np.mean((np.abs(rows - point) / 2 - np.abs(rows)) / reach, axis=0)[first:last]
+            i = first + int(np.argmax(nearer))
+            if is_in <= 0.1 and would_be >= 0.9 and (first >= n or nearer.max() > 0):
+                return (
+                    f"{self.labels()[i]} = {rows[0, i]:.6g} is shown, and the operating point is "
+                    f"{point[i]:.6g}: this is a deviation, and the problem is in plant units. Show "
+                    "what the plant shows, or leave x_ss and u_ss out of the model."
+                )
+        return ""
 
     @cached_property
     def theta_half(self) -> Array:

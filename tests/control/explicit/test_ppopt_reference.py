@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from sample_problems import small_mpc
-from sb3_yann.control.explicit.ppopt_reference import _solve_lp
+from sb3_yann.control.explicit.solve import _solve_lp
 
 BOX = np.vstack([np.eye(2), -np.eye(2)])
 

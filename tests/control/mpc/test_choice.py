@@ -15,7 +15,7 @@ from sb3_yann import RateLimits
 from sb3_yann.control import LinearMPC, OnlineLaw, OnlineLawWarning, PiecewiseAffine
 from sb3_yann.control.explicit import budget, solve
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
-from sb3_yann.control.mpc import choice
+from sb3_yann.control.mpc import linear_mpc
 
 
 def test_auto_is_the_explicit_law_where_it_is_soon_found() -> None:
@@ -23,7 +23,7 @@ def test_auto_is_the_explicit_law_where_it_is_soon_found() -> None:
 
 
 def test_auto_is_the_online_law_beyond_the_budget_and_says_so_once(monkeypatch) -> None:
-    monkeypatch.setattr(choice, "REGIONS", 2)
+    monkeypatch.setattr(linear_mpc, "REGIONS", 2)
     mpc = servo()
     with pytest.warns(OnlineLawWarning, match="more than region_limit = 2") as caught:
         law = mpc.law()
@@ -51,7 +51,7 @@ def test_a_law_that_fails_its_check_is_not_taken(monkeypatch) -> None:
 
 
 def test_what_was_solved_is_taken_whatever_its_size(monkeypatch) -> None:
-    monkeypatch.setattr(choice, "REGIONS", 2)
+    monkeypatch.setattr(linear_mpc, "REGIONS", 2)
     mpc = servo()
     explicit = mpc.explicit()
     assert mpc.law() is explicit
@@ -68,7 +68,7 @@ def test_what_was_chosen_is_kept(monkeypatch) -> None:
 
 
 def test_auto_gives_up_by_what_it_counts_and_not_by_the_clock(monkeypatch) -> None:
-    monkeypatch.setattr(choice, "EFFORT", 0.01)
+    monkeypatch.setattr(linear_mpc, "EFFORT", 0.01)
     messages = set()
     for speed in (0.0, 100.0):
         clock = itertools.count()

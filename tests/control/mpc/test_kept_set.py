@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 import general_problems
 import sample_problems
 from sb3_yann import LinearModel, LinearMPC, Terminal, Tracking
-from sb3_yann.control.mpc.kept_set import kept_set
+from sb3_yann.control.mpc.invariant_sets import kept_set
 
 
 def test_of_an_unstable_mode_it_ends_where_inputs_no_longer_hold_it():

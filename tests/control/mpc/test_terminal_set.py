@@ -8,7 +8,7 @@ import pytest
 from general_problems import INVARIANT_SET, LOADED, RATED, RATES, servo, two_tanks
 from sample_problems import UNSTABLE, input_bounds_only, small_mpc
 from sb3_yann import LinearModel, LinearMPC, OutputBounds, RateLimits, Terminal
-from sb3_yann.control.mpc import terminal_set as invariant
+from sb3_yann.control.mpc import invariant_sets as invariant
 
 INVARIANT = {
     "regulator": lambda: small_mpc(**INVARIANT_SET),

@@ -1,13 +1,16 @@
-"""The invariant terminal set: where the terminal gain keeps every hard constraint for ever."""
+"""Sets in which hard bounds can be kept for ever: by the terminal gain, and by any inputs."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, ReadOnlyArrays
 from sb3_yann.control import lqr
 from sb3_yann.control.mpc.problem import MPCProblem
+from sb3_yann.control.polyhedra import bounded_region, farthest_points
 
 MARGIN = 0.01
 """How far inside the bounds steady states must lie, relative to the bounds."""
@@ -153,3 +156,168 @@ def _is_redundant(row: Array, bound: float, A: Array, b: Array) -> bool:
     A, b = np.vstack([A, row]), np.append(b, bound + 1)
     best = optimize.linprog(-row, A_ub=A, b_ub=b, bounds=[(None, None)] * len(row))
     return bool(best.status == 0 and -best.fun <= bound + 1e-9)
+
+
+FEW = 1e-9
+"""A column or a radius, in half-widths, that counts as zero."""
+ROOM = 1e-5
+"""Half-widths that inputs which the MPC does not plan leave from one step to the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeptSet(ReadOnlyArrays):
+    """Half-spaces ``F theta <= g`` in deviations: in all of them hard bounds can be kept.
+
+    Attributes
+    ----------
+    F, g : ndarray, shapes (q, n_theta) and (q,)
+        None for a problem without hard bounds of states or outputs. Slacks are in half-widths:
+        a state that is off by as much moves them by no more than 1.
+    ahead : ndarray, shape (q, n_theta + m + 1)
+        Rows ``[a, b, c]``: where ``a theta + b u <= c`` the predicted next theta lies in the set,
+        and mixed bounds and those that change at run time hold.
+    steps : int
+        From each theta in it some inputs within bounds keep the bounds for so many steps.
+    for_ever : bool
+        Whether they do for ever.
+    """
+
+    F: Array
+    g: Array
+    ahead: Array
+    steps: int
+    for_ever: bool
+
+
+def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) -> KeptSet:
+    """Return the largest set in which inputs within bounds keep the hard bounds for ever.
+
+    Preimages are intersected until nothing changes by more than 1e-7 half-widths (Blanchini, Set
+    invariance in control, Automatica 35 (1999)), with references and disturbances constant. With a
+    terminal set, they are as many as the horizon is long: the set in which the MPC has a solution.
+
+    Parameters
+    ----------
+    problem : MPCProblem
+        Its inputs need bounds.
+    most_steps, most_rows : int
+        Where these are not enough the last set is taken, which looks fewer steps ahead.
+    """
+    problem = problem.deviations
+    half, u_half = problem.theta_half, problem.u_half
+    A, B = problem.prediction
+    own, forced = A * half / half[:, None], B * u_half / half[:, None]
+    n, unit = len(half), np.concatenate([half, u_half])
+    box, inputs = _around(problem, half), _scaled(hard_rows(problem, ("u", "du", "mixed")), unit)
+    bounds = _scaled(hard_rows(problem, ("x", "y")), unit)
+    bounds = bounds[0][:, :n], bounds[1]
+
+    def before(rows: Rows, room: float = 0.0) -> Rows | None:
+        F, g = rows
+        return _without_inputs((np.hstack([F @ own, F @ forced]), g - room), inputs, box)
+
+    last, upper = problem.terminal.set
+    end = _reduced(_joined(bounds, (last * half, upper)), box)
+    steps, found, settled = 0, bounds if end is None else end, False
+    nothing = end is None or not len(bounds[1])
+    ends = not nothing and not _implies(bounds, (last * half, upper), box)
+    if ends:  # a terminal set that inputs cannot stay in promises nothing
+        stays = before(found)
+        ends = stays is not None and _implies(found, stays, box)
+    most_steps = 0 if nothing else problem.horizon if ends else most_steps
+    while steps < most_steps and not settled:
+        # What the MPC does not plan itself needs room: an unstable plant leaves an edge at once.
+        earlier = before(found, ROOM if not ends and steps >= problem.horizon else 0.0)
+        earlier = None if earlier is None else _reduced(_joined(bounds, earlier), box)
+        if earlier is None or len(earlier[1]) > most_rows:
+            break
+        settled = not ends and _implies(found, earlier, box)
+        found = earlier
+        steps += 1
+    F, g = found
+    size = np.abs(F[:, problem.layout.state]).sum(1)
+    size = np.where(size > 0, size, 1.0)
+    F, g = F / size[:, None] / half, g / size
+    # Inputs and rates within fixed bounds, and inputs within those of theta, are clipped anyway.
+    rate_moves = any(name.startswith("du") for name in problem.layout.bounds)
+    now = hard_rows(problem, ("du", "mixed") if rate_moves else ("mixed",))
+    rows = np.vstack([np.hstack([F @ A, F @ B, g[:, None]]), np.column_stack(now)])
+    return KeptSet(F, g, rows, steps, settled or (ends and steps == problem.horizon))
+
+
+def _around(problem: MPCProblem, half: Array) -> Rows:
+    """Return the box of theta, ten times as large in the states, in half-widths."""
+    low, high = problem.theta_min / half, problem.theta_max / half
+    low, high = np.where(np.isfinite(low), low, -1), np.where(np.isfinite(high), high, 1)
+    far = np.ones(len(half))
+    far[problem.layout.state] = 10
+    middle, reach = (low + high) / 2, far * (high - low) / 2
+    eye = np.eye(len(half))
+    return np.vstack([eye, -eye]), np.concatenate([middle + reach, reach - middle])
+
+
+def _scaled(rows: Rows, unit: Array) -> Rows:
+    return rows[0] * unit, rows[1]
+
+
+def _joined(*parts: Rows) -> Rows:
+    return np.vstack([F for F, _ in parts]), np.concatenate([g for _, g in parts])
+
+
+def _without_inputs(ahead: Rows, inputs: Rows, box: Rows, most: int = 3000) -> Rows | None:
+    """Return for which theta some u fulfils the rows of [theta, u]; None where that is too large.
+
+    It is the elimination of Fourier and Motzkin.
+    """
+    F, g = _joined(ahead, inputs)
+    n = box[0].shape[1]
+    while F.shape[1] > n:
+        last = F[:, -1]
+        above, below = last > FEW, last < -FEW
+        if above.sum() * below.sum() > most:
+            return None
+        up, down = F[above] / last[above, None], F[below] / last[below, None]
+        pairs = (up[:, None] - down[None]).reshape(-1, F.shape[1])
+        ends = ((g[above] / last[above])[:, None] - (g[below] / last[below])[None]).ravel()
+        free = ~(above | below)
+        F, g = _joined((pairs, ends), (F[free], g[free]))
+        F = F[:, :-1]
+        wide = np.zeros((len(box[1]), F.shape[1]))
+        wide[:, :n] = box[0]
+        found = _reduced((F, g), (wide, box[1]))
+        if found is None:
+            return None
+        F, g = found
+    return F, g
+
+
+def _reduced(rows: Rows, box: Rows) -> Rows | None:
+    """Return the rows that say something new within a box; None where no theta fulfils them."""
+    F, g = rows
+    if not len(g):
+        return rows
+    length = np.linalg.norm(F, axis=1)
+    some = length > FEW
+    if np.any(g[~some] < -FEW):
+        return None
+    F, g = F[some] / length[some, None], g[some] / length[some]
+    order = np.argsort(g, kind="stable")  # of parallel rows the first, which is the nearest
+    _, first = np.unique(np.round(F[order], 9), axis=0, return_index=True)
+    kept = order[np.sort(first)]
+    F, g = F[kept], g[kept]
+    A, b = _joined((F, g), box)
+    _, radius, facets, _ = bounded_region(A, b, FEW)
+    if radius <= FEW:
+        return None
+    facets = facets[facets < len(g)]
+    return F[facets], g[facets]
+
+
+def _implies(found: Rows, wanted: Rows, box: Rows, room: float = 1e-7) -> bool:
+    """Tell whether all theta of one set lie in another, to some room."""
+    if not len(wanted[1]):
+        return True
+    A, b = _joined(found, box)
+    inside, _, _, _ = bounded_region(A, b, np.inf)
+    ends = farthest_points(A, b, inside, wanted[0])
+    return bool(np.all(np.sum(ends * wanted[0], axis=1) <= wanted[1] + room))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, check_array, check_bounds, check_int, to_float
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
@@ -175,5 +176,48 @@ def warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> Non
             f"SoftBounds.x softens the bounds {lower[i]:g} to {upper[i]:g} of x[{i}], but theta_min"
             f" = {low[i]:g} and theta_max = {high[i]:g} do not exceed them: the law ends there. "
             "Give theta_min and theta_max the states from which it is to come back.",
+            stacklevel=3,
+        )
+
+
+def warn_of_misread_bounds(
+    model: LinearModel, ranges: Mapping[str, tuple[Array, Array, Array]], has_constants: bool
+) -> None:
+    """Warn of bounds that seem to be deviations, or in which the law cannot rest.
+
+    Ranges are lower and upper bounds, and the operating point between them, by name: "x", "theta"
+    of the states, "u", and others. References and disturbances are other places to rest at.
+    """
+    left_out = {name: (low > point) | (high < point) for name, (low, high, point) in ranges.items()}
+    for name, (lower, upper, points) in ranges.items():
+        for i in np.flatnonzero(left_out[name] & (lower < 0) & (upper > 0))[:1]:
+            low, high, point = lower[i], upper[i], points[i]
+            warnings.warn(
+                f"{name}_min = {low:g} and {name}_max = {high:g} of entry {i} leave out the "
+                f"operating point, {point:g}, and hold 0. Bounds are what the plant shows. If "
+                f"these are deviations, pass {name}_min = {low + point:g} and {name}_max = "
+                f"{high + point:g}, or leave x_ss and u_ss out of the model.",
+                stacklevel=3,
+            )
+            return
+    if has_constants:
+        return
+    has_point = bool(np.any(model.x_ss) or np.any(model.u_ss))
+    cure = "If these are what the plant takes, give the model its x_ss and u_ss."
+    if has_point:
+        cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
+    for i in np.flatnonzero(left_out["u"]):
+        low, high, point = (each[i] for each in ranges["u"])
+        warnings.warn(
+            f"u_min = {low:g} and u_max = {high:g} leave out u[{i}] = {point:g}, "
+            f"the operating point: the law cannot rest there. {cure}",
+            stacklevel=3,
+        )
+    for i in np.flatnonzero(has_point & (left_out["x"] | left_out["theta"])):
+        low, high, point = (each[i] for each in ranges["x" if left_out["x"][i] else "theta"])
+        warnings.warn(
+            f"{labels_of(model)[0][i]} = {point:g}, the operating point, lies outside its "
+            f"bounds, {low:g} to {high:g}: the law cannot rest there. Look at the "
+            "order of the states.",
             stacklevel=3,
         )
