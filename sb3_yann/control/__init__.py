@@ -8,6 +8,7 @@ from sb3_yann.control.model.identify import Identified, identify
 from sb3_yann.control.model.identify_outputs import IdentifiedOutputs, identify_outputs
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.augmented import offset_free, with_extra
+from sb3_yann.control.mpc.coordinates import ThetaLayout
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
     LinearCost,
@@ -19,7 +20,6 @@ from sb3_yann.control.mpc.groups import (
     Tracking,
 )
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
-from sb3_yann.control.mpc.theta_layout import ThetaLayout
 from sb3_yann.control.observer import DisturbanceObserver, StateEstimator
 from sb3_yann.control.online import OnlineLaw, OnlineLawWarning
 

@@ -433,9 +433,8 @@ class PiecewiseAffine(PlantLaw):
         return f"PiecewiseAffine({law}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was compiled for this process, and the tree of a law of version 0.1."""
-        left = "packed", "_at", "tree"
-        return {name: each for name, each in vars(self).items() if name not in left}
+        """Leave out what was compiled for this process."""
+        return {name: each for name, each in vars(self).items() if name not in ("packed", "_at")}
 
 
 def read_law(kind: str, path: str | PathLike[str], build: Callable[[dict[str, Any]], T]) -> T:

@@ -126,13 +126,11 @@ class OnlineLaw(PlantLaw):
 
     @classmethod
     def of(cls, program: ParametricQP, u_min: Array, u_max: Array, infeasible: str) -> OnlineLaw:
-        """Return the law of a program.
+        """Return the law of a program whose first variables are the inputs.
 
         Parameters
         ----------
-        program : ParametricQP
-            Whose first variables are the inputs.
-        u_min, u_max, infeasible
+        program, u_min, u_max, infeasible
             As in :class:`OnlineLaw`.
         """
         parts = {each.name: getattr(program, each.name) for each in fields(program)}
@@ -329,13 +327,9 @@ LAWS = ("auto", "explicit", "online")
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What comes of rows of theta.
+    """What comes of rows of theta: multipliers and active constraints (batch, most), how many are.
 
-    Attributes
-    ----------
-    multipliers, active : ndarray, shape (batch, most)
-    sizes, status : ndarray of int, shape (batch,)
-        How many constraints are active, and a status of `_kernels.online`.
+    The status (batch,) is one of `_kernels.online`.
     """
 
     multipliers: Array
@@ -348,23 +342,11 @@ class Answers:
 class DualProgram:
     """A program in its dual form, in which each point costs no factorization of its own.
 
-    Slacks are ``s = d0 + D' theta + gram lam``, inputs ``u = k0 + K theta - E' lam``.
-
-    Attributes
-    ----------
-    D, d0, gram : ndarray, shapes (n, rows), (rows,) and (rows, rows)
-        Of the constraints that the inputs can meet, in units in which ``gram`` has ones.
-    E, K, k0 : ndarray, shapes (rows, m), (m, n) and (m,)
-        In the units of the plant.
-    softness : ndarray, shape (rows,)
-        What is added to the diagonal of ``gram`` where a constraint is to give way.
-    fixed : pair of ndarray, shapes (k, n) and (k,)
-        ``S theta + w >= 0``: what no input can change.
-    bounds : ndarray, shape (2, m)
-        Of the inputs.
-    rows : ndarray of int
-        Where these constraints lie in the program.
-    n_variables : int
+    Slacks are ``s = d0 + D' theta + gram lam``, of the constraints that inputs can meet, in units
+    in which ``gram`` (rows, rows) has ones on its diagonal. Inputs, in the units of the plant, are
+    ``u = k0 + K theta - E' lam``. ``softness`` (rows,) is added to the diagonal where constraints
+    are to give way. Of ``fixed``, S and w, no input can change ``S theta + w >= 0``. ``bounds``
+    (2, m) are those of the inputs, and ``rows`` is where the constraints lie in the program.
     """
 
     D: Array
@@ -464,15 +446,7 @@ class KnownPoints:
     """A function of rows that remembers them: a row of the same bits is not computed again.
 
     Two keys of 64 bits stand for a row, so that two rows of a million share them with a chance of
-    1e-26. A full table forgets.
-
-    Parameters
-    ----------
-    function : callable
-        ``(batch, n) -> (batch, n_outputs)``, of contiguous float64.
-    n_outputs : int
-    size : int, default 2**20
-        The number of places, a power of 2: some 40 MB for three inputs once all are in use.
+    1e-26. A table that is full, of 2**20 places or some 40 MB for three inputs, forgets.
 
     Examples
     --------

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearModel, LinearMPC, Terminal
-from sb3_yann.control.mpc.steady_state import steady_states
+from sb3_yann.control.mpc.coordinates import steady_states
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode, pieces
 from sb3_yann.twin.selection import FOLDS, candidates, held_out, ridge

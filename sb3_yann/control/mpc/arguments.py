@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, check_array, check_bounds, check_int, to_float
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.mpc.theta_layout import ThetaLayout
+from sb3_yann.control.mpc.coordinates import ThetaLayout
 
 DRIFT, BEYOND = 1e-3, 0.5
 """In widths: the drift in a sample that warns; how far theta's box reaches beyond soft bounds."""
@@ -106,16 +106,9 @@ def theta_box(
 ) -> Bounds:
     """Return the box of theta.
 
-    Parameters
-    ----------
-    layout : ThetaLayout
-        The parts of theta.
-    given : pair of array_like or None
-        theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
-    states : pair of ndarray, shape (n,)
-        The box of the states where none is given.
-    others : sequence of pairs
-        The boxes of r, d and the previous input, from which those given must not differ.
+    ``given`` are theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
+    ``states`` (n,) stand in for them. ``others`` are the boxes of r, d, bounds and the previous
+    input, from which those given must not differ.
     """
     n, parts = layout.n_states, []
     for value, fallback in zip(given, states, strict=True):

@@ -96,13 +96,7 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
 
 
 def gain_at_rest(problem: MPCProblem, law: Law) -> Array:
-    """Return K (m, n_z) with ``v = -K z`` near rest.
-
-    Raises
-    ------
-    ValueError
-        If the law does not rest there, or, near it, at the steady states of r and d.
-    """
+    """Return K (m, n_z) with ``v = -K z`` near rest, where the law must rest."""
     errors = problem.error_system
     rest, unit = problem.theta_rest, 2 * problem.u_half
     if not law.in_domain(rest) or np.any(np.abs(law(rest)) > 1e-9 * unit):

@@ -19,25 +19,12 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of states and outputs.
+    """Bounds ``low <= C x <= high`` of states and outputs, one of which is finite at least.
 
-    Attributes
-    ----------
-    C : ndarray, shape (k, n)
-        Combinations of the states.
-    low, high, half : ndarray, shape (k,)
-        Their bounds, one of which is finite at least, and half-widths: of theta's box, or of the
-        outputs in it. Where a state's box has an open side, the size of its bound.
-    softness : ndarray, shape (k,)
-        The violation that counts as one unit where a bound is soft, 0 where it is hard.
-    of_states : ndarray of bool, shape (k,)
-        Which are of single states; the others are of outputs.
-    states : slice
-        Where theta has the states.
-    used : ndarray of bool, shape (n + q,)
-        Which states and outputs these are.
-    moving : tuple of ndarray
-        Bounds that change at run time, as of `MPCProblem.limit_rows`.
+    ``half`` (k,) are half-widths of theta's box, or of the outputs in it; where a state's box has
+    an open side, the size of its bound. ``softness`` (k,) is the violation that counts as one unit,
+    0 where a bound is hard. ``used`` (n + q,) tells which states and outputs these are,
+    ``of_states`` (k,) which are states. ``moving`` bounds are those of `MPCProblem.limit_rows`.
     """
 
     C: Array
@@ -113,16 +100,7 @@ def mixed_beyond(problem: MPCProblem, thetas: Array, inputs: Array, room: float 
 
 
 class BoundNames(NamedTuple):
-    """What the bounds of a problem are called: of `Bounds`, of inputs, of rates, and mixed ones.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-    half : tuple of float
-        Half-widths.
-    soft : tuple of bool
-        Which are soft.
-    """
+    """What the bounds of a problem are called: of `Bounds`, of inputs, of rates, and mixed ones."""
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
@@ -196,17 +174,8 @@ def bound_excess(
     """Return by how much trajectories exceed the bounds of their problem, those of rates too.
 
     What is not finite exceeds by inf. The state that a trajectory begins in is nobody's doing.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Whose theta and inputs they are.
-    thetas, inputs : ndarray, shapes (T + 1, ..., n_theta) and (T, ..., m)
-        Of trajectories, in deviations.
-    taken : ndarray of bool, shape (T, ...), optional
-        Which steps count.
-    bounds : Bounds, optional
-        Those of the problem, where they are at hand: a wrapper asks at every step.
+    Thetas (T + 1, ..., n_theta) and inputs (T, ..., m) are deviations; ``taken`` (T, ...) are the
+    steps that count. A wrapper that asks at every step has the ``bounds`` of the problem at hand.
 
     Examples
     --------
@@ -263,14 +232,6 @@ def bound_excess(
 
 
 def excess_of_episodes(problem: MPCProblem, episodes: Iterable[tuple[Array, Array]]) -> BoundExcess:
-    """Return the same of episodes of any lengths, one entry for each.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Whose theta and inputs they are.
-    episodes : iterable of pairs of ndarray, shapes (T + 1, n_theta) and (T, m)
-        Thetas and inputs of each.
-    """
+    """Return the same of thetas (T + 1, n_theta) and inputs (T, m) of episodes, one for each."""
     found = [bound_excess(problem, thetas, inputs) for thetas, inputs in episodes]
     return BoundExcess(*np.array(found, dtype=np.float64).reshape(-1, 5).T)

@@ -112,13 +112,8 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
     All of it is in deviations. Where the model's modes grow too much over the horizon for float64,
     the variables are ``v_k = u_k - K theta_k`` instead, for a gain K that stabilizes: what is
     predicted then decays. ``feedback`` of the program is that K. The change of variables is exact:
-    the law is the same.
-
-    Raises
-    ------
-    ValueError
-        If digits are lost all the same. The law without constraints must be that of the Riccati
-        recursion, which loses none, to 1e-8 of the input range.
+    the law is the same. ValueError if digits are lost all the same: the law without constraints
+    must be that of the Riccati recursion, which loses none, to 1e-8 of the input range.
     """
     problem = problem.deviations
     plain = _condensed(problem, None) if _growth(problem) <= GROWTH else None
@@ -211,14 +206,9 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
 def _held(
     A: Array, B: Array, weight: Array, P: Array, gamma: float, length: int
 ) -> tuple[Array, Array]:
-    """Return the gain of an input that is held, and the cost with it.
+    """Return the gain of an input that is held for a block, and the cost with it.
 
-    Parameters
-    ----------
-    A, B, weight, P : ndarray
-        The model, the stage cost ``[z; v]' weight [z; v]``, and the cost at the end.
-    gamma, length : float, and int
-        The discount, and for how many samples.
+    The stage cost is ``[z; v]' weight [z; v]``, that at the end ``z' P z``.
     """
     n, m = B.shape
     step = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])

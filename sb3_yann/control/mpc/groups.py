@@ -377,13 +377,8 @@ class LinearCost(ReadOnlyArrays):
 def parametric_names(names: Sequence[str], limits: Mapping[str, Bounds]) -> tuple[str, ...]:
     """Return a name such as "u_max[0]" for each bound that changes at run time.
 
-    Parameters
-    ----------
-    names : sequence of str
-        "u_max" for all entries that are bounded, or "u_max[0]" for one; likewise x, y, du and
-        "_min". Those of MixedBounds are "mixed_min" and "mixed_max".
-    limits : dict of str to pair of ndarray
-        The bounds of a problem by "x", "u", ...
+    A name is "u_max" for all entries that are bounded, or "u_max[0]" for one; likewise x, y, du and
+    "_min". Those of MixedBounds are "mixed_min" and "mixed_max". ``limits`` are by "x", "u", ...
     """
     if isinstance(names, str) or not all(isinstance(each, str) for each in names):
         raise TypeError(f"parametric_bounds = {names!r} must be a list such as ['u_max'].")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
 from sb3_yann.control.linear_system import labels_of, with_units
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.mpc.error_coordinates import ErrorSystem, error_system
+from sb3_yann.control.mpc.coordinates import (
+    ErrorSystem,
+    SteadyStates,
+    ThetaLayout,
+    error_system,
+    steady_states,
+)
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
     LinearCost,
@@ -24,16 +30,10 @@ from sb3_yann.control.mpc.groups import (
     Tracking,
     bound_entry,
 )
-from sb3_yann.control.mpc.steady_state import SteadyStates, steady_states
-from sb3_yann.control.mpc.theta_layout import ThetaLayout
 from sb3_yann.units import Units, fields_in_deviations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-
-OF_OLD_PICKLES = "absolute", "theta_ss", "_online"
-"""What a problem of 0.1 held besides, or had computed from its operating point."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,24 +78,6 @@ class MPCProblem(ReadOnlyArrays):
     price: LinearCost = field(default_factory=LinearCost)
     parametric_bounds: tuple[str, ...] = ()
     control_horizon: int | tuple[int, ...] | None = None
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copy or a pickle; one of 0.1 is in deviations, whatever its model says."""
-        if "mixed" not in state:  # groups of later versions
-            model = state["model"]
-            state = {
-                "mixed": MixedBounds().sized(model.n_states, model.n_inputs),
-                "price": LinearCost().sized(model.n_states, model.n_inputs),
-                "parametric_bounds": (),
-                **{name: value for name, value in state.items() if name != "layout"},
-            }
-        if "absolute" in state:
-            model = state["model"].about_zero()
-            state = {name: value for name, value in state.items() if name not in OF_OLD_PICKLES}
-            rest = np.zeros(layout_of(model, state["tracking"], state["rate"]).size)
-            laws = {name: law.on_plant(model, rest) for name, law in state.get("_laws", {}).items()}
-            state |= {"model": model, "_laws": laws}
-        super().__setstate__(state)
 
     @cached_property
     def units(self) -> Units:
@@ -381,14 +363,7 @@ def layout_of(
 ) -> ThetaLayout:
     """Return what theta holds in a problem with these parts.
 
-    Parameters
-    ----------
-    model, tracking, rate : LinearModel, Tracking, RateLimits
-        Of the problem.
-    load_preview : int, default 0
-        Of the measured disturbances.
-    bounds : tuple of str, optional
-        Those that change at run time.
+    ``load_preview`` is that of the measured disturbances, and ``bounds`` change at run time.
     """
     return ThetaLayout(
         model.n_states,

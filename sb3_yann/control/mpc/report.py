@@ -20,18 +20,9 @@ BOUND = "bound, which may move in, of entry"
 
 
 def report(problem: MPCProblem, law: Law, samples: int = 500, seed: int = 0) -> str:
-    """Return the parameters, the size of the law, and sampled shares of the box, as text.
+    """Return the parameters, the size of the law, and shares of the bounded box, as text.
 
-    Parameters
-    ----------
-    problem : MPCProblem
-        With a bounded box of parameters.
-    law : PiecewiseAffine or OnlineLaw
-        The problem's.
-    samples : int, default 500
-        Points drawn uniformly from the box of parameters: shares are good to 1 / sqrt(samples).
-    seed : int, default 0
-        Of the draws.
+    Points are drawn uniformly from the box: shares are good to 1 / sqrt(samples).
     """
     rng = np.random.default_rng(seed)
     own = problem.deviations

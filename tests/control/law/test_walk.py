@@ -16,7 +16,6 @@ import pytest
 from partitions import edges
 from sb3_yann.control import LinearModel, LinearMPC, PiecewiseAffine
 from sb3_yann.control._kernels.law import walk_to
-from sb3_yann.control.search_tree import SearchTree
 
 UNKNOWN = np.empty(0, np.int64)
 
@@ -122,17 +121,6 @@ def test_they_are_saved_and_copied_and_a_law_may_have_none(tmp_path: Path) -> No
     old = PiecewiseAffine.load(tmp_path / "old.npz")
     assert old == law and not old.walks
     assert np.array_equal(old(points), law(points))
-
-
-def test_a_pickle_with_a_search_tree_as_the_first_version_wrote_is_read() -> None:
-    law = cart()
-    old = PiecewiseAffine.__new__(PiecewiseAffine)
-    old.__setstate__({**vars(replace(law)), "tree": SearchTree()})
-    state = pickle.loads(pickle.dumps(vars(old)))
-    read = PiecewiseAffine.__new__(PiecewiseAffine)
-    read.__setstate__(state)
-    assert read == law and np.array_equal(read(in_box(law, 50)), law(in_box(law, 50)))
-    assert "tree" not in vars(pickle.loads(pickle.dumps(read)))
 
 
 def test_regions_that_overlap_go_by_the_largest_slack() -> None:

@@ -129,19 +129,6 @@ def test_bounds_stay_where_they_are_when_the_operating_point_moves() -> None:
     np.testing.assert_allclose(own.outputs.y_max + 347.5, [382])
 
 
-def test_a_pickle_of_the_first_version_is_in_deviations_as_it_was() -> None:
-    """It held deviations, whatever its model says; what an env takes then tells it from ours."""
-    law = deviations().explicit()
-    kept = {**vars(deviations()), "model": MODEL, "absolute": True, "theta_ss": shown().theta_ss}
-    kept = {name: each for name, each in kept.items() if name not in ("units", "_online")}
-    kept["_laws"] = {"walk": law.on_plant(MODEL, shown().theta_ss)}
-    old = object.__new__(LinearMPC)
-    old.__setstate__(kept)
-    assert old == deviations() and not old.units.shifted
-    assert old.explicit() is not law and not old.explicit().units.shifted
-    assert old.explicit() == law
-
-
 def test_a_box_of_theta_and_what_is_not_given() -> None:
     mpc = LinearMPC(
         MODEL, **WEIGHTS, theta_min=[300, 0], theta_max=[400, 4], u_min=8, u_max=15,

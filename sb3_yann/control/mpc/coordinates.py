@@ -1,4 +1,4 @@
-"""What the parameter theta of a problem holds, and where."""
+"""What theta holds, the steady state it asks for, and the coordinates of the error about it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, ReadOnlyArrays
+from sb3_yann.control.model.linear_model import LinearModel
 
 
 @dataclass(frozen=True)
@@ -162,3 +164,131 @@ class ThetaLayout:
 
 def _after(part: slice, size: int) -> slice:
     return slice(part.stop, part.stop + size)
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyStates(ReadOnlyArrays):
+    """``x_s = x [r; d]`` and ``u_s = u [r; d]``, of shapes (n, p + d) and (m, p + d)."""
+
+    x: Array
+    u: Array
+
+
+def steady_states(
+    model: LinearModel, C: Array, Q: Array, R: Array, x_unit: Array, u_unit: Array
+) -> SteadyStates:
+    """Return the map from reference and disturbance to the steady state with ``C x_s = r``.
+
+    It solves ``(A - I) x_s + B u_s = -E d`` and ``C x_s = r``. Of several solutions it is the one
+    with the smallest ``x_s'Q x_s + u_s'R u_s``, then that of minimum norm in the units given
+    (Rawlings, Mayne & Diehl, Model Predictive Control, Section 1.5). ``x_unit`` (n,) and ``u_unit``
+    (m,) are typical sizes: ranks and norms do not depend on the units of the plant. ValueError if
+    some reference or disturbance has no steady state, whatever the bounds.
+    """
+    n, m = model.B.shape
+    if len(C) + model.n_disturbances == 0:
+        return SteadyStates(np.zeros((n, 0)), np.zeros((m, 0)))
+    unit = np.concatenate([x_unit, u_unit])
+    equations = np.block([[model.A - np.eye(n), model.B], [C, np.zeros((len(C), m))]]) * unit
+    row_unit = np.concatenate([x_unit, np.linalg.norm(equations[n:], axis=1)])
+    row_unit[row_unit == 0] = 1.0
+    equations = equations / row_unit[:, None]
+    right = linalg.block_diag(np.zeros((n, 0)), np.eye(len(C)))
+    right = np.hstack([right, np.vstack([-model.E, np.zeros((len(C), model.n_disturbances))])])
+    right = right / row_unit[:, None]
+
+    solution = np.linalg.pinv(equations, rcond=1e-10) @ right
+    size = np.maximum(np.abs(right).max(axis=0, initial=0.0), np.finfo(float).tiny)
+    missed = np.abs(equations @ solution - right).max(axis=0, initial=0.0) > 1e-8 * size
+    if np.any(missed):
+        raise ValueError(_why_none(model, C, missed, equations))
+
+    free = linalg.null_space(equations, rcond=1e-10)
+    weight = linalg.block_diag(Q, R) * np.outer(unit, unit)
+    curvature = free.T @ weight @ free
+    # What costs nothing leaves the squares of rounding, 1e-32 of the weights: no curvature.
+    rounding = 1e-24 * np.abs(weight).max() / max(np.abs(curvature).max(initial=0.0), 1e-300)
+    inverse = np.linalg.pinv(curvature, rcond=max(1e-12, rounding), hermitian=True)
+    solution = solution - free @ inverse @ (free.T @ weight @ solution)
+    solution = solution * unit[:, None]
+    return SteadyStates(solution[:n], solution[n:])
+
+
+def _why_none(model: LinearModel, C: Array, missed: Array, equations: Array) -> str:
+    p = len(C)
+    which = [f"r[{i}]" if i < p else f"d[{i - p}]" for i in np.flatnonzero(missed)]
+    rank = int(np.linalg.matrix_rank(equations, tol=1e-10))
+    return (
+        f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank {rank}, "
+        f"not {model.n_states + p}. Track fewer outputs, or other ones: at most as many as inputs "
+        f"({model.n_inputs}) can be tracked, each moved by an input at steady state."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSystem(ReadOnlyArrays):
+    """The problem in ``z = to_error theta`` and ``v = u - to_input theta``: ``z+ = A z + B v``.
+
+    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight, and by what r and d
+    of a preview differ from the last of them, whose steady state x_s and u_s are. The constant r
+    and d, modes on the unit circle that no Riccati equation without discount allows, are gone.
+    ``to_theta`` (n_theta, n_z) leads to a theta with this z, whose last r and d are zero. The stage
+    cost is ``z'Qz + 2 z' cross v + v'Rv``, and ``[theta; u]' stage_matrix [theta; u]`` too.
+    """
+
+    model: LinearModel
+    to_error: Array
+    to_input: Array
+    to_theta: Array
+    Q: Array
+    R: Array
+    cross: Array | None
+    stage_matrix: Array
+
+
+def error_system(
+    model: LinearModel,
+    layout: ThetaLayout,
+    steady: SteadyStates,
+    prediction: tuple[Array, Array],
+    weights: tuple[Array, Array, Array],
+) -> ErrorSystem:
+    """Return the coordinates of a problem with weights Q (n, n), R (m, m) and R_du (m, m).
+
+    The stage cost is ``e'Qe + v'Rv + (u - u_prev)'R_du(u - u_prev)``, with ``e = x - x_s`` and
+    ``v = u - u_s`` of the present r and d.
+    """
+    n, m = model.B.shape
+    every = np.eye(layout.size)
+    x, previous = every[layout.state], every[layout.previous]
+    is_rated = bool(np.any(weights[2]))
+    from_now = np.block([[x - steady.x @ every[layout.now], np.zeros((n, m))],
+                         [-steady.u @ every[layout.now], np.eye(m)]])  # fmt: skip
+    if is_rated:
+        from_now = np.vstack([from_now, np.hstack([-previous, np.eye(m)])])
+    weight = linalg.block_diag(*weights[: 2 + is_rated])
+    W = from_now.T @ weight @ from_now
+
+    to_input = steady.u @ every[layout.last]
+    changes = np.flatnonzero(layout.next != np.arange(layout.size))
+    final = layout.lift @ every[layout.settles]  # all r and d are the last ones
+    to_error = [x - steady.x @ every[layout.last]]
+    to_theta = [x]
+    if is_rated:
+        to_error.append(previous - to_input)
+        to_theta.append(previous)
+    to_error.append((every - final)[changes])
+    to_theta.append(every[changes])
+    E, T = np.vstack(to_error), np.vstack(to_theta).T
+    A, B = prediction
+    cross = T.T @ W[: layout.size, layout.size :]
+    return ErrorSystem(
+        model=LinearModel(E @ A @ T, E @ B, model.dt),
+        to_error=E,
+        to_input=to_input,
+        to_theta=T,
+        Q=T.T @ W[: layout.size, : layout.size] @ T,
+        R=W[layout.size :, layout.size :],
+        cross=cross if np.any(cross) else None,
+        stage_matrix=W,
+    )
