@@ -14,17 +14,7 @@ from sb3_yann.control.polyhedra import (
     largest_ball,
 )
 
-TRIANGLE = np.array([[-1.0, 0.0], [0.0, -1.0], [0.6, 0.8]])
-ROOM = np.array([0.0, 0.0, 2.4])
 """x, y >= 0 and 3 x + 4 y <= 12: corners at (0, 0), (4, 0) and (0, 3); the inner circle has 1."""
-LENGTHS = np.array([[1.0, 1.0, 1.0], [5.0, 1e-3, 40.0]])
-
-
-def test_the_largest_ball_of_a_triangle_of_3_4_and_5() -> None:
-    center, radius = largest_ball(TRIANGLE, ROOM)
-    assert center == pytest.approx([1, 1]) and radius == pytest.approx(1)
-    middle, half = largest_ball(TRIANGLE, ROOM, facet=0)
-    assert middle[0] == pytest.approx(0) and 0 < half <= 1.5
 
 
 def polygon(seed: int, rows: int = 9) -> tuple[np.ndarray, np.ndarray]:

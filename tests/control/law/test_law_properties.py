@@ -129,18 +129,6 @@ def test_every_number_has_an_input_within_its_bounds(mpc: LinearMPC, data, dtype
 
 
 @examples(8)
-@given(problems(), st.data(), st.sampled_from([np.nan, np.inf, -np.inf]))
-def test_what_is_no_number_is_refused(mpc: LinearMPC, data, value: float) -> None:
-    theta = in_box(mpc, 3)
-    theta[data.draw(st.integers(0, 2)), data.draw(st.integers(0, mpc.n_theta - 1))] = value
-    lost = theta[np.argmin(np.isfinite(theta).all(axis=1))]
-    for law in kinds(mpc):
-        for points in (theta, lost, np.float32(lost)):
-            with pytest.raises(ValueError, match="NaN or infinite"):
-                law(points)
-
-
-@examples(8)
 @given(problems(), SEEDS)
 def test_law_is_saved_to_the_last_bit(mpc: LinearMPC, seed: int) -> None:
     points = mixture(mpc, seed)[::5]

@@ -91,14 +91,6 @@ def test_zero_is_no_input_outside_or_the_bound_nearest_to_it(name: str, value: f
     np.testing.assert_array_equal(law(infeasible), value)
 
 
-@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
-def test_law_read_from_a_file_is_equal_to_the_one_saved(tmp_path: Path, infeasible: str) -> None:
-    law, path = law_of("reactor", infeasible), tmp_path / "law"
-    law.save(path)
-    assert PiecewiseAffine.load(path) == law
-    assert hash(PiecewiseAffine.load(str(path))) == hash(law)
-
-
 def test_saved_file_holds_plain_arrays(tmp_path: Path) -> None:
     law = law_of("pendulum")
     law.save(tmp_path / "law.npz")

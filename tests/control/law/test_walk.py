@@ -177,12 +177,6 @@ def test_theta_may_come_in_any_array_or_list(given) -> None:
     assert np.array_equal(law(np.array([given, given], dtype=float))[1], expected)
 
 
-@pytest.mark.parametrize("given", [[np.nan, 0.0], [0.0, np.inf], [0.0], [0.0] * 3, 0.0])
-def test_theta_that_is_none_is_refused_also_where_compiled_code_sees_it_first(given) -> None:
-    with pytest.raises(ValueError, match="theta"):
-        cart()(np.array(given))
-
-
 @pytest.mark.slow
 def test_without_a_compiler_the_law_is_the_same(tmp_path: Path) -> None:
     cart().save(tmp_path / "law.npz")

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization.linearize import time_limit_fault
-from sb3_yann.control.linearization.simulator import sample_time, to_vector
+from sb3_yann.control.linearization.simulator import sample_time
 
 
 def box(low: Any, high: Any) -> gym.spaces.Box:
@@ -131,41 +130,3 @@ def test_the_time_of_a_step_is_given_or_the_plant_s_own() -> None:
     plant.dt = np.inf
     with pytest.raises(ValueError, match="Plant has no dt, tau or DT to take it from"):
         sample_time(plant, None)
-
-
-def test_a_vector_of_numbers_is_a_state_and_nothing_else_is() -> None:
-    assert to_vector([1, 2]).tolist() == [1.0, 2.0]
-    for other in (None, "12", {"x": 1}, [[1.0]], 3.0, [], [np.nan], [np.inf], ["a"]):
-        assert to_vector(other) is None
-
-
-class Episodes(gym.Env[Any, Any]):
-    """Episodes that end, or are cut, after so many steps."""
-
-    def __init__(self, ends: Any, cut: Any = None) -> None:
-        self.action_space = box([-1], [1])
-        self.ends, self.cut = ends, cut
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.t = 0
-        return np.zeros(1), {}
-
-    def step(self, action: Any) -> Any:
-        self.t += 1
-        ends = self.ends(float(action[0])) if callable(self.ends) else self.ends
-        return np.zeros(1), 0.0, self.t == ends, self.t == self.cut, {}
-
-
-def faults(*given: Any, **more: Any) -> str:
-    return time_limit_fault(Episodes(*given, **more), np.zeros(1))
-
-
-def test_a_termination_after_the_same_number_of_steps_is_a_time_limit() -> None:
-    assert "Episodes terminate after 30 steps whatever happens" in faults(30)
-    assert "TruncateAtTimeLimit(env, 30)" in faults(30)
-    assert "after 2 steps" in faults(2) and faults(1) == ""
-    assert "after 400 steps" in faults(400) and faults(401) == ""
-    assert faults(None) == "" and faults(30, cut=20) == "" and faults(20, cut=30) != ""
-    # Another input is tried: half of a quarter of its range more.
-    assert faults(lambda u: 30 if u < 0.49 else 31) == ""
-    assert faults(lambda u: 30 if u < 0.51 else 31) != ""

@@ -34,16 +34,6 @@ def test_lists_and_columns_that_are_returned_are_taken_as_vectors_are(f: Any) ->
     np.testing.assert_allclose(model.B, same.B, atol=1e-9)
 
 
-def test_a_function_that_fails_shows_its_own_error() -> None:
-    with pytest.raises(IndexError, match="index 7 is out of bounds"):
-        LinearModel.from_dynamics(lambda x, u: [x[7]], [0.0], [0.0], 0.1)
-
-
-def test_a_wrong_number_of_derivatives_is_named() -> None:
-    with pytest.raises(ValueError, match=r"f returned the shape \(3,\), expected \(2,\)"):
-        LinearModel.from_dynamics(lambda x, u: [0.0, 0.0, 0.0], [0, 0], [0], 0.1)
-
-
 def test_the_state_of_the_reactor_is_solved_for() -> None:
     model = LinearModel.from_dynamics(cstr.dynamics, [NAN] * 4, cstr.U_SS, cstr.DT)
     np.testing.assert_allclose(cstr.dynamics(model.x_ss, model.u_ss), 0, atol=1e-6)

@@ -23,21 +23,6 @@ def of(f: Any, at: float = 0.0, longest: float = 0.1, noise: float = EPS) -> Jac
     return jacobian(lambda z: np.atleast_1d(f(z[0])), at * ONE, longest * ONE, noise * ONE)
 
 
-def test_derivatives_are_exact_beside_rounding_in_every_coordinate() -> None:
-    def f(z: np.ndarray) -> np.ndarray:
-        a, b, c = z
-        return np.array([np.sin(a) * b, a**3 + np.exp(c), 5 * b * c - 2])
-
-    point = np.array([0.4, -1.5, 0.7])
-    found = jacobian(f, point, np.array([0.1, 0.2, 0.3]), np.full(3, EPS))
-    a, b, c = point
-    expected = [[np.cos(a) * b, np.sin(a), 0], [3 * a**2, 0, np.exp(c)], [0, 5 * c, 5 * b]]
-    np.testing.assert_allclose(found.value, expected, atol=1e-11)
-    np.testing.assert_array_equal(found.value == 0, np.array(expected) == 0)
-    np.testing.assert_array_equal(found.steps, [0.1, 0.2, 0.3])
-    assert found.doubt < 1e-10 and found.dropped < 1e-13
-
-
 @pytest.mark.parametrize(("k", "smooth"), [(0.0049, True), (0.0052, False), (-0.0052, False)])
 def test_slopes_that_differ_by_a_hundredth_of_the_steepest_are_a_kink(k, smooth) -> None:
     """Of z + k |z|: they differ by 2 k, and the steepest is 1 + k."""

@@ -65,11 +65,6 @@ def test_what_the_inputs_hardly_move_is_named() -> None:
     assert "x[0] -1 x[1] is moved" in report
 
 
-def test_unstable_modes_that_no_input_moves_are_found() -> None:
-    model = LinearModel([[1.2, 0], [0, 0.5]], [[0], [1]], 1)
-    assert "Nothing moves x[0]." in model.report()
-
-
 def test_short_samples_are_not_taken_for_a_lack_of_control() -> None:
     A = np.diag(np.ones(3), 1) - np.diag([1.0, 2, 3, 4])
     fast = LinearModel.from_continuous(A, [[0], [0], [0], [1]], 1e-3)
@@ -125,17 +120,3 @@ def test_operating_point_and_disturbances_are_told() -> None:
         "Linear model: 1 state, 1 input, 2 disturbances, sampled every 0.25.",
         "Operating point: x_ss = (3), u_ss = (4), d_ss = (5, 6).",
     ]
-
-
-def test_notes_end_the_report() -> None:
-    noted = LinearModel([[0.5]], [[1]], 0.1, notes=["D was dropped."])
-    assert noted.report().endswith("\nNote: D was dropped.")
-
-
-def test_fit_of_an_identified_model_is_told() -> None:
-    rng = np.random.default_rng(0)
-    u, x = rng.normal(size=(200, 1)), np.zeros((201, 1))
-    for k in range(200):
-        x[k + 1] = 0.8 * x[k] + u[k]
-    report = LinearModel.from_data(x, u, dt=1).report()
-    assert "Fit over 40 steps held out, 100 % is perfect: 100 % one step ahead, 100 % 10" in report

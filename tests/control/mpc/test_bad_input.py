@@ -15,42 +15,27 @@ TURN = [[np.cos(1), np.sin(1), 0], [-np.sin(1), np.cos(1), 0], [0, 0, 0.5]]
 
 BAD_MODELS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"A": [[1, 2, 3], [4, 5, 6]]}, ValueError, r"A has shape \(2, 3\), expected a square matrix"),
-    ({"A": [1, 2]}, ValueError, r"A has shape \(2,\), expected \(n, n\)"),
     ({"A": np.zeros((0, 0))}, ValueError, r"A has shape \(0, 0\), expected a square matrix"),
-    ({"A": None}, ValueError, r"A has shape \(\), expected \(n, n\)"),
     ({"A": [[1, NAN], [0, 1]]}, ValueError, "A holds NaN or infinite entries"),
-    ({"A": [[1, INF], [0, 1]]}, ValueError, "A holds NaN or infinite entries"),
     ({"A": [["a", 1], [0, 1]]}, TypeError, "A = .* is not an array of real numbers"),
-    ({"A": [[1, 2], [3]]}, TypeError, "A = .* is not an array of real numbers"),
-    ({"A": np.array([[1j, 0], [0, 1]])}, TypeError, "(?s)A = .* is not an array of real numbers"),
     ({"B": [[1], [2], [3]]}, ValueError, r"B has shape \(3, 1\), expected \(2, m\)"),
-    ({"B": [1, 2]}, ValueError, r"B has shape \(2,\), expected \(2, m\)"),
     ({"B": np.zeros((2, 0))}, ValueError, r"B has shape \(2, 0\): the model needs at least one"),
-    ({"B": [[NAN], [1]]}, ValueError, "B holds NaN or infinite entries"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
-    ({"dt": -0.1}, ValueError, "dt = -0.1 must be a finite number above 0"),
     ({"dt": NAN}, ValueError, "dt = nan must be a finite number above 0"),
-    ({"dt": INF}, ValueError, "dt = inf must be a finite number above 0"),
     ({"dt": "soon"}, TypeError, "dt = 'soon' must be a number"),
-    ({"dt": [1, 2]}, TypeError, r"dt = \[1, 2\] must be a number"),
     ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
-    ({"x_ss": [NAN, 0]}, ValueError, "x_ss holds NaN or infinite entries"),
-    ({"u_ss": [1, 2]}, ValueError, r"u_ss has shape \(2,\), expected \(1,\)"),
     ({"E": [[1]]}, ValueError, r"E has shape \(1, 1\), expected \(2, d\)"),
-    ({"E": [[1], [NAN]]}, ValueError, "E holds NaN or infinite entries"),
-    ({"d_ss": [[1], [1, 2]]}, TypeError, r"d_ss = \[\[1\], \[1, 2\]\] is not an array of real num"),
     ({"d_ss": [1]}, ValueError, r"d_ss = \[1\] is given, but there are no disturbances: pass E"),
 ]
 
 
-@pytest.mark.parametrize("make", [LinearModel, LinearModel.from_continuous])
 @pytest.mark.parametrize(("changes", "error", "message"), BAD_MODELS)
 def test_bad_argument_of_a_model_is_named(
-    make: Any, changes: dict[str, Any], error: type[Exception], message: str
+    changes: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     values = {"A": [[1, 1], [0, 1]], "B": [[0], [1]], "dt": 1.0}
     with pytest.raises(error, match=message):
-        make(**{**values, **changes})
+        LinearModel.from_continuous(**{**values, **changes})
 
 
 BAD_DYNAMICS: list[tuple[dict[str, Any], type[Exception], str]] = [
@@ -60,12 +45,6 @@ BAD_DYNAMICS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"x_ss": [np.inf, 0]}, ValueError, r"x_ss has .* expected a vector of finite numbers, or NaN"),
     ({"u_ss": 0.0}, ValueError, r"u_ss has shape \(\) .* expected a vector"),
     ({"x_ss": []}, ValueError, r"x_ss has shape \(0,\) .* finite numbers, .* one at least"),
-    ({"u_ss": []}, ValueError, r"u_ss has shape \(0,\) .* finite numbers, .* one at least"),
-    (
-        {"scale": [[1], [1, 2]]},
-        TypeError,
-        r"scale = \[\[1\], \[1, 2\]\] is not an array of real num",
-    ),
     ({"f": lambda x, u: [1, 0]}, ValueError, "is no steady state.*NaN to have them solved"),
     ({"f": 3}, TypeError, "f = 3 must be a function"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
@@ -84,9 +63,7 @@ def test_bad_dynamics_are_named(
 BAD_PROBLEMS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"model": "pendulum"}, TypeError, "model = 'pendulum' must be a LinearModel"),
     ({"Q": np.eye(3)}, ValueError, r"Q has shape \(3, 3\), expected \(2, 2\)"),
-    ({"Q": 1}, ValueError, r"Q has shape \(\), expected \(2, 2\)"),
     ({"Q": [[1, NAN], [0, 1]]}, ValueError, "Q holds NaN"),
-    ({"Q": [["a", 0], [0, 1]]}, TypeError, "Q = .* is not an array of real numbers"),
     ({"Q": [[1, 2], [0, 1]]}, ValueError, r"Q is not symmetric: .* Pass \(Q \+ Q.T\) / 2"),
     ({"Q": [[1, 2], [2, 1]]}, ValueError, "Q must be positive semi-definite, .* is -1"),
     (
@@ -95,39 +72,21 @@ BAD_PROBLEMS: list[tuple[dict[str, Any], type[Exception], str]] = [
         "R must be positive definite, .* is 0, where .* Give every",
     ),
     ({"R": [[-1]]}, ValueError, "R must be positive semi-definite, its smallest eigenvalue is -1"),
-    ({"R": np.eye(2)}, ValueError, r"R has shape \(2, 2\), expected \(1, 1\)"),
-    ({"R": [[INF]]}, ValueError, "R holds NaN or infinite entries"),
     ({"horizon": 0}, ValueError, "horizon = 0 must be a whole number of at least 1"),
-    ({"horizon": -1}, ValueError, "horizon = -1 must be a whole number of at least 1"),
     ({"horizon": 2.5}, TypeError, "horizon = 2.5 must be a whole number of steps"),
     ({"horizon": True}, TypeError, "horizon = True must be a whole number of steps"),
-    ({"horizon": "2"}, TypeError, "horizon = '2' must be a whole number of steps"),
     ({"gamma": 0}, ValueError, r"gamma = 0 must lie in \(0, 1\]"),
     ({"gamma": 1.5}, ValueError, r"gamma = 1.5 must lie in \(0, 1\]"),
-    ({"gamma": NAN}, ValueError, r"gamma = nan must lie in \(0, 1\]"),
     ({"gamma": "high"}, TypeError, "gamma = 'high' must be a number"),
-    ({"gamma": [0.9, 0.9]}, TypeError, r"gamma = \[0.9, 0.9\] must be a number"),
     ({"u_min": 2}, ValueError, "u_min must lie below u_max, but entry 0 has u_min = 2 and u_max ="),
-    ({"u_min": 1}, ValueError, "u_min must lie below u_max, but entry 0 has u_min = 1 and u_max ="),
     ({"u_min": [-1, -1]}, ValueError, r"u_min has shape \(2,\), expected \(1,\) or a single"),
     ({"u_max": NAN}, ValueError, "u_max holds NaN: .* Use inf for 'no bound'"),
-    ({"u_max": "high"}, TypeError, "u_max = 'high' is not an array of real numbers"),
-    ({"u_max": -INF}, ValueError, "u_min must lie below u_max"),
     ({"x_min": [0, 5]}, ValueError, "x_min must lie below x_max, but entry 1 has x_min = 5"),
-    ({"x_max": [1, 2, 3]}, ValueError, r"x_max has shape \(3,\), expected \(2,\) or a single"),
-    ({"x_max": [NAN, 1]}, ValueError, "x_max holds NaN"),
     ({"theta_min": 6}, ValueError, "theta_min must lie below theta_max, but entry 0"),
-    ({"theta_max": [[1, 1]]}, ValueError, r"theta_max has shape \(1, 2\), expected \(2,\)"),
     (
         {"infeasible": "mean"},
         ValueError,
         r"infeasible = 'mean' must be one of \('nearest_region', 'zero_input'\)",
-    ),
-    ({"infeasible": None}, ValueError, "infeasible = None must be one of"),
-    (
-        {"infeasible": np.array(["zero_input", "zero_input"])},
-        ValueError,
-        "infeasible = .* must be one of",
     ),
     ({"terminal": np.eye(2)}, TypeError, "(?s)terminal = .* must be of the class Terminal"),
 ]
@@ -135,13 +94,9 @@ BAD_PROBLEMS: list[tuple[dict[str, Any], type[Exception], str]] = [
 BAD_TERMINALS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"cost": np.eye(3)}, ValueError, r"Terminal.cost has shape \(3, 3\), expected \(2,"),
     ({"cost": -np.eye(2)}, ValueError, "Terminal.cost must be positive semi-definite"),
-    ({"cost": 1}, ValueError, r"Terminal.cost has shape \(\), expected \(1, 1\)"),
     ({"set": 5}, TypeError, r"Terminal.set must be a pair \(F, g\) of arrays .* got int"),
-    ({"set": (np.eye(2),)}, TypeError, r"Terminal.set must be a pair .* got tuple"),
     ({"set": (np.eye(3), [1] * 3)}, ValueError, r"Terminal.set F has shape \(3, 3\)"),
-    ({"set": (np.eye(2), [1] * 3)}, ValueError, r"Terminal.set g has shape \(3,\), exp"),
     ({"set": (np.eye(2), [1, INF])}, ValueError, "Terminal.set g holds NaN or infinite"),
-    ({"set": ("F", "g")}, TypeError, "Terminal.set F = 'F' is not an array of real"),
 ]
 
 

@@ -63,13 +63,6 @@ def test_names_and_operating_point_stay_and_a_terminal_set_is_solved_anew() -> N
     assert len(offset_free(solved("invariant"))[0].terminal.set[1]) > 0
 
 
-def test_bounds_that_were_given_as_the_plant_shows_them_are_shown_so() -> None:
-    tank = LinearModel([[0.5]], [[1.0]], 1, x_ss=[3], u_ss=[1.5])
-    box = {"x_min": 2, "x_max": 4, "u_min": 1, "u_max": 2}
-    mpc, _ = offset_free(LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **box))
-    assert "x_min=[2], x_max=[4], u_min=[1], u_max=[2]" in repr(mpc)
-
-
 def test_the_notes_of_the_model_stay_and_its_drift_is_made_up_for() -> None:
     noted = LinearModel(
         [[0.8]], [[0.3]], 2.0, notes=["fitted to a log"], drift=[0.4], state_names=["T"]

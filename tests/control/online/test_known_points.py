@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 
 import numpy as np
-import pytest
 
 from general_problems import solved
 from sb3_yann.control.online import KnownPoints
@@ -22,29 +21,12 @@ class Counted:
         return np.column_stack([rows.sum(1), rows[:, 0]])
 
 
-def test_a_row_is_computed_once() -> None:
-    counted, rows = Counted(), np.random.default_rng(0).normal(size=(500, 3))
-    known = KnownPoints(counted, 2)
-    first = known(rows)
-    assert counted.rows == 500
-    assert np.array_equal(known(rows[::-1].copy()), first[::-1])
-    assert counted.rows == 500
-    assert np.array_equal(first, Counted()(rows))
-
-
 def test_a_full_table_forgets_and_stays_right() -> None:
     counted, rows = Counted(), np.random.default_rng(0).normal(size=(1000, 2))
     known = KnownPoints(counted, 2, size=64)
     for _ in range(3):
         assert np.array_equal(known(rows), Counted()(rows))
     assert counted.rows > 2000
-
-
-@pytest.mark.parametrize("size", [0, 1])
-def test_no_rows_and_zeros_are_rows_too(size) -> None:
-    known = KnownPoints(Counted(), 2)
-    for _ in range(2):
-        assert np.array_equal(known(np.zeros((size, 3))), np.zeros((size, 2)))
 
 
 def test_what_a_law_remembers_does_not_travel() -> None:
