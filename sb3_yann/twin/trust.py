@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.identification.frozen import frozen_rows, words_for
+from sb3_yann.control.identification.fit import frozen_rows, words_for
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.alignment import objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of

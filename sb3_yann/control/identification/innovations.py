@@ -39,24 +39,17 @@ TINY_RIDGE = 1e-9
 class Innovations:
     """``x[k+1] = A x[k] + B v[k] + c + K e[k]``, ``y[k] = C x[k] + y_0 + e[k]``.
 
-    Attributes
-    ----------
-    A, B, K, C : ndarray, shapes (n, n), (n, m + d), (n, q) and (q, n)
-    c, y_0 : ndarray, shapes (n,) and (q,)
-    noise : ndarray, shape (q, q)
-        Covariance of e.
-    sparse : bool
-        Whether some outputs are read now and then only: K and the noise are those of the samples
-        at which they are.
+    Where some outputs are read now and then only, ``sparse``, K and the noise are those of the
+    samples at which they are.
     """
 
-    A: Array
-    B: Array
-    K: Array
-    C: Array
-    c: Array
-    y_0: Array
-    noise: Array
+    A: Array  # (n, n)
+    B: Array  # (n, m + d)
+    K: Array  # (n, q)
+    C: Array  # (q, n)
+    c: Array  # (n,)
+    y_0: Array  # (q,)
+    noise: Array  # (q, q), covariance of e
     sparse: bool = False
 
     @property
@@ -178,12 +171,7 @@ def no_effect(found: Regression, columns: Sequence[int], chance: float) -> bool:
 class Past:
     """The state of each order as a linear function of the past, by predictor-based subspaces.
 
-    Parameters
-    ----------
-    episodes : sequence of Episode
-        Outputs as states; inputs moved by their dead times.
-    rare : ndarray of bool, shape (q,), optional
-        Outputs that are read now and then: stand-ins take their place.
+    Inputs are moved by their dead times. For ``rare`` outputs (q,) there are stand-ins.
     """
 
     def __init__(self, episodes: Sequence[Episode], rare: NDArray[np.bool_] | None = None) -> None:
@@ -443,19 +431,9 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
 def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Array, Array]) -> Array:
     """Return the states (T + 1, n) that the outputs before each sample tell.
 
-    The filter begins with a mean and a covariance, and goes on without what is missing. Where some
-    outputs are read now and then its gain is K throughout.
-
-    Parameters
-    ----------
-    model : Innovations
-        The plant.
-    outputs : ndarray, shape (T + 1, q)
-        NaN where there is no reading.
-    moved : ndarray, shape (T, n)
-        ``B v + c`` of each step.
-    start : pair of ndarray, shapes (n,) and (n, n)
-        Mean and covariance of the first state.
+    The filter begins with a mean (n,) and a covariance (n, n), and goes on without readings that
+    are NaN. ``moved`` (T, n) is ``B v + c`` of each step. Where some outputs are read now and then
+    the gain is K throughout.
     """
     A, C, K, noise = model.A, model.C, model.K, model.noise
     there: NDArray[np.bool_] = np.isfinite(outputs)

@@ -25,36 +25,21 @@ NOT_EXCITED = (
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """``x[k+1] = reached + coefficients (z[k] - center)``, n states x, p regressors z.
+    """``x[k+1] = reached + coefficients (z[k] - center)``, n states x, p regressors z."""
 
-    Attributes
-    ----------
-    coefficients, standard_errors : ndarray, shape (n, p)
-    center, reached : ndarray, shapes (p,) and (n,)
-    spread, factors : ndarray, shape (p,)
-        Root mean square about the center; a column's standard errors over the residuals' deviation.
-    correlation : ndarray, shape (p, p)
-        ``outer(covariance, correlation)`` is the coefficients' covariance.
-    covariance, autocorrelation : ndarray, shapes (n, n) and (n,)
-        Of the residuals; the latter one step apart, zero where they are rounding.
-    degrees_of_freedom, steps : int
-    excitation, weakest : float and str
-        Smallest over largest singular value of the scaled regressors; what moved least.
-    """
-
-    coefficients: Array
-    standard_errors: Array
-    center: Array
-    reached: Array
-    spread: Array
-    factors: Array
-    correlation: Array
-    covariance: Array
-    autocorrelation: Array
+    coefficients: Array  # (n, p)
+    standard_errors: Array  # (n, p)
+    center: Array  # (p,)
+    reached: Array  # (n,)
+    spread: Array  # (p,), root mean square about the center
+    factors: Array  # (p,), a column's standard errors over the residuals' deviation
+    correlation: Array  # (p, p): its outer product with covariance is that of the coefficients
+    covariance: Array  # (n, n), of the residuals
+    autocorrelation: Array  # (n,), of residuals one step apart; zero where they are rounding
     degrees_of_freedom: int
     steps: int
-    excitation: float
-    weakest: str
+    excitation: float  # smallest over largest singular value of the scaled regressors
+    weakest: str  # what moved least
 
     def predict(self, regressors: Array) -> Array:
         """Return the next states (k, n) for regressors (k, n+m+d)."""

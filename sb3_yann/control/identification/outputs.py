@@ -42,41 +42,18 @@ WORSE = 1.1
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """A model of outputs, with what chose it.
-
-    Attributes
-    ----------
-    model : Innovations
-        In scaled units.
-    delays : tuple of int
-    errors : ndarray, shape (q,)
-        Root mean square of free runs over held-out data, in spreads of the outputs; NaN without.
-    criterion : float
-        Hannan and Quinn's, for each step.
-    start : pair of ndarray, shapes (n,) and (n, n)
-        Mean and covariance of the states.
-    fits : tuple of ndarray, shapes (q,)
-        One and `AHEAD` steps ahead over held-out data, in percent; NaN without such.
-    refined : bool
-        Whether prediction errors refined it.
-    idle : tuple of int
-        Inputs and disturbances without effect that can be told from 0.
-    feedback : tuple of (int, float)
-        Inputs that follow the outputs, and what share of them does not.
-    curvature : ndarray, shape (q,)
-        Share of the prediction errors' variance that squares and products explain.
-    """
+    """A model of outputs in scaled units, with what chose it; NaN without held-out data."""
 
     model: Innovations
     delays: tuple[int, ...]
-    errors: Array
-    criterion: float
-    start: tuple[Array, Array]
-    fits: tuple[Array, Array]
-    refined: bool = False
-    idle: tuple[int, ...] = ()
-    feedback: tuple[tuple[int, float], ...] = ()
-    curvature: Array = field(default_factory=lambda: np.zeros(0))
+    errors: Array  # (q,), root mean square of free runs, in spreads of the outputs
+    criterion: float  # Hannan and Quinn's, for each step
+    start: tuple[Array, Array]  # mean (n,) and covariance (n, n) of the states
+    fits: tuple[Array, Array]  # (q,) each, one and `AHEAD` steps ahead, in percent
+    refined: bool = False  # by prediction errors
+    idle: tuple[int, ...] = ()  # inputs and disturbances without effect that can be told from 0
+    feedback: tuple[tuple[int, float], ...] = ()  # inputs that follow outputs; what does not
+    curvature: Array = field(default_factory=lambda: np.zeros(0))  # (q,), share of the errors
 
     @property
     def error(self) -> float:
@@ -126,10 +103,7 @@ def fit_structure(
 def _feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, float]]:
     """Return the inputs that follow earlier outputs, and what share of them does not.
 
-    Raises
-    ------
-    ValueError
-        For an input that is a function of earlier outputs and inputs alone.
+    ValueError for an input that is a function of earlier outputs and inputs alone.
     """
     longer = [each for each in episodes if len(each) > lags]
     if sum(map(len, longer)) <= 10 * lags * episodes[0].regressors.shape[1]:

@@ -7,7 +7,7 @@ import pytest
 
 from sb3_yann import LinearModel
 from sb3_yann.control import identify
-from sb3_yann.control.identification.frozen import frozen_rows
+from sb3_yann.control.identification.fit import frozen_rows
 
 
 def log(steps: int = 200, noise: float = 0.0, hold: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -248,7 +248,9 @@ def test_input_without_effect_is_warned_of() -> None:
 
 def test_sensor_noise_is_taken_for_no_delay() -> None:
     for seed in range(5):
-        identify(*record(seed, 4000, sensor=0.1)[:2], dt=1)  # a warning would be an error
+        noisy = record(seed, 4000, sensor=0.1)[:2]
+        identify(*noisy, dt=1)  # a warning would be an error
+        assert identify(*noisy, dt=1, delay="auto").delays == (0,)
 
 
 def closed_loop(test_signal: float) -> tuple[np.ndarray, np.ndarray]:
