@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
-"""Okabe and Ito's, told apart with any color vision (*Color Universal Design*, 2008)."""
+"""Okabe and Ito's, distinct with any color vision (*Color Universal Design*, 2008)."""
 REST = "#D9D9D9"
 LIMIT = {"color": "black", "linestyle": (0, (5, 2)), "linewidth": 1.0}
 SET_POINT = {"color": "black", "linestyle": ":", "linewidth": 1.4}

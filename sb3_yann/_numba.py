@@ -1,4 +1,4 @@
-"""The decorator that compiles, and what tells when kept machine code is out of date."""
+"""The decorator that compiles, and the check whether kept machine code is out of date."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ COST_ROUNDING = 1e-6
 WORST_START = 10.0
 """With a CVaR: how many times as much as on average a single start may cost more."""
 FEW_PAIRS = 12
-"""Pairs that a drift can line up by the order that is drawn, which no standard error tells."""
+"""Pairs that a drift can line up by the order that is drawn, which no standard error shows."""
 HARDEST = 10
 """New starts that join those of every later candidate at a time."""
 
@@ -123,7 +123,7 @@ class AcceptanceRule:
 class Verdict(NamedTuple):
     """Whether a policy is no worse, and whether more starts would change that.
 
-    The reason is empty where it is accepted. ``breaks_limit`` tells that it breaks a limit that the
+    The reason is empty where it is accepted. ``breaks_limit``: it breaks a limit that the
     policy before does not: then there is no patience. ``above_mpc``: its mean cost is above the
     MPC's. ``is_sure``: its mean cost is surely lower, at the level that was asked for.
     ``is_hopeless``: more starts would hardly show a gain that counts.
@@ -145,7 +145,7 @@ class Scores(NamedTuple):
     """What a policy's episodes cost and break, in the order of their seeds.
 
     ``costs`` (episodes,) hold the penalty of soft bounds, ``unsafe`` (episodes, 9) is that of
-    :func:`unsafe_columns`, and ``visits`` (episodes, regions) tells which regions the episodes come
+    :func:`unsafe_columns`, and ``visits`` (episodes, regions) says which regions the episodes come
     through: other networks have no effect on them.
     """
 

@@ -213,7 +213,7 @@ class Log:
             first = episodes[0]
             raise ValueError(
                 f"states has shape {first.states.shape} and actions {first.inputs.shape}: one step "
-                "tells nothing. Rows are samples and columns states or inputs; transpose a log "
+                "says nothing. Rows are samples and columns states or inputs; transpose a log "
                 "that has them otherwise."
             )
         dt = check_positive("dt", dt)
@@ -357,8 +357,8 @@ def _stretches(
     found = []
     for i, each in enumerate(episodes):
         there: NDArray[np.bool_] = np.all(np.isfinite(each.states[:, ~rare]), axis=1)
-        told = np.isfinite(each.driven).all(axis=1)
-        whole = np.all([there[:-1], there[1:], told], axis=0)
+        complete = np.isfinite(each.driven).all(axis=1)
+        whole = np.all([there[:-1], there[1:], complete], axis=0)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))
         found += [(i, int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return found

@@ -32,7 +32,7 @@ SIZES = (1.0, 0.5, 0.2, 0.05)
 SETTLED = 1e-5
 """A start is done when a correction saves less than this part of its cost."""
 ROUNDS, RACE = 40, 4
-"""Corrections at most; after how many the best of several beginnings goes on."""
+"""Corrections at most; after how many the best of several initial guesses goes on."""
 SOFT = 1e-2
 """Bounds count so much less at first: stiff ones would end a search where it meets them."""
 DAMPED, PATIENCE = 10.0, 5
@@ -391,7 +391,7 @@ def _feedback(H: Array, G: Array, at_low: Mask, at_high: Mask, moving: Mask) -> 
     """Return the gains (k, m, n_theta) of the minimizers in a box whose sides may move.
 
     H (k, m, m) is the curvature, G (k, m, n_theta) how the gradient changes with theta, and
-    ``moving`` (2, k, m) tells whether the lower and the upper bound move with the previous input,
+    ``moving`` (2, k, m) says whether the lower and the upper bound move with the previous input,
     theta's last entries.
     """
     held, m = at_low | at_high, H.shape[1]

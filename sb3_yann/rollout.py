@@ -594,7 +594,7 @@ def maker(env: Any, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]
 
 
 class OneOf(gym.Env[Any, Any]):
-    """One env of a Stable-Baselines3 VecEnv: it waits for no other, and begins where it is told to.
+    """One env of a Stable-Baselines3 VecEnv: it waits for no other, and resets alone.
 
     The VecEnv is not closed.
     """

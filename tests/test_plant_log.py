@@ -72,7 +72,7 @@ def test_disturbances_are_columns_behind_the_inputs_and_one_step_is_no_log() -> 
     several = Log.from_arrays(np.zeros((2, 4, 2)), np.ones((2, 3, 1)), 1.0)
     assert several.sizes == (2, 1, 0) and [len(each) for each in several.episodes] == [3, 3]
     assert [each[1].shape for each in several] == [(3, 1), (3, 1)]
-    with pytest.raises(ValueError, match="one step tells nothing"):
+    with pytest.raises(ValueError, match="one step says nothing"):
         Log.from_arrays(x[:2], u[:1], 1.0)
 
 

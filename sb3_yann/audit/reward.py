@@ -31,7 +31,7 @@ _EFFECTS = {
     "FlattenObservation": "",
     "TransformObservation": "changes observations: pass policy_kwargs={'observation': ...}",
     "MaxAndSkipObservation": "repeats actions",
-    "StickyAction": "does not always do what it is told: leave it out",
+    "StickyAction": "does not always take the action: leave it out",
     "RepeatAction": "repeats actions: the MPC needs the sampling time and weights of all of them",
     "RescaleAction": "changes actions: build the LinearMPC for the inputs that the env takes",
     "ClipAction": "",

@@ -77,7 +77,7 @@ class Commissioning:
         models lie beside it.
     excite : float, default 0
         How far inputs may be moved at random beside the MPC's, as a fraction of their range, in
-        every other episode while no policy is on trial: so a log of the MPC alone tells their
+        every other episode while no policy is on trial: so a log of the MPC alone shows their
         gains.
     shadow : bool, default False
         The MPC acts throughout; the record shows what the policy would have done.

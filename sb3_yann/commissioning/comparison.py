@@ -44,7 +44,7 @@ class Costs(NamedTuple):
     difference : Difference
         Of all pairs since the policy is on trial, in the order in which they were played.
     look : int
-        How often the policy has been looked at, this one included.
+        Looks at the policy so far, this one included.
     own_reward : bool
         Whether the costs are minus the rewards, which are not the stage cost: no twin knows them.
     longer : str
@@ -137,7 +137,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
     if not costs.difference.pairs:
-        return "no pair of episodes tells what it costs"
+        return "no pair of episodes shows what it costs"
     more = costs.difference.mean
     room = costs.difference.room(RULE.significance)
     if not more <= min(room, MOST * abs(costs.mpc)):  # nor does NaN pass

@@ -216,7 +216,8 @@ class Journal:
         return [
             number
             for number in range(self.state.first, len(self.episodes))
-            if self.episodes[number].tells and len(self.episodes[number].actions) >= SHORTEST
+            if self.episodes[number].usable_for_fitting
+            and len(self.episodes[number].actions) >= SHORTEST
         ]
 
     @property
@@ -225,7 +226,9 @@ class Journal:
 
         An episode that began and never ended counts as one.
         """
-        return bool(self._open) or (bool(self.episodes) and not self.episodes[-1].tells)
+        return bool(self._open) or (
+            bool(self.episodes) and not self.episodes[-1].usable_for_fitting
+        )
 
     @property
     def cut_off(self) -> int:
@@ -270,7 +273,7 @@ class Journal:
         self._close(batch, state)
 
     def _take(self, event: Event) -> None:
-        """Do again what an event of the record tells."""
+        """Do again what an event of the record says."""
         if event["event"] == "start":
             self._begin(event["acts"])
         elif event["event"] == "interrupted":

@@ -63,7 +63,7 @@ class PlantEpisode:
     excited: bool = False
 
     @property
-    def tells(self) -> bool:
+    def usable_for_fitting(self) -> bool:
         """Whether it shows the plant as it is: no sensor and no actuator was doubted."""
         return self.alarm is None or self.alarm.kind == "violation"
 

@@ -1,4 +1,4 @@
-"""A watchdog: tells within an episode that the plant is no longer what its twin describes."""
+"""A watchdog: says within an episode that the plant is no longer what its twin describes."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class Alarm:
 
 
 @dataclass(frozen=True)
-class Familiarity:
-    """How far the twin may be wrong at a point that the log tells little about.
+class PredictiveVariance:
+    """How far the twin may be wrong at a point that the log shows little of.
 
     The standard deviation of fits without each fold of the episodes; beyond the log also what the
     residual explains, times the distance in widths of the log.
@@ -106,7 +106,7 @@ class Bands:
 
     Attributes
     ----------
-    known : Familiarity
+    known : PredictiveVariance
     error : ndarray, shape (n,)
         Root mean squares of one-step errors.
     spread, most : ndarray, shape (gains, n)
@@ -119,7 +119,7 @@ class Bands:
         By how much the largest ratio is exceeded only where something is wrong.
     """
 
-    known: Familiarity
+    known: PredictiveVariance
     error: Array
     spread: Array
     most: Array
@@ -149,7 +149,7 @@ class Bands:
         explained = [twin.dynamics.residual(e.thetas[None, :-1], e.actions[None])[0] for e in log]
         size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST * error) ** 2)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log])
-        known = Familiarity(unseen, seen.min(axis=0), seen.max(axis=0), size)
+        known = PredictiveVariance(unseen, seen.min(axis=0), seen.max(axis=0), size)
         means, doubts = [], []
         for each, errors in zip(log, left, strict=True):
             charts = _Charts(len(units))
@@ -186,7 +186,7 @@ class Watchdog:
 
     Innovations are charted at several gains: at once for what is abrupt, averaged over up to 50
     samples for what is small and lasts. Their bands come from episodes of the log that the fit
-    has not seen, times a factor. They widen where the log tells little. A reading that repeats
+    has not seen, times a factor. They widen where the log shows little. A reading that repeats
     itself while the twin moves is frozen.
 
     Make one with :meth:`of`, anew after each fit of the twin. It holds nothing from one episode

@@ -34,7 +34,7 @@ class StateEstimator:
     Parameters
     ----------
     model : LinearModel
-        Disturbances that are not ``estimated`` are measured, and :meth:`update` is told them.
+        Disturbances that are not ``estimated`` are measured, and :meth:`update` takes them.
     measured : array_like, shape (q, n), or list of int, optional
         C, or the indices of the measured states. The default is the model's C.
     state_noise, disturbance_noise, measurement_noise : array_like or float, default 1
@@ -82,7 +82,7 @@ class StateEstimator:
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        known = self._told(model)
+        known = self._measured(model)
         n, d = model.n_states, model.n_disturbances - len(known)
         self.model = model
         self.C = check_outputs("measured", model.shown if measured is None else measured, n)
@@ -121,7 +121,7 @@ class StateEstimator:
             )
         self.estimate: Array = np.zeros(n + d)
 
-    def _told(self, model: LinearModel) -> list[int]:
+    def _measured(self, model: LinearModel) -> list[int]:
         """Return which disturbances are measured."""
         return [*model.measured]
 
@@ -137,7 +137,7 @@ class StateEstimator:
 
     @property
     def n_known(self) -> int:
-        """Number of measured disturbances, which :meth:`update` is told."""
+        """Number of measured disturbances, which :meth:`update` takes."""
         return int(self.E.shape[1])
 
     @property
@@ -201,7 +201,7 @@ class StateEstimator:
     def _after(self, u: ArrayLike, d: ArrayLike | None) -> Array:
         if (d is None) != (self.n_known == 0):
             raise ValueError(
-                f"d = {d!r}, but the observer is told {self.n_known} measured disturbances: those "
+                f"d = {d!r}, but the observer takes {self.n_known} measured disturbances: those "
                 "of its model that are not `estimated`. Pass what acted together with u."
             )
         moved = self.A @ self.estimate + self.B @ check_array("u", u, (self.model.n_inputs,))
@@ -219,9 +219,9 @@ class StateEstimator:
                 spread = self.C_aug @ P @ self.C_aug.T + V
                 gain = np.asarray(np.linalg.solve(spread, self.C_aug @ P).T)
                 if np.any(cross):
-                    # What v tells of w moves the state one sample later.
-                    told = np.linalg.solve(spread, cross.T).T
-                    gain = gain + np.linalg.lstsq(self.A, told, rcond=None)[0]
+                    # What v shows of w moves the state one sample later.
+                    shared = np.linalg.solve(spread, cross.T).T
+                    gain = gain + np.linalg.lstsq(self.A, shared, rcond=None)[0]
             if self._radius(gain) < 1:
                 return gain
         except ValueError:  # a LinAlgError is one
@@ -238,10 +238,10 @@ class StateEstimator:
             seen = np.flatnonzero(k % self.every == 0)
             S = C[seen] @ P @ C[seen].T + V[np.ix_(seen, seen)]
             own = np.linalg.solve(S, C[seen] @ P).T
-            told = np.linalg.solve(S, cross[:, seen].T).T
+            next_step = np.linalg.solve(S, cross[:, seen].T).T
             if k >= (PERIODS - 1) * period:
-                total[:, seen] += own + np.linalg.lstsq(A, told, rcond=None)[0]
-            ahead = A @ own + told
+                total[:, seen] += own + np.linalg.lstsq(A, next_step, rcond=None)[0]
+            ahead = A @ own + next_step
             moved = A - ahead @ C[seen]
             shared = ahead @ cross[:, seen].T
             P = (
@@ -285,12 +285,12 @@ class DisturbanceObserver(StateEstimator):
     [2.0]
     """
 
-    def _told(self, model: LinearModel) -> list[int]:
-        told = [*model.measured] if model.estimated else []
-        if len(told) == model.n_disturbances:
+    def _measured(self, model: LinearModel) -> list[int]:
+        measured = [*model.measured] if model.estimated else []
+        if len(measured) == model.n_disturbances:
             hint = "pass its matrix E, e.g. E = B for a load at the input."
             raise ValueError(f"The model has no disturbance to estimate: {hint}")
-        return told
+        return measured
 
 
 def _covariance(name: str, value: ArrayLike, size: int) -> tuple[Array, list[float]]:

@@ -30,7 +30,7 @@ class Checks:
         goes on without it, elsewhere the last good one stands in.
     late_after : float, optional
         A step is late when more time has passed since the last one, in units of dt, 1.5 by default.
-        It is checked where a step is told the time. None checks nothing.
+        It is checked where a step is passed the time. None checks nothing.
     hold : int, default 5
         Steps with a faulty reading that the last good one stands in for; then the output is held.
     recover : int, default 10

@@ -332,14 +332,14 @@ class Controller:
         given = np.full(m, np.nan) if manual is None else _as_readings("manual", manual)
         if given.shape != (m,):
             raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
-        told = self.counters["steps"] == 0 and bool(np.isfinite(given).all())
-        if told:
+        known = self.counters["steps"] == 0 and bool(np.isfinite(given).all())
+        if known:
             self._output = given.copy()
         faulty, status = self._readings(rows[0])
         if elapsed is not None and elapsed > float(data["late_after"]):
             status |= Status.LATE
         mode = self._mode(status)
-        seen = self._seen(rows[0], faulty, told)
+        seen = self._seen(rows[0], faulty, known)
         action, low, high, inside, sound = self._act(seen[None], mode == POLICY)
         status |= Status(0) if inside[0] else Status.OUTSIDE
         status |= Status(0) if sound[0] else Status.NETWORK
@@ -348,7 +348,7 @@ class Controller:
         if mode == MANUAL:
             by_hand = np.isfinite(given) & (self.request == MANUAL)
             target = np.where(by_hand, given, self._output)
-        if mode != self.mode or told:
+        if mode != self.mode or known:
             self.counters["changes"] += mode != self.mode
             self._left = int(data["transfer"])
             self._bump = self._output - target
@@ -391,14 +391,14 @@ class Controller:
         self._good = np.where(faulty, self._good, obs)
         return faulty, status
 
-    def _seen(self, obs: Array, faulty: NDArray[np.bool_], told: bool) -> Array:
+    def _seen(self, obs: Array, faulty: NDArray[np.bool_], known: bool) -> Array:
         """Return what the policy sees: good readings, estimates and the last input, each in place.
 
         Parameters
         ----------
         obs, faulty : ndarray, shape (n_read,)
             The readings, and which are not good.
-        told : bool
+        known : bool
             Whether this is the first step and the plant's present input is known.
         """
         data = self.data
@@ -413,7 +413,7 @@ class Controller:
                 found = data["est_next"] @ [*self._estimate, *u, *self._loads, 1.0]
                 left = y - data["est_C"] @ found
                 found = found + data["est_gain"] @ np.where(np.isfinite(left), left, 0.0)
-            elif told:
+            elif known:
                 found = data["est_rest"] @ [*np.where(np.isnan(y), rest, y), *u, *loads, 1.0]
             else:
                 found = data["est_first"] @ [*np.where(np.isnan(y), rest, y), 1.0]

@@ -156,7 +156,7 @@ def _shows_theta(policy: Any) -> bool:
 
 
 def _with_sources(problem: LinearMPC) -> list[str]:
-    """Return the names of theta's entries, with who tells a disturbance."""
+    """Return the names of theta's entries, with the source of a disturbance."""
     labels, layout = [*problem.labels()], problem.layout
     for i, name in enumerate(layout.names):
         if layout.disturbance.start <= i < layout.disturbance.stop:

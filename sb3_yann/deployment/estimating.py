@@ -46,11 +46,11 @@ def estimator_arrays(
     """
     model, layout = problem.model, problem.layout
     _require_same(model, estimator)
-    q, size, told = estimator.n_measured, len(estimator.A), estimator.n_known
-    estimated = [*range(told, model.n_disturbances)]
+    q, size, n_known = estimator.n_measured, len(estimator.A), estimator.n_known
+    estimated = [*range(n_known, model.n_disturbances)]
     x = np.concatenate([model.x_ss, model.d_ss[estimated]])
     y = estimator.C_aug @ x
-    driven = np.concatenate([model.u_ss, model.d_ss[:told]])
+    driven = np.concatenate([model.u_ss, model.d_ss[:n_known]])
     step = np.hstack([estimator.A, estimator.B, estimator.E])
     smallest = np.zeros((size, q))
     smallest[: model.n_states] = np.linalg.pinv(estimator.C)
@@ -67,7 +67,7 @@ def estimator_arrays(
     source[from_filter] = n_read + np.arange(size)
     source[previous] = n_read + size + np.arange(len(previous))
     limits = np.full(model.n_states, np.inf)
-    d_min, d_max = (getattr(problem.disturbances, side)[told:] for side in ("d_min", "d_max"))
+    d_min, d_max = (getattr(problem.disturbances, side)[n_known:] for side in ("d_min", "d_max"))
     names = [*_output_names(estimator, seen), *(seen[i] for i in read)]
     scale = 1 / units.scale
     return {
@@ -77,7 +77,7 @@ def estimator_arrays(
         "est_C": estimator.C_aug,
         "est_gain": estimator.gain,
         "est_input": np.array([scale, model.u_ss - units.shift * scale]),
-        "est_loads": source[in_d[:told]],
+        "est_loads": source[in_d[:n_known]],
         "est_box": np.array([[*-limits, *d_min], [*limits, *d_max]]),
         "source": source,
         "obs_names": np.array(names),

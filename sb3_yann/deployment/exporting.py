@@ -81,7 +81,7 @@ def export(
         so. An MPC and a law take theta and put out the input, in plant units where the model has an
         operating point.
     path : str or PathLike
-        Its suffix tells the format.
+        Its suffix is the format.
     format : {"npz", "c", "onnx", "st", "xml", "fmu"}, optional
         ``npz`` is for :class:`Controller`, which needs numpy alone. ``c`` is C99: a file, its
         header beside it, and a test with known answers. ``onnx`` is a graph without memory, from
@@ -94,7 +94,7 @@ def export(
         Of the numbers in code and graphs.
     checks : Checks, optional
         Limits of the readings and how to fall back. By default only what is not finite is a fault,
-        and late steps where the time is told.
+        and late steps where the time is passed.
     estimator : StateEstimator or "caller", optional
         What estimates states and disturbances from measured outputs. It becomes part of the
         controller, which then takes the outputs y, references r, measured disturbances, and puts

@@ -85,7 +85,7 @@ class Run:
         Where there is a plant, its outputs are added to the first ones.
     elapsed, lost, requests, starts_anew : ndarray, shape (T,)
         Whether the first reading is lost, and whether the controller starts anew: the plant's input
-        is told it then.
+        takes it then.
     plant : dict of str to ndarray
         ``x+ = step_of_plant [x; u; loads; 1]`` from ``start_of_plant``, with the outputs
         ``C_of_plant x``; empty where there is none.

@@ -45,7 +45,7 @@ from sb3_yann.rollout import (
 )
 
 FIRST_LOOK = 5
-"""Starts of a trial after which it is looked at first."""
+"""Starts of a trial of its first look."""
 FIRST_FINAL_LOOK = 40
 """The same at the end: the worst 5 % of so many are two."""
 INTERIM_LEVEL = 0.2

@@ -216,7 +216,7 @@ def _event_above(guard: BaseCallback, callback: Any) -> EventCallback | None:
 
 
 class InterruptHandler:
-    """Ctrl-C during `learn`, of which SB3 tells no callback.
+    """Ctrl-C during `learn`, of which no callback of SB3 hears.
 
     Calls the handler that was there; where that raises, it restores the accepted policy. Once
     another exception has ended `learn`, it only passes on.

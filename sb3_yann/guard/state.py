@@ -311,14 +311,14 @@ def _rows(decisions: list[Decision], header: bool) -> str:
 
 
 ADVICE = {
-    "too little a gain": "see by headroom(mpc, env) what there is to gain",
+    "too little a gain": "see by headroom(mpc, env) what can be gained",
     "new starts": "raise n_eval_episodes: the known starts do not show what the new ones do",
     "violation": "bound the policy (max_correction), or tighten the MPC's own limits",
     "the env ends": "bound the policy (max_correction), or tighten the MPC's own limits",
-    "finite": "lower the learning rate; CostAudit shows what the critic is told",
+    "finite": "lower the learning rate; CostAudit shows what the critic learns from",
     "too far": "take networks='shared', whose policy is continuous",
     "costs": "bound the policy (max_correction), or allow the worst starts more (rule.margin)",
-    "mean cost": "see by headroom(mpc, env) what there is to gain, and by CostAudit whether the "
+    "mean cost": "see by headroom(mpc, env) what can be gained, and by CostAudit whether the "
     "reward is the MPC's cost",
 }
 """What helps against a reason for a refusal that holds such words: the first one that does."""

@@ -1,4 +1,4 @@
-"""What there is to gain over an MPC, and a better policy from a twin or a simulator."""
+"""What can be gained over an MPC, and a better policy from a twin or a simulator."""
 
 from sb3_yann.improvement.gains import Headroom
 from sb3_yann.improvement.improving import Improvement, improve

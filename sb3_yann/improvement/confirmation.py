@@ -1,4 +1,4 @@
-"""Pairs of episodes, one of the policy and one of the MPC, until they tell: the plant decides."""
+"""Pairs of episodes, one of the policy and one of the MPC: the plant decides."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def confirm(
     say: Callable[[str, int], None] = lambda text, pairs: None,
     significance: float = RULE.significance,
 ) -> tuple[Check, Pairs]:
-    """Play pairs from new starts until they tell; return the last look, and all pairs.
+    """Play pairs from new starts until they are decisive; return the last look, and all pairs.
 
     Looks come after 10, 20, 40 and 80 pairs; all together err with a probability of no more than
     ``significance``. A policy that breaks a bound, or does not gain, is refused at the first look
@@ -149,7 +149,7 @@ def confirm(
     number : int
         Of the check.
     say : callable
-        Is told what each look shows, and after how many pairs.
+        Called with what each look shows, and after how many pairs.
     significance : float
         Probability that a policy that is no better is accepted.
     """

@@ -1,4 +1,4 @@
-"""What there is to gain over an MPC, in figures and words."""
+"""What can be gained over an MPC, in figures and words."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CURE = (
     "mpc.disturbances.d_min, mpc.disturbances.d_max)."
 )
 ADVICE = {
-    "do not bother": "there is little to gain over the MPC.",
+    "keep the MPC": "there is little to gain over the MPC.",
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
     "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
     "headroom(...).reidentified.",
@@ -34,7 +34,7 @@ UNKNOWN = "not known"
 
 @dataclass(frozen=True)
 class Headroom:
-    """What there is to gain over an MPC, as :func:`headroom` has found it.
+    """What can be gained over an MPC, as :func:`headroom` has found it.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Headroom:
         the offset of a plant that is not its model; what the re-identified model gains beyond
         that; the rest.
     verdict : str
-        What to do: one of "do not bother", "add ObserveDisturbance first", "re-identify", "learn";
+        What to do: one of "keep the MPC", "add ObserveDisturbance first", "re-identify", "learn";
         "not known" where what was found is worth it but may be chance, and where nothing was found
         with plans that were made in a poor model.
     source : str
@@ -143,7 +143,7 @@ class Headroom:
     def _advice(self) -> str:
         """Return what the verdict means, and whether more starts might change it."""
         parts = self.offset, self.model_error, self.nonlinearity
-        if self.verdict != verdict_of(*parts) != "do not bother":
+        if self.verdict != verdict_of(*parts) != "keep the MPC":
             return "what was found may be chance on so few starts. Take more: n_starts=."
         poor = ""
         if self.lost is not None:
@@ -194,7 +194,7 @@ def verdict_of(offset: float, model_error: float, nonlinearity: float, doubt: fl
     Examples
     --------
     >>> verdict_of(0.0, 0.0, 0.015), verdict_of(0.0, 0.01, 0.005), verdict_of(0.0, 0.005, 0.02)
-    ('do not bother', 're-identify', 'learn')
+    ('keep the MPC', 're-identify', 'learn')
     """
     parts = offset, model_error, nonlinearity
     verdict = [*ADVICE][1 + int(np.argmax(parts))]
@@ -202,5 +202,5 @@ def verdict_of(offset: float, model_error: float, nonlinearity: float, doubt: fl
     if sum(parts) < worth and max(offset, model_error) >= LITTLE:
         verdict, worth = [*ADVICE][1 + int(np.argmax(parts[:2]))], LITTLE
     if sum(parts) < worth or WORTH > sum(parts) < doubt:
-        return "do not bother"
+        return "keep the MPC"
     return verdict if sum(parts) >= doubt else UNKNOWN

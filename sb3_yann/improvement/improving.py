@@ -347,7 +347,7 @@ class _Work:
     n_starts, rounds, updates, seed : int
         As for :func:`improve`.
     say : callable
-        Is told what is done.
+        Called with what is done.
     """
 
     def __init__(

@@ -99,7 +99,7 @@ def headroom(
     >>> from sb3_yann import headroom
     >>> mpc = gym.make("CSTR-v0").observation_space.problem
     >>> found = headroom(mpc, "CSTR-v0", n_starts=2)
-    >>> 0.01 < found.total < 0.05, found.verdict in ("learn", "do not bother")
+    >>> 0.01 < found.total < 0.05, found.verdict in ("learn", "keep the MPC")
     (True, False)
     """
     if not isinstance(mpc, LinearMPC):
@@ -277,8 +277,8 @@ class _Search:
             latest[now] = np.where(safe, loops.costs, base.costs[now])
             self.fair[f"plan {number}"] = latest.copy()
             simulator.learn(loops)
-            dearer = loops.costs - planning.promised(len(now))
-            kept = safe & (dearer <= KEPT * np.abs(base.costs).mean())
+            costlier = loops.costs - planning.promised(len(now))
+            kept = safe & (costlier <= KEPT * np.abs(base.costs).mean())
             todo = np.setdiff1d(todo, now[kept])
             left = (ROUNDS - 1 - number) * (time.monotonic() - began) * bool(len(todo))
             self.say(
@@ -307,7 +307,7 @@ class _Search:
         whole = Headroom(base, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
         lost = -gain(base, self.played.get("plan", base)) if self.poor else 0.0
-        if lost > 0 and verdict_of(*parts) == "do not bother":
+        if lost > 0 and verdict_of(*parts) == "keep the MPC":
             verdict = UNKNOWN
         return dataclasses.replace(
             whole,

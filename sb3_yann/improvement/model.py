@@ -236,7 +236,7 @@ class Scenarios:
     def like(cls, model: Model, episodes: Sequence[Episode], rng: np.random.Generator) -> Scenarios:
         """Return scenarios like some episodes, with their references and disturbances.
 
-        Every other one begins as its episode did, the others in the box of all beginnings.
+        Every other one begins as its episode did, the others in the box of all first states.
 
         Parameters
         ----------

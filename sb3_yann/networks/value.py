@@ -140,7 +140,7 @@ class QuadraticStateActionValue(nn.Module):
     """``Q(theta, a) = -[theta; u]' M [theta; u] + network``: u now, the law ever after.
 
     The critic of Braniff & Tian, Section 4.2. ``u`` is the input in physical units for an action
-    ``a`` in [-1, 1]. Only exploration tells this network how Q depends on a.
+    ``a`` in [-1, 1]. Only exploration shows this network how Q depends on a.
 
     Parameters
     ----------

@@ -418,7 +418,7 @@ def _with_one(terms: Value, n: int) -> Array:
 EPS = 1e-8
 """Of Adam, for gradients in units of the values' scale."""
 FOLLOWS, RECENT = 10, 0.1
-"""Updates after which the values' scale is looked at; share of that batch in the mean cost."""
+"""Updates after which the values' scale is checked; share of that batch in the mean cost."""
 
 
 def follow_scale(
@@ -441,7 +441,7 @@ def follow_scale(
     mean : Tensor, shape ()
         The mean stage cost until now, which takes in that of the critic's batch.
     taken : int
-        Updates of the critic so far: it is looked at after every tenth.
+        Updates of the critic so far: it is checked after every tenth.
     eps : float
         Of both optimizers, in units of their gradients.
     """

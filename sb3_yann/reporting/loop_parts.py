@@ -83,7 +83,7 @@ def loops_part(subject: Subject) -> Part:
             same if same else table(head, single[:1000]),
         ]
     )
-    less = less_safe(policy.unsafe(), mpc.unsafe())[:, :INPUT_STEP]  # of bounds the next part tells
+    less = less_safe(policy.unsafe(), mpc.unsafe())[:, :INPUT_STEP]  # the next part has the bounds
     bad = int(np.sum(less.any(axis=1)))
     finding = make_finding(
         not bad,

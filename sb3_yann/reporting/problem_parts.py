@@ -220,7 +220,7 @@ def law_part(subject: Subject) -> Part:
             f"For this report it was compared with an independent quadratic program at "
             f"{len(subject.samples)} random points of its box: {count} have a solution, the "
             f"largest difference of an input is {error:.1e} of half its range, and {doubtful} "
-            "points are judged solvable by one only."
+            "points are solvable by one only."
         ),
         paragraph(
             "The law inside the policy, without what it has learnt, differs by at most "
@@ -250,7 +250,7 @@ def _regions(subject: Subject) -> Html:
     names = " and ".join(problem.labels()[k] for k in plane)
     caption = (
         f"Regions of the law over {names}; the other parameters are at the operating point. "
-        "A number is a region, a color tells which constraints act in the optimal plan."
+        "A number is a region, a color shows which constraints act in the optimal plan."
     )
     return picture(partial(plot_regions, problem, entries=plane, by="constraint"), caption)
 

@@ -77,7 +77,7 @@ class _Replays:
 
     def __init__(self, judge: Judge, episodes: Sequence[Episode], remembers: bool) -> None:
         self.dynamics, self.members = judge.dynamics, len(judge.dynamics.members)
-        self.tells, self.units = False, judge.dynamics.coordinates.units
+        self.explains, self.units = False, judge.dynamics.coordinates.units
         row, steps = self.dynamics.row, max(map(len, episodes))
         at = [np.minimum(np.arange(steps + 1), len(each)) for each in episodes]
         self.rows = np.stack([e.thetas[k] for e, k in zip(episodes, at, strict=True)], axis=1)
@@ -180,7 +180,7 @@ class _Replays:
             rests = e - z @ weights[-1], e - z[..., :plain] @ short
             test = known & unseen if np.any(known & unseen) else known
             left += [np.sum((each[test] / self.units) ** 2) for each in rests]
-        self.tells = bool(left[0] < (1 - LESS) * left[1])
+        self.explains = bool(left[0] < (1 - LESS) * left[1])
         return np.array(weights)
 
 
@@ -230,7 +230,7 @@ def forecast(
     for judge in judges:
         law = law_of(judge.dynamics.problem)
         for remembers in (False, True):
-            if (judge.refuted and not remembers) or (remembers and not own.tells):
+            if (judge.refuted and not remembers) or (remembers and not own.explains):
                 continue
             replays = _Replays(judge, episodes, remembers)
             if surely_worse(replays.left - (own if remembers else plain).left):

@@ -157,7 +157,7 @@ class PlantTwin:
             that are not all of theta are what it measured, (T + 1, q), and it is run over them:
             a log of outputs is enough. ``disturbances`` are then the measured ones.
         residuals : sequence, default ("none", "linear", "quadratic", "network")
-            What there is to choose from. Networks are tried where nothing else predicts well.
+            The candidates. Networks are tried where nothing else predicts well.
         n_members : int, default 5
             The first is fitted to all episodes, the others to as many drawn from them.
         updates : int, default 3000

@@ -36,8 +36,8 @@ class Residual:
         k, n = L.shape
         hidden = np.zeros((k, 0)), np.zeros((1, 0)), np.zeros((0, 0)), np.zeros((1, 0))
         constant = np.zeros(n) if b is None else b
-        bent = np.zeros((k, k, n)) if Q is None else Q
-        return cls([*hidden, np.zeros((0, n)), constant[None], L, bent.reshape(k, k * n)])
+        quadratic = np.zeros((k, k, n)) if Q is None else Q
+        return cls([*hidden, np.zeros((0, n)), constant[None], L, quadratic.reshape(k, k * n)])
 
     @classmethod
     def zero(cls, k: int, n: int) -> Residual:

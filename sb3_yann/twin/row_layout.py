@@ -58,23 +58,23 @@ class RowLayout:
             )
         its, own = ((each.n_states, each.n_inputs) for each in (estimator.model, model))
         blind = model.n_disturbances - len(self.problem.extra)
-        told = estimator.model.n_disturbances
-        if its != own or not blind <= told <= model.n_disturbances:
+        theirs = estimator.model.n_disturbances
+        if its != own or not blind <= theirs <= model.n_disturbances:
             raise ValueError(
-                f"observer has {(*its, told)} states, inputs and disturbances, the problem "
+                f"observer has {(*its, theirs)} states, inputs and disturbances, the problem "
                 f"{(*own, model.n_disturbances)}. Give the observer of this problem's "
                 "disturbances, all of them."
             )
 
     @cached_property
     def observer(self) -> DisturbanceObserver | None:
-        """The estimator where it tells the plant's state and all disturbances, else None."""
+        """The estimator where it determines the plant's state and all disturbances, else None."""
         found, n = self.estimator, self.problem.model.n_states
         if not isinstance(found, DisturbanceObserver):
             return None
         square = found.C.shape == (n, n) and found.n_estimated == self._n_disturbances
-        told = square and max(map(np.linalg.cond, (found.C, found.gain[:n]))) < SINGULAR
-        return found if told else None
+        determined = square and max(map(np.linalg.cond, (found.C, found.gain[:n]))) < SINGULAR
+        return found if determined else None
 
     @property
     def _n_disturbances(self) -> int:
@@ -219,7 +219,7 @@ class RowLayout:
 
         Where d is NaN its states are the measured ones: the observer is run over them. Else what
         it measured follows from what it showed. An episode that begins amid an estimate loses its
-        first row: nothing tells what was measured there.
+        first row: what was measured there is not known.
         """
         if self.observer is None:
             return thetas, actions
@@ -267,14 +267,14 @@ class RowLayout:
         filtered, model = copy.deepcopy(self.estimator), self.estimator.model
         y = np.asarray(outputs, np.float64) - filtered.C @ model.x_ss
         u = np.asarray(inputs, np.float64).reshape(len(y) - 1, -1) - model.u_ss
-        told = filtered.n_known
-        d = None if loads is None or not told else loads[:, :told] - model.d_ss[:told]
+        n_known = filtered.n_known
+        d = None if loads is None or not n_known else loads[:, :n_known] - model.d_ss[:n_known]
         found = [filtered.reset(y[0])]
         for k in range(len(u)):
             found.append(filtered.update(y[k + 1], u[k], None if d is None else d[k]))
         x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
         bounds, known = self.problem.disturbances, self._n_disturbances - filtered.n_estimated
-        d_hat = np.clip(d_hat + model.d_ss[told:], bounds.d_min[known:], bounds.d_max[known:])
+        d_hat = np.clip(d_hat + model.d_ss[n_known:], bounds.d_min[known:], bounds.d_max[known:])
         return x_hat + model.x_ss, d_hat
 
     def _run(self, thetas: Array, actions: Array) -> Array:

@@ -21,7 +21,7 @@ DEGREES = {"linear": 1, "quadratic": 2}
 KINDS = ("none", *DEGREES, "network")
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 INPUT_FACTORS = (1.0, 30.0)
-"""How many times as strongly inputs are shrunk: the log of a closed loop tells little of them."""
+"""How many times as strongly inputs are shrunk: the log of a closed loop shows little of them."""
 LONGEST = 100
 """Steps of a free run, at most."""
 RUNS = 20

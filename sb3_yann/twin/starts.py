@@ -148,7 +148,7 @@ class Starts:
         return np.asarray(2 / (k + 1) * ((1 + np.maximum(rho, 1.0)) / 2) ** (1.0 - k))
 
     def draw_anywhere(self, count: int, rng: np.random.Generator) -> Array:
-        """Return rows (count, size), a third each of beginnings, of logged and of around."""
+        """Return rows (count, size), a third each of first states, of logged and of around."""
         third = count // 3
         parts = self.draw_logged(third, rng), self.draw_around(third, rng)
         return np.concatenate([self.draw_between(count - 2 * third, rng), *parts])

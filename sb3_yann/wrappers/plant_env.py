@@ -51,7 +51,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     Raises
     ------
     TypeError, ValueError
-        If an argument is of no use, or nothing tells where episodes begin.
+        If an argument is of no use, or it is not known where episodes begin.
 
     Examples
     --------
@@ -84,7 +84,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         if layout.n_disturbances and observer is None:
             raise ValueError(
                 "The MPC has disturbances, and f(x, u) has none. If they are estimated, pass the "
-                "observer. Else write an env that tells them, and wrap it in MeasuredDisturbance "
+                "observer. Else write an env that shows them, and wrap it in MeasuredDisturbance "
                 "and StageCost."
             )
         half = (mpc.theta_max - mpc.theta_min)[layout.state] / 4
@@ -95,7 +95,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         start = check_bounds("start", lowest, highest, n)
         if not np.all(np.isfinite(start)):
             raise ValueError(
-                "The MPC's box of states is not bounded, so nothing tells where episodes begin: "
+                "The MPC's box of states is not bounded, so it is not known where episodes begin: "
                 "pass start_low and start_high."
             )
         check_int("substeps", substeps)

@@ -322,19 +322,19 @@ def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
     return None
 
 
-def _require_told(observer: StateEstimator, measured: MeasuredDisturbance | None) -> None:
+def _require_known(observer: StateEstimator, measured: MeasuredDisturbance | None) -> None:
     """Raise unless an observer knows which disturbances the env measures, and comes after them."""
     shown = 0 if measured is None else measured.n_loads
-    model, told = observer.model, observer.n_known
-    if shown != told:
+    model, n_known = observer.model, observer.n_known
+    if shown != n_known:
         raise ValueError(
-            f"The env measures {shown} disturbances (MeasuredDisturbance), but the observer is "
-            f"told {told}: what it is not told it takes for unknown, and it would count twice. "
+            f"The env measures {shown} disturbances (MeasuredDisturbance), but the observer "
+            f"takes {n_known}: what it does not take it estimates, and that would count twice. "
             "Wrap the plant in MeasuredDisturbance first, and give the observer the MPC's model "
             "with E of all disturbances, the measured ones first: LinearModel(A, B, dt, E=E, "
             "estimated=[...])."
         )
-    if told and model.estimated and model.estimated[0] < told:
+    if n_known and model.estimated and model.estimated[0] < n_known:
         raise ValueError(
             f"estimated = {[*model.estimated]}: theta holds the measured disturbances before the "
             "estimated ones. Sort the columns of E so."
@@ -349,7 +349,7 @@ class EstimateState(Appending):
 
     The first entries of the env's observation are the measured outputs y (q,) of the estimator;
     what other wrappers have appended to them, such as a reference, stays where it is. Measured
-    disturbances come from a :class:`MeasuredDisturbance` below, and the estimator is told them.
+    disturbances come from a :class:`MeasuredDisturbance` below, and the estimator takes them.
 
     Parameters
     ----------
@@ -385,7 +385,7 @@ class EstimateState(Appending):
         free = np.full(observer.n_estimated, np.inf)
         low, high = -free if low is None else low, free if high is None else high
         self.measured: Any = _below(env, MeasuredDisturbance)
-        _require_told(observer, self.measured)
+        _require_known(observer, self.measured)
         if np.size(low) == np.size(high) == observer.model.n_disturbances:
             low, high = (np.ravel(side)[-observer.n_estimated :] for side in (low, high))
         super().__init__(env, low, high, observer.n_measured, observer.model.n_states)
@@ -396,10 +396,10 @@ class EstimateState(Appending):
             )
         self.observer = copy.deepcopy(observer)
         model = observer.model
-        told = [*range(observer.n_known)]
+        known = [*range(observer.n_known)]
         estimated = [*range(observer.n_known, model.n_disturbances)]
         # The observer computes with deviations: what counts from where.
-        self.inner = Units(np.concatenate([observer.C @ model.x_ss, model.d_ss[told]]), model.u_ss)
+        self.inner = Units(np.concatenate([observer.C @ model.x_ss, model.d_ss[known]]), model.u_ss)
         self.outer = Units(np.concatenate([model.x_ss, model.d_ss[estimated]]), model.u_ss)
         self.load: Array | None = None
         self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
@@ -421,8 +421,8 @@ class EstimateState(Appending):
         else:
             x_hat, d_hat = observer.update(measured, u, self.load)
         if self.measured is not None:  # acts until the next sample
-            told = observer.n_measured
-            self.load = self.measured.held[: observer.n_known] - self.inner.theta_ss[told:]
+            first = observer.n_measured
+            self.load = self.measured.held[: observer.n_known] - self.inner.theta_ss[first:]
         x_hat, d_hat = np.split(self.outer.to_plant(np.append(x_hat, d_hat)), [len(x_hat)])
         return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
 

@@ -1,4 +1,4 @@
-"""An input that moves the env against the model is told, and nothing else is."""
+"""An input that moves the env against the model is reported, and nothing else is."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def test_noise_and_a_wrong_model_are_no_other_order(noise: float, gain: float) -
     assert not told(Shuffled([0, 1, 2], noise, gain))
 
 
-def test_of_two_states_that_are_alike_neither_order_is_told() -> None:
+def test_of_two_states_that_are_alike_neither_order_is_reported() -> None:
     twins = LinearModel(np.eye(2) / 2, [[1], [1]], dt=1.0)
     mpc = LinearMPC(twins, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
     theta, u = np.random.default_rng(0).normal(size=(40, 2)), np.zeros((40, 1))
@@ -165,7 +165,7 @@ def test_of_two_states_that_are_alike_neither_order_is_told() -> None:
 BOX = {"theta_min": -9, "theta_max": 9}
 
 
-def test_of_six_states_two_that_are_exchanged_are_told() -> None:
+def test_of_six_states_two_that_are_exchanged_are_reported() -> None:
     rng = np.random.default_rng(0)
     model = LinearModel(0.3 * rng.normal(size=(6, 6)), np.ones((6, 1)), dt=1.0)
     mpc = LinearMPC(model, Q=np.eye(6), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)

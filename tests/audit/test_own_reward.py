@@ -1,4 +1,4 @@
-"""A reward that is not the stage cost is told where the stage cost is what counts, and no other."""
+"""A reward that is not the stage cost is reported where that cost counts, and no other."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def told(env, problem: LinearMPC, seeds: int = 4) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", OTHER)
-def test_a_reward_of_its_own_is_told(kind: str) -> None:
+def test_a_reward_of_its_own_is_reported(kind: str) -> None:
     (message,) = told(partial(Rewarded, OTHER[kind]), mpc())
     assert "The env has a reward of its own, and it is ignored" in message
     assert "over 100 steps" in message and "state it in Q and R" in message

@@ -333,12 +333,12 @@ def test_a_policy_is_taken_back_where_it_surely_costs_more_or_shows_no_gain() ->
     said = "it cost 10.3, the MPC in turns with it 10"
     assert said in why_taken_back(journal, costs(0.3, 0.15, 8))  # Student's t: 1.895
     assert why_taken_back(journal, costs(0.3, 0.2, 8)) == ""
-    assert why_taken_back(journal, costs(0.3, np.inf, 1)) == ""  # one pair tells nothing
+    assert why_taken_back(journal, costs(0.3, np.inf, 1)) == ""  # one pair shows nothing
     assert why_taken_back(journal, costs(0.6, 1.0, 8)) != ""  # more than five per cent in any case
     assert why_taken_back(journal, costs(np.nan, 1.0, 8)) != ""
     assert (
         why_taken_back(journal, costs(np.nan, np.inf, 0))
-        == "no pair of episodes tells what it costs"
+        == "no pair of episodes shows what it costs"
     )
     assert why_taken_back(journal, costs(0.11, 0.1, 10)) == "10 pairs show no gain"
     assert not is_hopeless(costs(0.11, 0.1, 9)) and not is_hopeless(costs(-0.01, 0.1, 10))

@@ -153,5 +153,5 @@ def test_a_measured_disturbance_is_told_and_no_part_of_the_estimate() -> None:
     for wrong in (None, [1.0, 2.0]):
         with pytest.raises(ValueError, match="d "):
             observer.update([0.0], [0.0], wrong)
-    with pytest.raises(ValueError, match="is told 0 measured disturbances"):
+    with pytest.raises(ValueError, match="takes 0 measured disturbances"):
         DisturbanceObserver(dataclasses.replace(model, estimated=())).update(x, u, load)

@@ -250,7 +250,7 @@ def test_without_a_compiler_it_holds_the_sources(tmp_path, monkeypatch):
     assert (tmp_path / "one.fmu").read_bytes() == (tmp_path / "two.fmu").read_bytes()
 
 
-def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
+def test_a_compiler_that_fails_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(fmu, "COMPILERS", ("false",))
     monkeypatch.setitem(fmu.LIBRARIES, (platform.system(), platform.machine()), ("linux64", ".so"))
     with pytest.warns(RuntimeWarning, match="false failed"):

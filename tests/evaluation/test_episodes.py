@@ -220,7 +220,7 @@ def test_a_function_that_makes_envs_may_be_named_by_its_module() -> None:
         (f"{__name__}:NOT_A_FUNCTION", "has no function 'NOT_A_FUNCTION' that makes an env"),
     ],
 )
-def test_a_name_that_leads_to_no_env_is_told(name, said) -> None:
+def test_a_name_that_leads_to_no_env_is_reported(name, said) -> None:
     with pytest.raises(ValueError, match=said):
         evaluate(lambda _: [0.0], name, [0])
 

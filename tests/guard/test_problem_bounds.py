@@ -221,7 +221,7 @@ def test_an_mpc_that_rides_its_bound_is_no_veto_and_no_excuse() -> None:
 
 
 @pytest.mark.parametrize("weight", [0.05, 0.4])
-def test_a_guard_s_env_that_pays_another_cost_than_training_is_told(weight: float) -> None:
+def test_a_guard_s_env_that_pays_another_cost_than_training_is_reported(weight: float) -> None:
     mpc, make = carriage("hard states")
     paid = replace(mpc, R=[[weight]])
     model = DDPG("YannPolicy", make(), policy_kwargs={"problem": mpc}, device="cpu", seed=0,

@@ -387,7 +387,7 @@ def test_an_episode_that_is_long_is_told_before_memory_is_full(monkeypatch) -> N
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_a_training_env_that_never_ends_is_told(n_envs, monkeypatch) -> None:
+def test_a_training_env_that_never_ends_is_reported(n_envs, monkeypatch) -> None:
     monkeypatch.setattr("sb3_yann.guard.callback.LONG_EPISODE", 20)
     endless = build(env=make_vec_env(Endless, n_envs))
     with pytest.warns(

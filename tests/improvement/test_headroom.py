@@ -1,4 +1,4 @@
-"""What there is to gain over an MPC is told before anybody trains, and of what kind it is."""
+"""What can be gained over an MPC is reported before anybody trains, and of what kind it is."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ class Counted(Heater):
 def test_where_the_model_is_the_plant_there_is_nothing_to_gain(capsys) -> None:
     Counted.steps_taken = 0
     found = headroom(heater(), Counted, n_starts=5, progress_bar=True)
-    assert found.verdict == "do not bother" and 0 <= found.total < 1e-3
-    assert "Verdict: do not bother" in str(found)
+    assert found.verdict == "keep the MPC" and 0 <= found.total < 1e-3
+    assert "Verdict: keep the MPC" in str(found)
     assert found.steps == Counted.steps_taken and f"{found.steps:,} of the env." in str(found)
     lines = capsys.readouterr().out.splitlines()
     assert "5 episodes of the MPC" in lines[0] and "s left" in lines[-1]
@@ -134,7 +134,7 @@ def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
     assert abs(without[-1, 0] - without[-1, 1]) > 0.02
 
 
-def test_a_disturbance_beyond_the_default_is_told() -> None:
+def test_a_disturbance_beyond_the_default_is_reported() -> None:
     plant = partial(Heater, load=0.6)
     found = headroom(heater(), plant, n_starts=3, max_steps=NO_PLANS)
     assert found.d_max is not None and found.d_max[0] > 0.6
@@ -185,14 +185,14 @@ def test_the_re_identified_mpc_is_handed_over() -> None:
 @pytest.mark.parametrize(
     ("parts", "doubt", "verdict"),
     [
-        ((0.0, 0.0, 0.019), 0.0, "do not bother"),  # learning would find a part of it
+        ((0.0, 0.0, 0.019), 0.0, "keep the MPC"),  # learning would find a part of it
         ((0.0, 0.0, 0.021), 0.0, "learn"),
         ((0.004, 0.003, 0.014), 0.0, "learn"),
         ((0.006, 0.0, 0.001), 0.0, "add ObserveDisturbance first"),
-        ((0.004, 0.0, 0.0), 0.0, "do not bother"),
+        ((0.004, 0.0, 0.0), 0.0, "keep the MPC"),
         ((0.0, 0.3, 0.1), 0.5, "not known"),  # it may be chance
         ((0.0, 0.0, 0.021), 0.03, "not known"),
-        ((0.0, 0.015, 0.004), 0.02, "do not bother"),  # little, and that may be chance
+        ((0.0, 0.015, 0.004), 0.02, "keep the MPC"),  # little, and that may be chance
         ((0.006, 0.0, 0.012), 0.0, "add ObserveDisturbance first"),  # too little to learn
         ((0.0, 0.3, 0.1), 0.3, "re-identify"),
     ],
@@ -216,7 +216,7 @@ def test_changes_of_a_set_point_are_not_known_before() -> None:
 def test_noise_is_no_headroom() -> None:
     """A plan that knew the noise to come would cost a fifth less than the MPC, which is optimal."""
     found = headroom(heater(), partial(Heater, noise=0.1), n_starts=10)
-    assert found.verdict == "do not bother" and found.total < 0.01
+    assert found.verdict == "keep the MPC" and found.total < 0.01
 
 
 def test_the_best_of_a_random_plant_is_one_controller() -> None:
@@ -339,14 +339,14 @@ def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:
 def test_a_plant_without_a_time_limit_may_be_given_one() -> None:
     bounds = {"u_min": -1, "u_max": 1, "theta_min": -3, "theta_max": 3}
     mpc = LinearMPC(LinearModel([[0.9]], [[1.0]], 1.0), Q=[[1]], R=[[1]], horizon=2, **bounds)
-    assert headroom(mpc, TimeLimit(LinearPlant(mpc), 30), n_starts=3).verdict == "do not bother"
+    assert headroom(mpc, TimeLimit(LinearPlant(mpc), 30), n_starts=3).verdict == "keep the MPC"
 
 
 def test_what_an_observer_loses_is_shown_as_a_loss() -> None:
     costs = np.array([10.0, 20.0, 30.0])
     dear = np.array([9.0, 20.0, 43.0])
     found = Headroom(
-        costs, costs, costs, costs, 0.0, 0.0, 0.0, "do not bother", "a simulator",
+        costs, costs, costs, costs, 0.0, 0.0, 0.0, "keep the MPC", "a simulator",
         observer_played=dear,
     )  # fmt: skip
     text = found.report()

@@ -26,7 +26,7 @@ def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
     found = headroom(MPC, shown, n_starts=3)
     np.testing.assert_allclose(found.mpc_costs, plain.mpc_costs, rtol=1e-9)
     np.testing.assert_allclose(found.best_costs, plain.best_costs, rtol=1e-6)
-    assert found.mpc_costs.max() < 10 and found.verdict == "do not bother"
+    assert found.mpc_costs.max() < 10 and found.verdict == "keep the MPC"
 
 
 @pytest.mark.parametrize(

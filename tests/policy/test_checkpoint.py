@@ -35,7 +35,7 @@ def test_a_checkpoint_is_a_copy_that_is_restored_bit_for_bit() -> None:
     assert actor_bits(policy) == original and before.is_actor_of(policy)
 
 
-def test_the_regions_whose_networks_differ_are_told() -> None:
+def test_the_regions_whose_networks_differ_are_reported() -> None:
     _, before, after = pair()
     changed = np.arange(3) == REGION[RIGHT]
     np.testing.assert_array_equal(before.changed_regions(after), changed)

@@ -136,7 +136,7 @@ WRONG = {
         lambda: wrappers.StickyAction(plant(), 0.3),
         "unknown",
         "StickyAction",
-        "does not always do what it is told",
+        "does not always take the action",
     ),
     "ActionRepeat": (
         lambda: ActionRepeat(plant(), 2),

@@ -30,7 +30,7 @@ TAKES = {"deviation": (-2.0, 5.0, 0.0), "plant": (38.0, 45.0, 40.0), "normalized
 
 
 class OwnUnits(gym.Env):
-    """The model as a plant; it shows and takes what it is told to."""
+    """The model as a plant; it shows and takes what it is asked to."""
 
     def __init__(self, shows: str, takes: str, dtype: type = np.float64) -> None:
         self.shows, self.takes, self.dtype = SHOWS[shows], takes, dtype

@@ -113,7 +113,7 @@ def test_an_episode_takes_set_points_and_length_of_a_logged_one() -> None:
     assert seen == {0, 1, 2}
 
 
-def test_an_episode_may_begin_where_it_is_told() -> None:
+def test_an_episode_may_begin_where_it_is_asked_to() -> None:
     found, logs = held()
     env = found.env(member=1)
     env.reset(seed=0)

@@ -85,7 +85,7 @@ def test_the_truth_lies_within_the_interval() -> None:
 def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
     found = twin(Lagging(0.5, 1.0, noise=0.0))
     memory = _Replays(found.judges[0], found.episodes, remembers=True)
-    assert memory.tells
+    assert memory.explains
     plain = _Replays(found.judges[0], found.episodes, remembers=False)
     assert np.mean(memory.errors**2) < 0.5 * np.mean(plain.errors**2)
 

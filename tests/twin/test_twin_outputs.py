@@ -93,7 +93,7 @@ def log() -> list[tuple[Array, Array, Array, Array]]:
 
 
 def test_a_row_steps_its_estimate_of_d_as_the_estimator_does(log: Any) -> None:
-    """What the states' residual is, moves it: the innovation is told by either."""
+    """What the states' residual is, moves it: the innovation follows from either."""
     row = RowLayout(MPC, ESTIMATOR)
     assert row.observer is None and row.size == MPC.n_theta
     for thetas, _, inputs, _ in log[:3]:

@@ -339,21 +339,21 @@ def test_with_a_measured_load_and_an_observer_the_plant_rests_at_its_set_point(h
     assert np.abs(np.array(seen[60:]) - theta[1]).max() < 0.3
 
 
-def test_an_observer_that_is_not_told_a_measured_load_is_refused_in_any_order() -> None:
+def test_an_observer_without_a_measured_load_is_refused_in_any_order() -> None:
     mpc = loaded([[0.07, 1.0]], estimated=[1])
-    told, untold = (
+    knows, blind = (
         DisturbanceObserver(mpc.model),
         DisturbanceObserver(LinearModel([[0.8]], [[0.2]], 1, E=[[1.0]])),
     )
     plain = SetPoint(Loaded(), [-1], [1])
     measured = MeasuredDisturbance(plain, [-5], [5])
     for env in (measured, PreviousInput(measured), PastInputs(measured, [1])):
-        with pytest.raises(ValueError, match=r"measures 1 disturbances .* told 0"):
-            ObserveDisturbance(env, untold, [-3], [3])
-    with pytest.raises(ValueError, match=r"measures 0 disturbances .* told 1"):
-        ObserveDisturbance(plain, told, [-3], [3])
+        with pytest.raises(ValueError, match=r"measures 1 disturbances .* takes 0"):
+            ObserveDisturbance(env, blind, [-3], [3])
+    with pytest.raises(ValueError, match=r"measures 0 disturbances .* takes 1"):
+        ObserveDisturbance(plain, knows, [-3], [3])
     with pytest.raises(ValueError, match="in ObserveDisturbance already"):
-        MeasuredDisturbance(ObserveDisturbance(plain, untold, [-3], [3]), [-5], [5])
+        MeasuredDisturbance(ObserveDisturbance(plain, blind, [-3], [3]), [-5], [5])
     swapped = DisturbanceObserver(LinearModel([[0.8]], [[0.2]], 1, E=[[1, 0.07]], estimated=[0]))
     with pytest.raises(ValueError, match="before the estimated ones"):
         ObserveDisturbance(measured, swapped, [-3], [3])

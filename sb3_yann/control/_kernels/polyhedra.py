@@ -235,7 +235,7 @@ def bounded_region(
 ) -> int:
     """Write the center of the largest ball and its radius (n + 1,), of a facet unless that is -1.
 
-    If the radius is more than ``thinnest``, ``kept`` (q,), ones before, tells which rows bound a
+    If the radius is more than ``thinnest``, ``kept`` (q,), ones before, says which rows bound a
     facet: 0 for none, 2 where others are equal. The center is then away from all of them: the
     largest ball of a slab may lie at its edge. Rows are of unit length, and the polyhedron is
     bounded. Returns OPTIMAL, or that it failed. It is one function, since each takes long to

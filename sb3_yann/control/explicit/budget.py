@@ -23,7 +23,7 @@ class ExplicitLimitError(RuntimeError):
     Attributes
     ----------
     n_regions : int
-        How many regions were found until then, where the solver tells.
+        How many regions were found until then, where the solver says.
     """
 
     def __init__(self, message: str, n_regions: int) -> None:

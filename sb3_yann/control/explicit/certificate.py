@@ -191,7 +191,7 @@ class Certificate:
         return None if at is None else self.regions[at].active_set
 
     def _require_neighbors(self, i: int, same: NDArray[np.bool_], kkt: Optimality) -> None:
-        """Raise if a facet of region i has no neighbor; ``same`` tells which conditions are it."""
+        """Raise if a facet of region i has no neighbor; ``same`` says which conditions are it."""
         outer = len(self.outer)
         covered = set()
         for row, each in np.argwhere(same).tolist():

@@ -277,7 +277,7 @@ class Optimality:
     ``U = law [theta; 1]``, law (v, n + 1). Constraints and multipliers hold where
     ``rows[:, :n] theta <= rows[:, n]``, of unit length; those without theta are constants.
     ``labels`` are the constraint of each row. ``factors`` (rows, active) are each constraint's part
-    along the active ones, all of unit length in U, and ``depends`` (rows,) tells whether one that
+    along the active ones, all of unit length in U, and ``depends`` (rows,) says whether one that
     is not active has no other part.
     """
 

@@ -101,8 +101,8 @@ def _left(gram: Array, delays: list[int], n: int) -> Array:
     size = np.sqrt(np.diag(gram)[taps])
     size = np.where(size > 0, size, 1.0)
     inner, cross = gram[np.ix_(taps, taps)] / np.outer(size, size), gram[taps, :n] / size[:, None]
-    told = np.sum(cross * (np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ cross), axis=0)
-    return np.asarray(np.maximum(total - told, 0.0))
+    explained = np.sum(cross * (np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ cross), axis=0)
+    return np.asarray(np.maximum(total - explained, 0.0))
 
 
 def _chosen(left: Array, steps: int, n: int) -> int:
@@ -189,7 +189,7 @@ def input_notes(
     for column, (name, lag) in enumerate(zip(names(sizes)[n:], lags, strict=True), n):
         idle = _chance(found, n, column) > CHANCE
         if lag:
-            start = f"{name} has no effect that can be told from 0, and t" if idle else "T"
+            start = f"{name} has no effect beyond chance, and t" if idle else "T"
             cure = f" Move its measurements {lag} samples down, in the log and on the plant."
             notes.append(
                 f"{start}he residuals follow {name} of {lag} steps before: it acts {lag} samples "
@@ -197,7 +197,7 @@ def input_notes(
             )
         elif idle:
             notes.append(
-                f"{name} has no effect on the next state that can be told from 0. Is it delayed by "
+                f"{name} has no effect on the next state beyond chance. Is it delayed by "
                 "more than the log shows, too small beside the noise, or not what the plant got?"
             )
     if any(lags[:m]):

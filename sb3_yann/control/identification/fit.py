@@ -205,7 +205,7 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
 
     A sensor that counts in steps repeats itself often: runs count from ten times its usual length
     on. A plant at rest repeats itself while nothing else moves. A state that rests by itself is
-    told to rest by a linear model of the other rows. A clipped one rests at an end of its range.
+    found at rest by a linear model of the other rows. A clipped one rests at an end of its range.
     None of these is frozen, and none is returned where they are less than 5 % of all rows.
     ``driven`` (T, k) are the inputs and disturbances between the rows.
     """

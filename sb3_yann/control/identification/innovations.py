@@ -182,7 +182,7 @@ class Past:
         past = [each.regressors - self.arx.center for each in self.rows]
         whiten = linalg.inv(linalg.cholesky(self.arx.covariance + FLOOR * np.eye(q), lower=True))
         block = whiten @ self.arx.coefficients
-        # What the past tells of the output i samples on, beside what comes in between.
+        # What the past says of the output i samples on, beside what comes in between.
         future = np.zeros((p * q, p * self.width))
         for i in range(p):
             future[i * q : (i + 1) * q, : (p - i) * self.width] = block[:, i * self.width :]
@@ -194,7 +194,7 @@ class Past:
         self.states = [each @ to_state.T for each in past]  # row k is the state at k + 1
 
     def idle(self) -> list[int]:
-        """Return the inputs and disturbances without effect that can be told from zero."""
+        """Return the inputs and disturbances without effect that can be distinguished from zero."""
         q, lags = len(self.arx.reached), self.arx.center.size // self.width
         return [
             j
@@ -456,8 +456,8 @@ def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Arra
         if seen.any():
             S = (C @ P @ C.T + noise)[np.ix_(seen, seen)]
             unit = np.sqrt(np.diag(S))  # outputs of any unit
-            told = (A @ P @ C.T + cross)[:, seen] / unit
-            scaled = np.linalg.lstsq(S / np.outer(unit, unit), told.T, rcond=1e-13)[0]
+            covariance = (A @ P @ C.T + cross)[:, seen] / unit
+            scaled = np.linalg.lstsq(S / np.outer(unit, unit), covariance.T, rcond=1e-13)[0]
             gain[:, seen] = scaled.T / unit
         x[k + 1] = A @ x[k] + step + gain[:, seen] @ left[seen]
         # The error moves by A - gain C and (K - gain) e: a sum of squares stays one.

@@ -171,7 +171,7 @@ def _free_run(found: Regression, episodes: list[Episode]) -> float:
             x = episode.states[start]
             for k in range(start, min(start + FREE_RUN, len(episode))):
                 x = found.predict(np.concatenate([x, episode.driven[k]])[None])[0]
-                # One that runs away is as bad as can be, and its size tells nothing.
+                # One that runs away is as bad as can be, and its size says nothing.
                 error = np.minimum(np.abs(x - episode.states[k + 1]) / unit, 1e3)
                 x = np.clip(x, -1e150, 1e150)
                 total, count = total + float(np.mean(error**2)), count + 1
@@ -214,7 +214,7 @@ def pole_note(found: Regression, n: int) -> str:
     if open_ends:
         text += (
             f" {open_ends} that decay in the model may be unstable in the plant, as far as the log "
-            "tells."
+            "shows."
         )
     return text
 

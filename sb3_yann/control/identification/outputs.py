@@ -51,7 +51,7 @@ class Structure:
     start: tuple[Array, Array]  # mean (n,) and covariance (n, n) of the states
     fits: tuple[Array, Array]  # (q,) each, one and `AHEAD` steps ahead, in percent
     refined: bool = False  # by prediction errors
-    idle: tuple[int, ...] = ()  # inputs and disturbances without effect that can be told from 0
+    idle: tuple[int, ...] = ()  # inputs and disturbances without effect beyond chance
     feedback: tuple[tuple[int, float], ...] = ()  # inputs that follow outputs; what does not
     curvature: Array = field(default_factory=lambda: np.zeros(0))  # (q,), share of the errors
 
@@ -147,7 +147,7 @@ class Search:
     def rough(self, order: int | None) -> Structure:
         """Return the best model by subspaces alone."""
         for n in range(1, self.largest + 1) if order is None else [min(order, self.past.limit)]:
-            self.tried.append(self.judged(self.past.model(n)))
+            self.tried.append(self.assessed(self.past.model(n)))
             best = int(np.argmin([each.criterion for each in self.tried]))
             if len(self.tried) - best > PATIENCE:
                 break
@@ -170,13 +170,13 @@ class Search:
 
     def trial(self, order: int, *, refine: bool = True) -> Structure:
         """Return the model of an order, refined where that lowers the criterion."""
-        rough = self.judged(self.past.model(order))
+        rough = self.assessed(self.past.model(order))
         if not refine or not np.isfinite(rough.criterion):
             return rough
-        found = replace(self.judged(refined(rough.model, self.chunks)), refined=True)
+        found = replace(self.assessed(refined(rough.model, self.chunks)), refined=True)
         return found if found.criterion < rough.criterion else rough
 
-    def judged(self, model: Innovations) -> Structure:
+    def assessed(self, model: Innovations) -> Structure:
         """Return a model with its criterion and its free runs over held-out data."""
         q = len(model.C)
         if not self.chunks.forgets(model):

@@ -82,7 +82,7 @@ class Leftover(NamedTuple):
 
     All of them hold the present states and inputs: with nothing else; with squares and products;
     with earlier states and inputs; with both; with squares, products and the inputs of the dead
-    time. A log that is too short has zeros throughout: nothing can be told then.
+    time. A log that is too short has zeros throughout: nothing can be said then.
     """
 
     linear: Array
@@ -113,7 +113,7 @@ class Leftover(NamedTuple):
 
         A filter of the readings takes up to a half off the noise that a sensor adds to the errors
         of one step, and more is a state that is not measured. Where squares and products show
-        curvature, earlier samples extrapolate what is left of it, and nothing can be told.
+        curvature, earlier samples extrapolate what is left of it, and nothing can be said.
         """
         far_less = np.minimum(self.both, self.lags) < NOISE * self.late
         return bool(np.any(far_less & ~self.bends))
@@ -123,7 +123,7 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     """Return what is left of rows that a fit has not seen, part after part of the log.
 
     The rows of a log depend on their neighbors, which an F test does not know: by chance, slow
-    inputs square to what a hidden state adds. A part of the log that was held out tells them apart.
+    inputs square to what a hidden state adds. A part of the log that was held out separates them.
     The first `ENOUGH` steps count. ``delays`` are the dead times of the inputs.
     """
     n, lags = episodes[0].states.shape[1], max(ORDERS[-1], *delays, 0)

@@ -13,7 +13,7 @@ from sb3_yann._validation import Array, to_float
 
 LEVELS, RATIO = 6, 4.0
 """Number of steps that approach a point, and how much shorter each is than the one before."""
-FAINT = 100.0
+NOISE_FLOOR = 100.0
 """Effects below so many times the noise are none. Hundreds of operations of an integrator round
 ten times as much as one does, and a plant that forgets a state within a sample shows only that."""
 
@@ -107,7 +107,7 @@ def _column(
     floor = np.max(2 * noise / span[0])
     if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
         raise NotSmoothError(i, "its slopes to the two sides differ (a kink)")
-    if np.max(error) > max(0.2 * np.max(np.abs(value)), FAINT * floor):
+    if np.max(error) > max(0.2 * np.max(np.abs(value)), NOISE_FLOOR * floor):
         raise NotSmoothError(i, "its slope has no limit for short steps (a jump or noise)")
     scale = np.max(np.abs(value))
     change = np.max(np.abs(slope[0] - value)) / scale if scale > 0 else 0.0

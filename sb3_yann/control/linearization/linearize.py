@@ -116,7 +116,7 @@ def _at_bounds(simulator: Simulator, u: Array, scale: Array) -> str:
 def require_steady_state(simulator: Simulator, point: Array, jacobian: Array, scale: Array) -> None:
     """Raise ValueError if a given operating point is far from the linear model's steady states.
 
-    Its motion alone tells little: in a short sample a plant hardly moves from anywhere. The
+    Its motion alone says little: in a short sample a plant hardly moves from anywhere. The
     ``jacobian`` (n, n+m) is that of the next state at the point (n+m,).
     """
     moved = residual(simulator, point, scale)
@@ -209,7 +209,7 @@ def time_limit_fault(env: Any, action: Array) -> str:
         return ""
     return (
         f"Episodes terminate after {ends[0]} steps whatever happens: that is a time limit, but "
-        "terminated=True tells the learner that nothing costs anything afterwards. Return "
+        "terminated=True means to the learner that nothing costs anything afterwards. Return "
         "truncated=True there, or wrap the environment in "
         f"sb3_yann.wrappers.TruncateAtTimeLimit(env, {ends[0]})."
     )
@@ -456,12 +456,13 @@ def _rest_of(rate: Rate, given: Array, scale: Array, dt: float) -> tuple[Array, 
         )
     # A bioreactor that is washed out is at rest too, and no input brings it back.
     found.sort(key=lambda each: _is_lost(rate, each, _size(each, n, scale[:n]), dt))
-    notes = [f"Of the steady state {np.count_nonzero(free)} entries were solved for."]
-    if np.count_nonzero(free) > n:
+    solved = np.count_nonzero(free)
+    notes = [f"Solved for the steady state: {solved} {'entry' if solved == 1 else 'entries'}."]
+    if solved > n:
         notes[0] += f" The equations determine {n}: it is one of many. Give more entries."
     elif len(found) > 1:
         others = "; ".join(str([float(f"{v:.4g}") for v in other]) for other in found[1:])
-        notes[0] += f" There are others, {others}: give an entry that tells them apart."
+        notes[0] += f" There are others, {others}: give an entry that separates them."
     return found[0], notes
 
 

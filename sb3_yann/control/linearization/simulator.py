@@ -73,7 +73,7 @@ def require_makes(env: Any) -> None:
                 f"env = {env!r} cannot be called without arguments ({error}). Pass an env, or a "
                 "function without arguments that makes one, such as lambda: PlantEnv(f, mpc)."
             ) from error
-        except ValueError:  # nothing tells its arguments
+        except ValueError:  # its arguments are not known
             pass
 
 

@@ -31,7 +31,7 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
 
     Not so where a wrapper scales by statistics of its own. Unless the user said what is shown,
     ``observation_given``, it must be the parameter of the law: neither rescaled nor stacked.
-    Unknown wrappers pass, and a `VecNormalize` is not looked at. Where states are late or inputs
+    Unknown wrappers pass, and a `VecNormalize` is not examined. Where states are late or inputs
     are not applied, it warns. Wrappers may be in other processes.
     """
     for layer in layers_of(env):

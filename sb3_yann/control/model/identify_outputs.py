@@ -196,7 +196,7 @@ def identify_outputs(
     disturbances : array_like, shape (T, d), or a sequence of such, optional
         Measured disturbances, which make E.
     held_out : float, default 0.2
-        Fraction of all steps, the last ones, over which the fits are told. The model that is
+        Fraction of all steps, the last ones, over which the fits are reported. The model that is
         returned is fitted to all of them.
 
     Raises
@@ -395,7 +395,7 @@ def _notes(
             "times as much as the most excited combination. Entries along it are uncertain."
         )
     notes += [
-        f"{driven[j]} has no effect on the outputs that can be told from 0. Is it delayed by more "
+        f"{driven[j]} has no effect on the outputs beyond chance. Is it delayed by more "
         "than the log shows, too small beside the noise, or not what the plant got?"
         for j in found.idle
     ]

@@ -38,7 +38,7 @@ def offset_free(
     Rawlings, AIChE J. 49, 2003). They must be measured. The observer takes disturbances and errors
     of measurements for equally large, in half-widths of the box of states.
 
-    Measured disturbances of the MPC stay, before the estimated ones: the observer is told them.
+    Measured disturbances of the MPC stay, before the estimated ones: the observer takes them.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def offset_free(
     q, tracked = len(C), mpc.tracking.C
     if np.any(np.abs(tracked - tracked @ np.linalg.pinv(C) @ C) > 1e-9 * (1 + np.abs(tracked))):
         raise ValueError(
-            "A tracked output is no combination of the measured ones: nothing tells its offset. "
+            "A tracked output is no combination of the measured ones: its offset is not known. "
             "Measure what is tracked."
         )
     unit = mpc.theta_half[mpc.layout.state]

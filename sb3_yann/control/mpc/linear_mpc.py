@@ -76,7 +76,7 @@ class LinearMPC(MPCProblem):
     The parameter of the law is ``theta = [x, r, d, bounds, u_prev]``, with the parts that the
     problem uses (:attr:`layout`): r with ``tracking``, d where the model has an E, bounds that
     change at run time, ``u_prev`` with a bound or a weight on the rate. r and d are constant over
-    the horizon, but for what a preview tells; e and v count from the steady state of each sample.
+    the horizon, but for a preview; e and v count from the steady state of each sample.
 
     The formula is one of deviations from the model's operating point. Bounds, theta and inputs are
     what the plant shows and takes, at every method; of a model without an operating point they are
@@ -406,7 +406,7 @@ class LinearMPC(MPCProblem):
             Seconds after which to give up, by the clock. To load compiled code, once in a process,
             does not count. A law that was kept takes none.
         region_limit : int, optional
-            The most regions that the law may have. ppopt tells them only at its end.
+            The most regions that the law may have. ppopt counts them only at its end.
         progress : bool, default False
             Show how many regions were found so far.
 
@@ -609,7 +609,7 @@ def _cost_of_coming_back(problem: MPCProblem) -> tuple[float, float]:
     wide = max(float(part.max(initial=0.0)) for part in parts)
     if not total > 0:
         raise ValueError(
-            "SoftBounds.penalty is missing, and nothing tells how much a violation should cost: "
+            "SoftBounds.penalty is missing, and it is not known how much a violation should cost: "
             "neither states nor inputs have a bound that costs anything. Pass the cost of one unit "
             "of violation."
         )

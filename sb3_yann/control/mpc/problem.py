@@ -338,10 +338,10 @@ class MPCProblem(ReadOnlyArrays):
         tracking, d, limits = self.tracking, self.disturbances, self.limits
         r = (tracking.r_min, tracking.r_max), (d.d_min, d.d_max)
         bounds = {"x": limits["x"], "u": limits["u"], "r": r[0], "d": r[1], **limits}
-        told = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]
+        shown = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]
         if self.layout.bounds:
-            told.append(f"parametric_bounds={[*self.layout.bounds]}")
-        return f"{type(self).__name__}({', '.join([sizes, options, *filter(None, told)])})"
+            shown.append(f"parametric_bounds={[*self.layout.bounds]}")
+        return f"{type(self).__name__}({', '.join([sizes, options, *filter(None, shown)])})"
 
 
 def _bounds_in_words(name: str, lower: Array, upper: Array) -> str:

@@ -145,8 +145,9 @@ def _values(problem: MPCProblem, law: Law, feasible: Array) -> Iterator[str]:
     yield f"The law at a few parameters ({', '.join(problem.labels())}):"
     for theta in np.vstack([problem.theta_rest, feasible[:3]]):
         where = "" if law.in_domain(theta) else " (not feasible)"
-        shown, taken = _numbers(units.to_plant(theta)), _numbers(units.input_to_plant(law(theta)))
-        yield f"  {shown} -> {u} = {taken}{where}"
+        taken = units.input_to_plant(law(theta))
+        taken = np.where(np.abs(taken) > 1e-9 * problem.u_half, taken, 0.0)  # no rounding
+        yield f"  {_numbers(units.to_plant(theta))} -> {u} = {_numbers(taken)}{where}"
 
 
 def _numbers(values: Array) -> str:

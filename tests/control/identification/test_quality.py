@@ -101,7 +101,7 @@ def test_a_fit_below_fifty_per_cent_is_poor() -> None:
     assert "The 40 steps held out tell no fit" in told(found, episode, fits=(none, none))
 
 
-def test_a_weak_log_and_a_ridge_are_told() -> None:
+def test_a_weak_log_and_a_ridge_are_reported() -> None:
     episode = log()
     found = fit(episode)
     for excitation, weak in ((0.0101, False), (0.0099, True)):

@@ -120,7 +120,7 @@ def test_intervals_of_the_poles_hold_the_truth() -> None:
     assert 25 <= inside <= 30
 
 
-def test_a_pole_that_may_be_unstable_is_told() -> None:
+def test_a_pole_that_may_be_unstable_is_reported() -> None:
     rng = np.random.default_rng(0)
     x, u = np.zeros((61, 1)), rng.normal(size=(60, 1))
     for k in range(60):

@@ -37,7 +37,7 @@ def test_lists_and_columns_that_are_returned_are_taken_as_vectors_are(f: Any) ->
 def test_the_state_of_the_reactor_is_solved_for() -> None:
     model = LinearModel.from_dynamics(cstr.dynamics, [NAN] * 4, cstr.U_SS, cstr.DT)
     np.testing.assert_allclose(cstr.dynamics(model.x_ss, model.u_ss), 0, atol=1e-6)
-    assert "4 entries were solved for" in model.notes[0]
+    assert "steady state: 4 entries" in model.notes[0]
 
 
 def test_the_input_that_holds_a_level_is_solved_for() -> None:
@@ -49,12 +49,12 @@ def test_the_input_that_holds_a_level_is_solved_for() -> None:
     np.testing.assert_allclose([*model.x_ss, *model.u_ss], [4, 4, 2], atol=1e-6)
 
 
-def test_several_steady_states_are_told() -> None:
+def test_several_steady_states_are_reported() -> None:
     model = LinearModel.from_dynamics(lambda x, u: x - x**3 + u, [NAN], [0], 0.1)
     assert "There are others, [1.0, 0.0]; [-1.0, 0.0]" in model.notes[0]
 
 
-def test_more_unknowns_than_equations_are_told() -> None:
+def test_more_unknowns_than_equations_are_reported() -> None:
     model = LinearModel.from_dynamics(lambda x, u: u - x, [NAN], [NAN], 0.1)
     assert "one of many" in model.notes[0]
 

@@ -48,7 +48,7 @@ def test_a_mode_is_told_in_time_and_in_samples(model: LinearModel, words: str) -
     ],
     ids=["stable", "border", "unstable"],
 )
-def test_stability_is_told(model: LinearModel, words: str) -> None:
+def test_stability_is_reported(model: LinearModel, words: str) -> None:
     assert words in model.report()
 
 
@@ -93,7 +93,7 @@ def test_the_gain_of_an_input_is_that_of_a_long_run() -> None:
     assert f"u[0] moves the state to ({x[0]:.4g}, {x[1]:.4g})" in model.report()
 
 
-def test_units_far_apart_are_told() -> None:
+def test_units_far_apart_are_reported() -> None:
     assert "Consider other units" in LinearModel([[0.5, 1e8], [1e-8, 0.5]], [[1], [1]], 1).report()
 
 
@@ -114,7 +114,7 @@ def test_sampling_is_compared_with_the_plant(model: LinearModel, word: str) -> N
     assert word in ("Slow:", "Fast:") or not ("Slow:" in report or "Fast:" in report)
 
 
-def test_operating_point_and_disturbances_are_told() -> None:
+def test_operating_point_and_disturbances_are_reported() -> None:
     model = LinearModel([[0.5]], [[1]], 0.25, [3], [4], [[1, 2]], [5, 6])
     assert model.report().splitlines()[:2] == [
         "Linear model: 1 state, 1 input, 2 disturbances, sampled every 0.25.",

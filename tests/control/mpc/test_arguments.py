@@ -55,7 +55,7 @@ def test_softness_of_a_single_number_is_for_all_that_have_a_bound() -> None:
     assert SoftBounds().penalty == 0.0
 
 
-def test_a_soft_bound_that_the_box_does_not_exceed_is_told() -> None:
+def test_a_soft_bound_that_the_box_does_not_exceed_is_reported() -> None:
     bounds = {"x_min": [-1, -2], "x_max": [1, 2], "soft": SoftBounds([1, 0], penalty=10)}
     (note,) = said(**bounds, theta_min=[-1, -2], theta_max=[1, 2])
     assert "softens the bounds -1 to 1 of x[0], but theta_min = -1 and theta_max = 1" in note

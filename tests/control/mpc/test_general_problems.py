@@ -91,7 +91,7 @@ def soft_cost(mpc: LinearMPC, units: np.ndarray) -> float:
     return float(x @ np.abs(mpc.Q) @ x + x @ np.abs(mpc.terminal.cost) @ x + 0.3)
 
 
-def test_the_law_reaches_beyond_a_soft_bound_without_being_told() -> None:
+def test_the_law_reaches_beyond_a_soft_bound_without_a_note() -> None:
     soft = {"x_min": -1.2, "x_max": 1.2, "soft": SoftBounds(1, penalty=300)}
     law = servo(**soft).explicit()
     assert law.in_domain([2.0, 0.0, 0.5])
@@ -242,7 +242,7 @@ BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
             "u_max": None,
         },
         ValueError,
-        "SoftBounds.penalty is missing, and nothing tells",
+        "SoftBounds.penalty is missing, and it is not known",
     ),
     (lambda: Terminal(set="invariants"), TypeError, "a pair .* or 'invariant', got 'invariants'"),
     (lambda: Tracking(0), ValueError, r"Tracking.C = 0 must be a list of indices of states: \[0\]"),

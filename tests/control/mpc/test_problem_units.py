@@ -163,14 +163,14 @@ def test_what_limits_the_plan_is_called_by_its_name() -> None:
     assert "u[0]" not in text and "x[0]" not in text and "-> flow = [10]" in text
 
 
-def test_an_input_that_cannot_rest_is_told() -> None:
+def test_an_input_that_cannot_rest_is_reported() -> None:
     tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
     box = {"theta_min": 0, "theta_max": 20, "u_min": 4, "u_max": 10}
     with pytest.warns(UserWarning, match=r"u_min = 4 and u_max = 10 leave out u\[0\] = 3, .*Line"):
         LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **box)
 
 
-def test_a_box_that_leaves_out_the_operating_point_is_told() -> None:
+def test_a_box_that_leaves_out_the_operating_point_is_reported() -> None:
     tanks = LinearModel(
         np.eye(2) / 2, [[1], [1]], 1, x_ss=[12, 1], u_ss=[3], state_names=["h", "c"]
     )
