@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG, PPO, SAC
 
+from improvement_samples import quick
 from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy, export
 from sb3_yann.cli import main
 from twin_samples import Cart, problem
 
 PLANT = """
 import dataclasses
+import functools
 from sb3_yann import RateLimits
 from twin_samples import Cart, problem
 cart = problem
+Short = functools.partial(Cart, 15)
 
 def rated():
     return dataclasses.replace(problem(), rate=RateLimits(-0.5, 0.5))
@@ -127,8 +130,9 @@ def test_report_writes_one_page(model, folder) -> None:
     )
 
 
-def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys) -> None:
-    again = ["commission", "cart", "--env", "my_cart:Cart", "--record", "record", "--batch", "2"]
+def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys, monkeypatch) -> None:
+    quick(monkeypatch)
+    again = ["commission", "cart", "--env", "my_cart:Short", "--record", "record", "--batch", "2"]
     assert main([*again, "--batches", "1", "--save", "done"]) == 0
     assert (folder / "record").exists() and (folder / "done.zip").exists()
     assert "batch" in capsys.readouterr().out.lower()

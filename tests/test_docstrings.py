@@ -13,6 +13,9 @@ from typing import Any
 
 import pytest
 
+from improvement_samples import quick
+from sb3_yann.twin import plant_twin
+
 PACKAGES = ("sb3_yann", "sb3_yann_envs")
 EXPORTING = (
     "sb3_yann",
@@ -127,6 +130,8 @@ def test_the_examples_of_a_docstring_run(example: doctest.DocTest, monkeypatch, 
         if example.name.startswith(f"{module}.") and importlib.util.find_spec(library) is None:
             pytest.skip(f"{library} is not installed")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plant_twin, "ROWS", 10**9)  # a fit of networks takes seconds
+    quick(monkeypatch)
     found = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example)
     assert found.attempted and not found.failed, "\n" + (example.docstring or "")
 

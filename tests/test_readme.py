@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from improvement_samples import quick
 from sb3_yann import LinearModel
-from sb3_yann.improvement import model
 from sb3_yann.twin import plant_twin
-from sb3_yann.twin.ensemble import fit_ensemble
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -91,9 +89,9 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, quick_fits) -> None:
 
 @pytest.fixture
 def quick_fits(monkeypatch) -> None:
-    """Let twins be of polynomials, and fit the networks of a simulator's model for a while only."""
+    """Let twins be of polynomials, and improvements short."""
     monkeypatch.setattr(plant_twin, "ROWS", 10**9)
-    monkeypatch.setattr(model, "fit_ensemble", partial(fit_ensemble, updates=300))
+    quick(monkeypatch)
 
 
 @pytest.mark.slow
@@ -106,7 +104,7 @@ def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> Non
 @pytest.mark.slow
 def test_the_code_in_the_page_on_improve_runs(tmp_path, monkeypatch, quick_fits) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(gym.registry["CSTR-v0"], "max_episode_steps", 100)
+    monkeypatch.setattr(gym.registry["CSTR-v0"], "max_episode_steps", 50)
     run("docs/improve.md")
     assert (tmp_path / "improved.zip").exists() and (tmp_path / "commissioning.jsonl").exists()
 

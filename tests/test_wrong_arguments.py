@@ -1,23 +1,40 @@
-"""Arguments of a wrong kind, size or sign: named at the door, with what was expected."""
+"""What is given wrongly is named at the door: what it was, what was expected, what to do."""
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3 import DDPG
 
-from policy_samples import scalar_mpc
+import general_problems
+import twin_samples
+from guard_samples import Slide, make_guard, train
+from guard_samples import build as build_slide
+from policy_samples import build, scalar_mpc
 from sample_plants import LinearPlant
 from sb3_yann import (
+    Controller,
+    DisturbanceObserver,
     ImprovementGuard,
+    LinearModel,
     NoActionNoise,
+    PlantTwin,
     SimulatedEpisodes,
     export,
+    headroom,
+    improve,
+    offset_free,
     restore_accepted,
 )
+from sb3_yann.commissioning.plant import Plant
+from sb3_yann.commissioning.record import Record, _with_digest
+from sb3_yann.control import PiecewiseAffine
 from sb3_yann.evaluation import comparison_table, evaluate, summary_table
 from sb3_yann.evaluation.plots import loops_figure
 from sb3_yann.wrappers import (
+    ObserveDisturbance,
     PastInputs,
     PreviousInput,
     StageCost,
@@ -113,3 +130,147 @@ def test_a_simulator_of_a_function_that_returns_none_is_named() -> None:
 
 def test_seeds_of_numpy_play_the_episodes_of_their_numbers() -> None:
     assert np.array_equal(played(*np.arange(3)).costs, played(0, 1, 2).costs)
+
+
+class NoCopy(LinearPlant):
+    def __deepcopy__(self, memo):
+        raise RuntimeError("a licence of one seat")
+
+
+class Endless(LinearPlant):
+    def step(self, action):
+        return (*super().step(action)[:2], False, False, {})
+
+
+def hand_made(high: float = 5.0) -> PiecewiseAffine:
+    """A law of one region, u = -x[0], which knows no plant."""
+    box = {"theta_min": [-5, -5], "theta_max": [5, high], "u_min": [-1], "u_max": [1]}
+    rows = {"A": [[1.0, 0.0], [-1.0, 0.0]], "b": [5.0, 5.0], "starts": [0]}
+    return PiecewiseAffine(gains=[[[-1.0, 0.0]]], offsets=[[0.0]], **rows, **box)
+
+
+def with_two_outputs() -> ObserveDisturbance:
+    model = LinearModel([[0.5]], [[1]], 1, E=[[1]])
+    return ObserveDisturbance(
+        LinearPlant(scalar_mpc()), DisturbanceObserver(model), [-1, -1], [1, 1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: headroom(scalar_mpc(), 3), TypeError, "env = 3 must be the id of an environment"),
+        (
+            lambda: headroom(scalar_mpc(), NoCopy(scalar_mpc())),
+            TypeError,
+            r"cannot be copied \(a licence of one seat\). Pass a function that makes",
+        ),
+        (
+            lambda: improve("m.zip", None),
+            TypeError,
+            "model = 'm.zip' must be a model with a YannPolicy",
+        ),
+        (lambda: offset_free(3), TypeError, "mpc = 3 must be a LinearMPC"),
+        (lambda: DisturbanceObserver("A"), TypeError, "model = 'A' must be a LinearModel, e.g."),
+        (lambda: PlantTwin.fit("cstr", []), TypeError, "problem = 'cstr' must be a LinearMPC"),
+        (
+            lambda: LinearModel.from_data(np.zeros((5, 1)), np.zeros((4, 1)), dt=1, delay=4),
+            ValueError,
+            r"delay = 4, but no episode has more than 4 steps: record longer",
+        ),
+        (
+            lambda: general_problems.solved("servo with all of it").steady_state(
+                r=np.zeros((3, 1))
+            ),
+            ValueError,
+            r"make 3 points, and steady_state takes one: r \(p,\) and d \(d,\)",
+        ),
+        (
+            lambda: hand_made(high=np.inf).plot(),
+            ValueError,
+            "box is not bounded in entries .* of theta: there is no frame to draw. Choose others",
+        ),
+        (
+            lambda: PastInputs(LinearPlant(scalar_mpc()), [1], initial=[0, 0]),
+            ValueError,
+            r"initial has shape \(2,\), expected \(1,\)",
+        ),
+        (with_two_outputs, ValueError, r"low has shape \(2,\), but the observer estimates 1"),
+        (
+            lambda: build(policy_kwargs={"features_extractor_class": th.nn.Identity}),
+            ValueError,
+            "features_extractor_class must stay FlattenExtractor: the law takes theta",
+        ),
+        (
+            lambda: ImprovementGuard("CSTR-v0", log_path="/"),
+            ValueError,
+            "log_path = '/' is a folder; name a file in it",
+        ),
+    ],
+)
+def test_it_is_named(call, error, message) -> None:
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_an_operators_output_has_the_shape_of_the_inputs(tmp_path) -> None:
+    export(scalar_mpc().explicit(), tmp_path / "law.npz")
+    controller = Controller.load(tmp_path / "law.npz")
+    controller.request = "manual"
+    with pytest.raises(ValueError, match=r"manual has shape \(3,\), expected \(1,\)"):
+        controller([0.1], manual=[0, 0, 0])
+
+
+def test_a_plants_episode_that_never_ends_is_an_error(monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.commissioning.plant.LONGEST", 20)
+    env = Endless(scalar_mpc())
+    plant = Plant(env, DDPG("YannPolicy", env, policy_kwargs={"problem": scalar_mpc()}))
+    with pytest.raises(RuntimeError, match="An episode of the plant did not end in 20 steps"):
+        plant.play(plant.begin(seed=0), plant.mpc, None)
+
+
+def test_a_line_of_a_record_that_is_no_event_is_refused(tmp_path) -> None:
+    text, _ = _with_digest('{"no": "event"}', "")
+    (tmp_path / "plant.jsonl").write_text(f"{text}\n")
+    with pytest.raises(ValueError, match=r"line 1: no event .*it has no key 'event'.*Name anot"):
+        Record(tmp_path / "plant.jsonl")
+
+
+def test_a_simulator_without_costs_on_new_starts_is_named() -> None:
+    class Costless(Slide):
+        def reset(self, *, seed=None, options=None):
+            self.new = seed is not None and seed >= 1_000_010
+            return super().reset(seed=seed)
+
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            return observation, np.nan if self.new else reward, *rest
+
+    guard = make_guard(Costless, n_new_starts=5, n_final_starts=5)
+    with pytest.raises(ValueError, match=r"finite number on none of 5 new starts .* must be"):
+        train(build_slide(), 20, guard)
+
+
+def test_a_twins_env_says_how_it_is_used() -> None:
+    env = twin_samples.twin().env()
+    with pytest.raises(gym.error.ResetNeeded, match=r"Call env\.reset\(\) before"):
+        env.step(env.action_space.sample())
+    with pytest.raises(ValueError, match=r"options\['state'\] has shape \(7,\), expected"):
+        env.reset(options={"state": np.zeros(7)})
+
+
+@pytest.mark.parametrize(
+    ("beside", "message"),
+    [
+        ({"references": [np.zeros((3, 1))]}, r"references have shape \(3, 1\), expected \(11, 1\)"),
+        ({"previous": [[0.0, 0.0]]}, r"previous has shape \(2,\), expected \(1,\)"),
+    ],
+)
+def test_a_log_names_what_does_not_fit(beside, message) -> None:
+    problem = general_problems.solved("servo with all of it")
+    n, m, d = problem.model.n_states, problem.model.n_inputs, problem.model.n_disturbances
+    given = {"references": [np.zeros((11, 1))], "disturbances": [np.zeros((11, d))]} | beside
+    with pytest.raises(ValueError, match=message):
+        PlantTwin.fit(problem, [(np.zeros((11, n)), np.zeros((10, m)))], **given)
+    with pytest.raises(ValueError, match="is given, but states are all of theta: leave it out"):
+        PlantTwin.fit(problem, [(np.zeros((11, problem.n_theta)), np.zeros((10, m)))], **beside)

@@ -97,8 +97,9 @@ class Commissioning:
     --------
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import Commissioning
-    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> first = Commissioning(model, "CSTR-v0", batch=2, rounds=1, updates=100).run(batches=1)[0]
+    >>> plant = gym.make("CSTR-v0", max_episode_steps=20)
+    >>> model = DDPG("YannPolicy", plant, device="cpu")
+    >>> first = Commissioning(model, plant, batch=2, rounds=1, updates=100).run(batches=1)[0]
     >>> first.acted, first.episodes
     ('MPC', 2)
     """

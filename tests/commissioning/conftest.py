@@ -1,9 +1,10 @@
-"""Twins here are of polynomials: a fit of networks takes seconds, and every batch fits a twin."""
+"""Twins here are of polynomials, and improvements short: every batch makes both."""
 
 from __future__ import annotations
 
 import pytest
 
+from improvement_samples import quick
 from sb3_yann.twin import plant_twin
 
 
@@ -11,3 +12,4 @@ from sb3_yann.twin import plant_twin
 def no_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no log be long enough for them, but where a test asks for nothing else."""
     monkeypatch.setattr(plant_twin, "ROWS", 10**9)
+    quick(monkeypatch)

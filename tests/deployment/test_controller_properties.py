@@ -7,18 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deployed import disturbed, in_float64
-from partitions import as_range, mixture
+from deployed import disturbed
 from random_problems import examples, problems
-from sb3_yann import Checks, Controller, LinearMPC, YannPolicy, export
-from sb3_yann.deployment.code import insensitive
+from sb3_yann import Checks, Controller, LinearMPC, export
 
-SEEDS = st.integers(0, 2**32 - 1)
 OPTIONS = st.sampled_from([
     {"networks": "per_region", "max_correction": 0.2},
     {"networks": "shared"},
@@ -30,28 +26,6 @@ def exported(given: Any, **options: Any) -> Controller:
     with tempfile.TemporaryDirectory() as folder:
         export(given, Path(folder) / "plant.npz", **options)
         return Controller.load(Path(folder) / "plant.npz")
-
-
-def by_torch(policy: YannPolicy, seen: np.ndarray, controller: Controller) -> np.ndarray:
-    """The policy in float64, an evaluation of its own."""
-    with th.no_grad():
-        actions = in_float64(policy).actor(th.as_tensor(seen)).numpy()
-    return np.asarray(actions * controller.data["action_scale"] + controller.data["action_shift"])
-
-
-@pytest.mark.slow
-@examples(12)
-@given(problems(), SEEDS, OPTIONS)
-def test_controller_is_the_policy_and_the_law(mpc: LinearMPC, seed: int, options: dict) -> None:
-    seen, law = mixture(mpc, seed).astype(np.float32).astype(np.float64), mpc.explicit()
-    policy = disturbed(mpc, seed=seed % 2**31, **options)
-    controller = exported(policy)
-    kept = np.isin(seen, insensitive(controller, seen, "double")).all(1)
-    off = as_range(law, controller.evaluate(seen) - by_torch(policy, seen, controller))
-    assert np.all(off[kept] <= 1e-12)
-    alone = exported(law)
-    kept = np.isin(seen, insensitive(alone, seen, "double")).all(1)
-    assert np.all(as_range(law, alone.evaluate(seen) - law(seen))[kept] <= 1e-12)
 
 
 @examples(15)

@@ -91,7 +91,7 @@ def test_blark_parses_it(tmp_path):
         short = re.sub(r":= \[([^],]*),[^]]*\];", r":= [\1];", text)  # it takes minutes for tables
         assert len(short) < len(text) / 3
         assert parse(short).exception is None
-        assert parse(short.replace("END_WHILE", "END_WHIL", 1)).exception is not None
+    assert parse(short.replace("END_WHILE", "END_WHIL", 1)).exception is not None
 
 
 def test_single_precision_is_real(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from stable_baselines3 import DDPG
 from general_problems import solved
 from sample_layers import scrambled
 from sb3_yann.networks import SharedYannLayer, YannLayer
+from twin_samples import problem
 
 
 def layer_of(kind: str):
@@ -69,15 +71,6 @@ def test_where_the_law_acts_alone_nothing_is_learnt() -> None:
     assert all(not each.grad.any() for each in layer.network.weights())
 
 
-@pytest.mark.parametrize("kind", ["per_region", "shared"])
-def test_the_box_travels_with_the_weights(kind) -> None:
-    mpc, layer = layer_of(kind)
-    layer.confine(-0.1 * mpc.theta_half, 0.1 * mpc.theta_half)
-    theta, other = drawn(mpc, 1.0), layer_of(kind)[1]
-    other.load_state_dict(layer.state_dict())
-    assert th.equal(other(theta), layer(theta))
-
-
 def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:
     model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
     scrambled(model.actor.mu)
@@ -93,3 +86,18 @@ def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:
     for low, high in ((half, -half), (None, half), (half[:2], half), (-np.inf * half, half)):
         with pytest.raises(ValueError, match="low = "):
             model.policy.confine_correction(low, high)
+
+
+@pytest.mark.parametrize("kind", [YannLayer, SharedYannLayer])
+def test_a_frozen_layer_acts_as_the_layer_and_refuses_another_width(kind: Any) -> None:
+    layer = kind(problem().explicit(), (8, 8), max_correction=0.3)
+    with th.no_grad():
+        for each in layer.network.weights():
+            each.add_(0.3 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
+    layer.confine(0.3 * problem().theta_min, 0.4 * problem().theta_max)
+    theta = np.random.default_rng(0).uniform(-3, 3, (50, 2))
+    theta[7] = np.inf
+    with th.no_grad():
+        np.testing.assert_array_equal(layer.frozen()(theta), layer(th.as_tensor(theta)).numpy())
+    with pytest.raises(ValueError, match=r"theta has shape \(4, 3\), expected \(batch, 2\)"):
+        layer.frozen()(np.zeros((4, 3)))

@@ -10,7 +10,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from partitions import as_range, edges, mixture, reordered, slacks, steepest
+from partitions import as_range, edges, mixture, steepest
 from random_problems import examples, problems
 from sb3_yann import LinearMPC
 from sb3_yann.networks import SharedYannLayer, YannLayer
@@ -84,23 +84,6 @@ def test_shared_network_leaves_no_jump_whatever_its_weights(
             slope *= float(matrix.detach()[..., :-1].abs().sum(-1).max())
         most = 2 * step * (2 * steepest(mpc.explicit()) + slope) + 1e-6 * (1 + slope)
         assert np.all(np.abs(change.double().numpy()) <= most)
-
-
-@examples(15)
-@given(problems(), SEEDS, st.sampled_from([YannLayer, SharedYannLayer]), HIDDEN)
-def test_order_of_the_regions_changes_nothing_at_first(
-    mpc: LinearMPC, seed: int, layer: Any, hidden: tuple[int, ...]
-) -> None:
-    law, theta = mpc.explicit(), th.as_tensor(mixture(mpc, seed))
-    other = reordered(law, np.random.default_rng(seed).permutation(law.n_regions))
-    with th.no_grad():
-        one, two = layer(law, hidden)(theta), layer(other, hidden)(theta)
-    deepest = np.sort(slacks(law, theta.numpy()), axis=1)
-    tie = 1e-9 * (1 + np.abs(deepest[:, -1]))
-    clear = (law.n_regions == 1) | (deepest[:, -1] - deepest[:, -2:].min(axis=1) > tie)
-    assert th.equal(one[clear], two[clear])
-    inside = law.in_domain(theta.numpy())
-    assert th.all((one - two).abs()[inside] <= 2e-7)
 
 
 @pytest.mark.slow

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from stable_baselines3 import DDPG, TD3
 
 from general_problems import LOADED, solved
 from sample_plants import LinearPlant, feasible_states
-from sb3_yann import NoActionNoise, YannPolicy
+from sb3_yann import YannPolicy
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.wrappers import ObserveDisturbance, PreviousInput, SetPoint, StageCost
 
@@ -99,17 +97,6 @@ def test_a_wrapped_plant_starts_as_offset_free_mpc_in_sb3() -> None:
     np.testing.assert_allclose(theta, [*mpc.steady_state([0.5], [0.2])[0], 0.5, 0.2, action[0]],
                                atol=1e-5)  # fmt: skip
     assert abs(reward) < 1e-9
-
-
-def test_it_trains_and_loads(tmp_path: Path) -> None:
-    mpc = solved("servo with all of it")
-    kwargs = {"problem": mpc, "critic_warmup": 0}
-    model = DDPG(YannPolicy, gym.wrappers.TimeLimit(wrapped(mpc), 20), policy_kwargs=kwargs)
-    model.learn(60, callback=NoActionNoise())
-    model.save(tmp_path / "model")
-    loaded = DDPG.load(tmp_path / "model")
-    theta = np.float32([0.1, 0.2, 0.3, 0.1, 0.0])
-    np.testing.assert_array_equal(loaded.predict(theta)[0], model.predict(theta)[0])
 
 
 @pytest.mark.parametrize(

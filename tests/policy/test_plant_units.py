@@ -56,14 +56,6 @@ def test_the_policy_is_the_mpc_whatever_the_units(shows: str, takes: str, dtype:
     assert error(model, env, units.states(2000, seed=1)) < 1e-5
 
 
-def test_an_env_in_plant_units_needs_no_word() -> None:
-    env = units.plant("plant", "plant")
-    model = build(env)
-    shown = units.states(100, seed=2) + units.X_SS
-    u = MPC.explicit().plant_input(shown)
-    assert np.max(np.abs(model.predict(shown)[0] - u)) < 7e-5
-
-
 def test_small_deviations_of_a_large_value_keep_their_digits() -> None:
     env = units.plant("plant", "plant", np.float64)
     model = build(env)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel, LinearMPC, plan
 from sb3_yann.improvement import critic, imitation, model
 from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann_envs import ProblemBox
@@ -20,7 +20,8 @@ FEW = {"n_starts": 6, "rounds": 1, "updates": 200}
 
 
 def quick(patch: pytest.MonkeyPatch) -> None:
-    """Let fits be short."""
+    """Let fits be short, and plans begin with the MPC and its inputs on their bounds."""
+    patch.setattr(plan, "WEIGHTS", ())
     patch.setattr(model, "fit_ensemble", partial(fit_ensemble, updates=300))
     patch.setattr(imitation, "FITS", 2)
     patch.setattr(critic, "SAMPLES", 512)
