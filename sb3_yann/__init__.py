@@ -32,7 +32,7 @@ _NAMES = {
     "MixedBounds OnlineLaw OnlineLawWarning OutputBounds PiecewiseAffine RateLimits SoftBounds "
     "StateEstimator Terminal Tracking identify identify_outputs offset_free "
     "with_extra",
-    "sb3_yann.deployment.checks": "Checks",
+    "sb3_yann.deployment.describe": "Checks",
     "sb3_yann.deployment.controller": "Controller",
     "sb3_yann.deployment.exporting": "Exported export",
     "sb3_yann.improvement": "Headroom Improvement headroom improve",

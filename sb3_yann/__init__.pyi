@@ -29,8 +29,8 @@ from sb3_yann.control import identify as identify
 from sb3_yann.control import identify_outputs as identify_outputs
 from sb3_yann.control import offset_free as offset_free
 from sb3_yann.control import with_extra as with_extra
-from sb3_yann.deployment.checks import Checks as Checks
 from sb3_yann.deployment.controller import Controller as Controller
+from sb3_yann.deployment.describe import Checks as Checks
 from sb3_yann.deployment.exporting import Exported as Exported
 from sb3_yann.deployment.exporting import export as export
 from sb3_yann.guard import AcceptanceRule as AcceptanceRule

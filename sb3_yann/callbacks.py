@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann.policy.exploring import Explores
 from sb3_yann.policy.observations import require_frozen, require_same_statistics
 from sb3_yann.policy.policies import StartsAsMPC, require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
-from sb3_yann.policy.spread import Explores
-
-if TYPE_CHECKING:
-    pass
 
 
 class NoActionNoise(BaseCallback):

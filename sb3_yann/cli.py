@@ -22,18 +22,7 @@ from sb3_yann._validation import check_int
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command, and return the exit code: 0, 1 for an error, 130 for Ctrl-C.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The default is the command line's.
-
-    Examples
-    --------
-    >>> main(["solve", "no-such-problem"])
-    1
-    """
+    """Run a command, and return the exit code: 0, 1 for an error, 130 for Ctrl-C."""
     options = _parser().parse_args(arguments)
     if os.getcwd() not in sys.path:  # modules of the user's, as with python -m
         sys.path.insert(0, os.getcwd())

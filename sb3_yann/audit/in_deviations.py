@@ -15,7 +15,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.units import ActionUnits, Units
-from sb3_yann.wrappers.spaces import require_vector
+from sb3_yann.wrappers.theta import require_vector
 
 Map = Callable[[Array], Array]
 """From an observation to theta."""

@@ -1,31 +1,188 @@
-"""A controller as C99: one file, its header, and a test of its own with known answers."""
+"""A controller as C99 with a test of its own, and as an FMU for co-simulation (FMI 2.0)."""
 
 from __future__ import annotations
 
+import io
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import tempfile
+import uuid
+import warnings
+import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
 
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
 from sb3_yann.deployment import code
-from sb3_yann.deployment.code import Arrays, literal, table
-from sb3_yann.deployment.controller import steps_of
-from sb3_yann.deployment.known_answers import known_answers
+from sb3_yann.deployment.code import (
+    Arrays,
+    input_ranges,
+    insensitive,
+    literal,
+    room_of,
+    room_outside,
+    sample_observations,
+    table,
+)
+from sb3_yann.deployment.controller import MODES, Controller, steps_of
+
+
+def known_answers(data: Arrays, precision: str) -> dict[str, str]:
+    """Return what the self-test in C is filled with: points and steps, and what they must give.
+
+    ValueError if a rounding changes all answers.
+    """
+    controller, n_points = Controller(data), 48
+    drawn = sample_observations(controller, 4 * n_points)
+    if precision == "float":
+        drawn = drawn.astype(np.float32).astype(np.float64)
+    obs = insensitive(controller, drawn, precision)[:n_points]
+    room = room_of(data, precision)
+    if not len(obs):
+        raise ValueError(
+            f"In {precision} a rounding of a reading moves the output by more than {room:g} of its "
+            "range, at all points tried: readings are large beside what they move by. Pass "
+            "precision='double'."
+        )
+    ranges = input_ranges(controller, controller.evaluate(drawn))
+    run = Run.with_estimator(data, obs) if "est_gain" in data else Run.of_readings(obs)
+    answers, room_in_loop = run.play(controller), 0.0
+    if run.plant:
+        # What roundings of the outputs do to the loop, code may do too.
+        moved = run.play(controller, 1e-6 if precision == "float" else 1e-13)
+        change = np.abs(moved["actions"] - answers["actions"]) / ranges
+        room_in_loop = 10 * float(change.max())
+    numbers: dict[str, NDArray[Any]] = {
+        "points": obs,
+        "policy": controller.evaluate(obs),
+        "law": controller.evaluate(obs, networks=False),
+        "range_of": ranges,
+        "readings": run.readings,
+        "elapsed": run.elapsed,
+        **{key: each for key, each in run.plant.items() if each.size},
+        "lost": run.lost,
+        "starts_anew": run.starts_anew,
+        "requests": run.requests,
+        **answers,
+    }
+    texts = [
+        table("yann_real" if each.dtype.kind == "f" else "int", name, each, precision)
+        for name, each in numbers.items()
+    ]
+    n_outputs, n_states = run.plant["C_of_plant"].shape if run.plant else (0, 0)
+    sizes = {"POINTS": len(obs), "STEPS": len(run.lost), "STATES": n_states, "OUTPUTS": n_outputs}
+    sizes["LOADS"] = len(run.plant["loads_of_plant"]) if run.plant else 0
+    return {
+        "VECTORS": "\n".join(texts),
+        **{key: str(size) for key, size in sizes.items()},
+        "ROOM_INSIDE": f"{room:g}",
+        "ROOM_OUTSIDE": f"{room_outside(data, precision):g}",
+        "ROOM_IN_LOOP": f"{room_in_loop:.2g}",
+    }
+
+
+@dataclass(frozen=True)
+class Run:
+    """Steps of a controller with lost readings, a late one, all modes and a second start."""
+
+    readings: Array  # (T, n_read); where there is a plant, its outputs are added to the first ones
+    elapsed: Array
+    lost: NDArray[np.bool_]  # the first reading is
+    requests: NDArray[np.int64]
+    starts_anew: NDArray[np.bool_]  # and takes the plant's input then
+    # x+ = step_of_plant [x; u; loads; 1] from start_of_plant, with outputs C_of_plant x; or empty
+    plant: dict[str, NDArray[Any]]
+
+    @classmethod
+    def of_readings(cls, readings: Array, count: int = 60, **plant: NDArray[Any]) -> Run:
+        """Return so many steps, each reading for four of them."""
+        k = np.arange(count)
+        return cls(
+            readings=readings[k // 4 % len(readings)],
+            elapsed=np.where(k == 20, 3.0, 1.0),
+            lost=((k >= 10) & (k < 13)) | ((k >= 30) & (k < 40)),
+            requests=np.select([(k >= 50) & (k < 53), (k >= 56) & (k < 60)], [1, 2], 0),
+            starts_anew=k == count - 15,
+            plant=plant,
+        )
+
+    @classmethod
+    def with_estimator(cls, data: Arrays, seen: Array) -> Run:
+        """Return a closed loop with the estimator's own model as the plant.
+
+        It begins beside the operating point, with a load that the estimator must find; references
+        and measured loads change.
+        """
+        (size, q), source, rest = data["est_gain"].shape, data["source"], data["obs_rest"]
+        half = (data["box"][1] - data["box"][0]) / 2
+        x = data["est_first"] @ np.append(rest[:q], 1.0)
+        spread = np.zeros(size)
+        readings = np.tile(rest, (50, 1))
+        for column, place in enumerate(source):
+            if len(rest) <= place < len(rest) + size:
+                spread[place - len(rest)] = half[column]
+            elif place < len(rest):
+                steps = seen[np.arange(50) // 5 % len(seen), column]
+                readings[:, place] += 0.1 * (steps - rest[place])
+        noise = np.random.default_rng(0).normal(size=(50, q))
+        readings[:, :q] = 1e-3 * noise * (np.abs(data["est_C"]) @ spread)
+        scale, shift = data["est_input"]
+        step = data["est_next"].copy()
+        step[:, -1] += step[:, size : size + len(scale)] @ shift
+        step[:, size : size + len(scale)] *= scale
+        return cls.of_readings(
+            readings,
+            200,
+            step_of_plant=step,
+            C_of_plant=data["est_C"],
+            start_of_plant=x + 0.2 * spread,
+            loads_of_plant=data["est_loads"],
+        )
+
+    def play(self, controller: Controller, moved: float = 0.0) -> dict[str, NDArray[Any]]:
+        """Return actions (T, m), status and modes; outputs move by a part of their size."""
+        controller.reset()
+        generator = np.random.default_rng(2)
+        x = self.plant["start_of_plant"] if self.plant else np.zeros(0)
+        actions: list[Array] = []
+        status, modes = [], []
+        for k, reading in enumerate(self.readings.copy()):
+            given = reading.copy()
+            if self.plant:
+                y = self.plant["C_of_plant"] @ x
+                given[: len(y)] += y * (1 + moved * generator.choice([-1, 1], len(y)))
+            if self.lost[k]:
+                given[0] = np.nan
+            if self.starts_anew[k]:
+                controller.reset()
+            controller.request = MODES[self.requests[k]]
+            present = actions[-1] if self.starts_anew[k] else None
+            actions.append(controller(given, self.elapsed[k], present))
+            status.append(int(controller.status))
+            modes.append(MODES.index(controller.mode))
+            if self.plant:
+                loads = reading[self.plant["loads_of_plant"]]
+                x = self.plant["step_of_plant"] @ [*x, *actions[-1], *loads, 1.0]
+        return {
+            "actions": np.array(actions),
+            "status": np.array(status),
+            "modes": np.array(modes),
+        }
 
 
 def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, str]:
-    """Return the texts of the C files by their names.
-
-    Parameters
-    ----------
-    data : dict of str to ndarray
-        As `describe` returns them.
-    precision : {"double", "float"}
-        Of all numbers.
-    about : str
-        The comment at the top: where it comes from.
-    file : str
-        What the files are called, without a suffix.
-    """
+    """Return the texts of the C files by their names."""
     lines = [f"  {line}" for line in code.signal_lines(data, "action")]
     n_obs, n_seen = len(data["obs_rest"]), data["obs_matrix"].shape[1]
     sizes = {"N_OBS": n_obs, "N_SEEN": n_seen, "N_INPUTS": len(data["action_scale"])}
@@ -130,3 +287,157 @@ def _definitions(data: Arrays, precision: str) -> str:
     lines += ["", *(table("real", key, each, precision) for key, each in numbers.items())]
     lines += [table(index, key, each, precision) for key, each in indices.items()]
     return "\n".join(lines)
+
+
+LIBRARIES = {
+    ("Linux", "x86_64"): ("linux64", ".so"),
+    ("Darwin", "x86_64"): ("darwin64", ".dylib"),
+    ("Darwin", "arm64"): ("darwin64", ".dylib"),
+}
+COMPILERS = "cc", "gcc", "clang"
+FLAGS = "-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"
+
+
+def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
+    """Return the bytes of an FMU.
+
+    It holds the C code, and a library for this machine where a C compiler is at hand. A step is a
+    step of the controller: the communication step is its dt.
+    """
+    name = str(data["name"])
+    identity = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"{precision} {about}")) + "}"
+    sources = {
+        file: text
+        for file, text in c_files(data, precision, about, name).items()
+        if not file.endswith("_selftest.c")
+    }
+    rest = ", ".join(literal(each, "double") for each in data["obs_rest"])
+    entries = {
+        "ABOUT": comment(about.splitlines()),
+        "FILE": name,
+        "GUID": identity,
+        "DT": literal(float(data["dt"]), "double"),
+        "REST": f"{{{rest}}}",
+    }
+    for suffix in (".c", ".h"):
+        sources[f"{name}_fmi2{suffix}"] = fill(f"fmi2{suffix}", entries, data)
+    units = [file for file in sources if file.endswith(".c")]
+    parts: dict[str, bytes] = {
+        "modelDescription.xml": _description(data, about, identity, units),
+        **{f"sources/{file}": text.encode("ascii") for file, text in sources.items()},
+    }
+    folder, suffix = LIBRARIES.get((platform.system(), platform.machine()), ("", ""))
+    library = _library(sources) if folder else b""
+    if library:
+        parts[f"binaries/{folder}/{name}{suffix}"] = library
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path, content in parts.items():
+            entry = zipfile.ZipInfo(path)  # with the same date each time: the same file
+            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(entry, content)
+    return file.getvalue()
+
+
+def _library(sources: dict[str, str]) -> bytes:
+    """Return a shared library of the sources; nothing where there is no compiler."""
+    compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
+    if compiler is None:
+        return b""
+    with tempfile.TemporaryDirectory() as folder:
+        for file, text in sources.items():
+            (Path(folder) / file).write_text(text, encoding="ascii")
+        units = [file for file in sources if file.endswith(".c")]
+        command = [compiler, *FLAGS, *units, "-lm", "-o", "library"]
+        # Its temporary files lie in the folder. An interrupt ends all processes of the compiler
+        # before the folder is removed.
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env={**os.environ, "TMPDIR": folder},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            errors = process.communicate()[1]
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            raise
+        if process.returncode == 0:
+            return (Path(folder) / "library").read_bytes()
+    warnings.warn(
+        f"{compiler} failed, so the FMU holds sources and no library: {errors.strip()[:300]}",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return b""
+
+
+def _description(data: Arrays, about: str, identity: str, units: list[str]) -> bytes:
+    """Return modelDescription.xml."""
+    name, dt = str(data["name"]), float(data["dt"])
+    root = ET.Element(
+        "fmiModelDescription",
+        fmiVersion="2.0",
+        modelName=name,
+        guid=identity,
+        description=about,
+        generationTool="sb3-yann",
+        variableNamingConvention="structured",
+    )
+    kind = ET.SubElement(root, "CoSimulation", modelIdentifier=name)
+    listed = ET.SubElement(kind, "SourceFiles")
+    for unit in units:
+        ET.SubElement(listed, "File", name=unit)
+    logs = ET.SubElement(root, "LogCategories")
+    ET.SubElement(logs, "Category", name="logStatusError")
+    if dt:
+        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(dt))
+    variables = ET.SubElement(root, "ModelVariables")
+    _add_variables(variables, data)
+    structure = ET.SubElement(root, "ModelStructure")
+    found = [i + 1 for i, each in enumerate(variables) if each.get("causality") == "output"]
+    for part in ("Outputs", "InitialUnknowns"):
+        unknowns = ET.SubElement(structure, part)
+        for index in found:
+            ET.SubElement(unknowns, "Unknown", index=str(index))
+    ET.indent(root)
+    return bytes(ET.tostring(root, "utf-8", xml_declaration=True)) + b"\n"
+
+
+def _add_variables(within: ET.Element, data: Arrays) -> None:
+    """Add all variables, in the order of their value references."""
+    inputs = [*map(str, data["action_names"])]
+    who = "0 the policy, 1 the MPC, 2 manual"
+    taken: list[tuple[str, str, str, str, str | None]] = []
+    for i, (name, rest) in enumerate(zip(data["obs_names"], data["obs_rest"], strict=True)):
+        start = repr(float(rest))
+        taken.append(("Real", "input", f"obs[{i}]", str(name), start))
+    elapsed = "time since the last step in units of dt; 0 where it is not known"
+    taken.append(("Real", "input", "elapsed", elapsed, "0.0"))
+    for i, name in enumerate(inputs):
+        taken.append(("Real", "input", f"manual[{i}]", f"{name}, of the operator", "0.0"))
+    for i, name in enumerate(inputs):
+        taken.append(("Real", "output", f"command[{i}]", name, None))
+    taken += [
+        ("Integer", "input", "request", who, "0"),
+        ("Integer", "output", "status", "0, or the sum of what was found", None),
+        ("Integer", "output", "mode", f"who acted: {who}", None),
+        ("Boolean", "input", "has_manual", "false holds the output while manual", "false"),
+    ]
+    counts = dict.fromkeys(("Real", "Integer", "Boolean"), 0)
+    for kind, causality, name, description, start_value in taken:
+        variable = ET.SubElement(
+            within,
+            "ScalarVariable",
+            name=name,
+            valueReference=str(counts[kind]),
+            description=description,
+            causality=causality,
+            variability="discrete",
+        )
+        counts[kind] += 1
+        ET.SubElement(variable, kind, {} if start_value is None else {"start": start_value})

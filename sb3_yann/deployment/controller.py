@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-FORMATS = (1, 2, 3)  # of the arrays; a reader takes its own only: rows to keep, an estimator
+FORMAT = 1  # of the arrays: a reader takes no other
 POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
 MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
 FAR = 1e12  # theta is clipped to so many times its box: beyond, slacks would overflow
@@ -213,17 +213,10 @@ class Controller:
             )
         self.data = {name: np.asarray(each) for name, each in data.items()}
         try:
-            (_, m, n) = self.data["gains"].shape
-            n_obs = self.data["obs_matrix"].shape[-1]
-            self.data.setdefault("kept", np.empty((0, n + m + 2)))  # as there was none
-            self.data.setdefault("moving", np.empty((0, m), np.int64))
-            self.data.setdefault("source", np.arange(n_obs))
-            self.data.setdefault("seen_rest", self.data["obs_rest"])
-            self.data.setdefault("missing", np.zeros(n_obs, np.int64))
             version = int(self.data["format"])
-            if version not in FORMATS:
+            if version != FORMAT:
                 raise ValueError(
-                    f"The controller has format {version}, this reader takes {FORMATS}. Export the "
+                    f"The controller has format {version}, this reader takes {FORMAT}. Export the "
                     "model again, or take the reader of the version that wrote it."
                 )
             _check_arrays(self.data)
@@ -392,15 +385,7 @@ class Controller:
         return faulty, status
 
     def _seen(self, obs: Array, faulty: NDArray[np.bool_], known: bool) -> Array:
-        """Return what the policy sees: good readings, estimates and the last input, each in place.
-
-        Parameters
-        ----------
-        obs, faulty : ndarray, shape (n_read,)
-            The readings, and which are not good.
-        known : bool
-            Whether this is the first step and the plant's present input is known.
-        """
+        """Return what the policy sees: good readings, estimates and the last input in place."""
         data = self.data
         if "est_gain" not in data:
             return np.asarray(self._good[data["source"]])

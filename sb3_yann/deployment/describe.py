@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, check_bounds, check_int, check_positive
 from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine, StateEstimator
 from sb3_yann.control.linear_system import labels_of, missing_observer
-from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.code import scale_within
-from sb3_yann.deployment.controller import FORMATS
-from sb3_yann.deployment.estimating import Estimator, estimator_arrays
+from sb3_yann.deployment.controller import FORMAT
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
 from sb3_yann.policy.checkpoint import ActorCheckpoint
@@ -22,31 +23,158 @@ from sb3_yann.policy.observations import AffineFeatures, keeps_entries
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.units import ActionUnits
 
+
+@dataclass(frozen=True)
+class Checks:
+    """What a controller takes for a fault, and how it falls back.
+
+    Parameters
+    ----------
+    obs_min, obs_max : array_like, shape (n_obs,), or float, optional
+        Limits of the readings, in the units of the export. None is no limit. Readings are what the
+        sensors say, not what an estimator makes of them.
+    frozen_after : int, default 0
+        A state that stays the same to the bit for so many steps in which another reading moves is
+        frozen. 0 checks nothing: only you know how coarse a sensor is.
+    missing : int or list of int, default 0
+        For how many steps in a row a reading may be NaN before that is a fault, one number or one
+        for each: 60 for a laboratory's hourly value among readings of every minute. An estimator
+        goes on without it, elsewhere the last good one stands in.
+    late_after : float, optional
+        A step is late when more time has passed since the last one, in units of dt, 1.5 by default.
+        It is checked where a step is passed the time. None checks nothing.
+    hold : int, default 5
+        Steps with a faulty reading that the last good one stands in for; then the output is held.
+    recover : int, default 10
+        Steps without a fault before the policy acts again. The MPC's law acts until then.
+    transfer : int, default 5
+        Steps within which a change of who acts fades.
+
+    Examples
+    --------
+    >>> Checks(obs_min=[-2, -60], obs_max=[2, 20], frozen_after=30).hold
+    5
+    """
+
+    obs_min: ArrayLike | None = None
+    obs_max: ArrayLike | None = None
+    frozen_after: int = 0
+    missing: int | Sequence[int] = 0
+    late_after: float | None = 1.5
+    hold: int = 5
+    recover: int = 10
+    transfer: int = 5
+
+    def arrays(self, size: int) -> dict[str, Any]:
+        """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""
+        low, high = check_bounds("obs", self.obs_min, self.obs_max, size)
+        counts: dict[str, Any] = {
+            name: np.int64(check_int(name, getattr(self, name), 0))
+            for name in ("frozen_after", "hold", "recover", "transfer")
+        }
+        late = np.inf
+        if self.late_after is not None:
+            late = check_positive("late_after", self.late_after, "None checks nothing.")
+        given = np.ravel(self.missing).tolist()
+        if len(given) not in (1, size):
+            raise ValueError(f"missing = {self.missing} must be one number, or {size}.")
+        missing = [check_int("missing", each, 0) for each in given]
+        counts["missing"] = np.resize(np.array(missing, np.int64), size)
+        return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}
+
+
+Estimator = StateEstimator | str | None
+
+
+def estimator_arrays(
+    problem: LinearMPC,
+    estimator: StateEstimator,
+    seen: list[str],
+    seen_rest: Array,
+    units: ActionUnits,
+) -> dict[str, Any]:
+    """Return the arrays of an estimator, and where each entry of what the policy sees comes from.
+
+    A step of the filter is ``[A B E c] [x; u; d; 1]``, and a correction by ``gain (y - C x)``, both
+    in plant units. Of what the policy sees, x and estimated disturbances come from the filter, the
+    previous input is the controller's own, and the rest are readings, behind the outputs.
+    """
+    model, layout = problem.model, problem.layout
+    _require_same(model, estimator)
+    q, size, n_known = estimator.n_measured, len(estimator.A), estimator.n_known
+    estimated = [*range(n_known, model.n_disturbances)]
+    x = np.concatenate([model.x_ss, model.d_ss[estimated]])
+    y = estimator.C_aug @ x
+    driven = np.concatenate([model.u_ss, model.d_ss[:n_known]])
+    step = np.hstack([estimator.A, estimator.B, estimator.E])
+    smallest = np.zeros((size, q))
+    smallest[: model.n_states] = np.linalg.pinv(estimator.C)
+
+    entries = np.arange(len(seen))
+    in_d = np.arange(layout.disturbance.start, layout.disturbance.stop)
+    first = in_d[len(in_d) - len(estimated) :]
+    from_filter = np.concatenate([entries[layout.state], first])
+    previous = entries[layout.previous]
+    read = np.delete(entries, np.concatenate([from_filter, previous]))
+    n_read = q + len(read)
+    source = np.empty(len(seen), np.int64)
+    source[read] = q + np.arange(len(read))
+    source[from_filter] = n_read + np.arange(size)
+    source[previous] = n_read + size + np.arange(len(previous))
+    limits = np.full(model.n_states, np.inf)
+    d_min, d_max = (getattr(problem.disturbances, side)[n_known:] for side in ("d_min", "d_max"))
+    names = [*_output_names(estimator, seen), *(seen[i] for i in read)]
+    scale = 1 / units.scale
+    return {
+        "est_next": _affine(step, np.concatenate([x, driven]), x),
+        "est_rest": _affine(estimator.resting, np.concatenate([y, driven]), x),
+        "est_first": _affine(smallest, y, x),
+        "est_C": estimator.C_aug,
+        "est_gain": estimator.gain,
+        "est_input": np.array([scale, model.u_ss - units.shift * scale]),
+        "est_loads": source[in_d[:n_known]],
+        "est_box": np.array([[*-limits, *d_min], [*limits, *d_max]]),
+        "source": source,
+        "obs_names": np.array(names),
+        "obs_rest": np.concatenate([y, seen_rest[read]]),
+        "watched": np.arange(n_read) < q,
+    }
+
+
+def _affine(matrix: Array, given_ss: Array, found_ss: Array) -> Array:
+    """Return ``[matrix, c]``: a map of deviations, for what counts from these operating points."""
+    return np.column_stack([matrix, found_ss - matrix @ given_ss])
+
+
+def _output_names(estimator: StateEstimator, seen: list[str]) -> list[str]:
+    """Return names of the measured outputs: those of states that are shown as they are."""
+    found = []
+    for i, row in enumerate(estimator.C):
+        at = np.flatnonzero(row)
+        as_is = len(at) == 1 and row[at[0]] == 1
+        found.append(seen[at[0]] if as_is else f"y[{i}]")
+    return found
+
+
+def _require_same(model: Any, estimator: StateEstimator) -> None:
+    """Raise unless an estimator's model is that of the problem."""
+    own = estimator.model
+    pairs = [(getattr(own, key), getattr(model, key)) for key in ("A", "B", "E", "x_ss", "u_ss")]
+    same = all(a.shape == b.shape and np.allclose(a, b) for a, b in pairs)
+    if not same or estimator.n_estimated != len(model.estimated):
+        raise ValueError(
+            "The estimator is of another model than the problem: take found.estimator() of the "
+            "model that the MPC has, or the observer that offset_free(mpc) returned with it."
+        )
+
+
 Exportable = BaseAlgorithm | StartsAsMPC | LinearMPC | PiecewiseAffine | OnlineLaw
 
 
 def describe(
     given: Exportable, name: str, checks: Checks, estimator: Estimator = None
 ) -> dict[str, Any]:
-    """Return the arrays of a controller.
-
-    Parameters
-    ----------
-    given : model, YannPolicy, LinearMPC or PiecewiseAffine
-        Of an MPC or a law the controller takes theta and puts out u, in plant units where its model
-        has an operating point; of a model it does what `predict` does.
-    name : str
-        What the controller is called.
-    checks : Checks
-        Limits of the readings, and how to fall back.
-    estimator : StateEstimator or "caller", optional
-        What estimates states and disturbances; "caller" where whoever calls it does.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it cannot be exported: the message says why.
-    """
+    """Return the arrays of a controller."""
     policy = given.policy if isinstance(given, BaseAlgorithm) else given
     if not isinstance(policy, StartsAsMPC | LinearMPC | PiecewiseAffine | OnlineLaw):
         raise TypeError(
@@ -100,7 +228,6 @@ def describe(
         units = policy.action_units if isinstance(policy, StartsAsMPC) else units
         signals = estimator_arrays(problem, own, labels, seen_rest, units)
     limits = checks.arrays(len(signals["obs_rest"]))
-    newest = own is not None or limits["missing"].any()
     return {
         **_law_arrays(law),
         **program,
@@ -109,7 +236,7 @@ def describe(
         **limits,
         "change": change,
         "moving": np.empty((0, law.n_inputs), np.int64) if law.moving is None else law.moving,
-        "format": np.int64(FORMATS[2 if newest else len(networks["kept"]) > 0]),
+        "format": np.int64(FORMAT),
         "name": name,
         "dt": np.float64(0.0 if law.model is None else law.model.dt),
         "obs_matrix": matrix,
@@ -308,8 +435,7 @@ def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
     """Return the networks of a layer that are not zero, and which of them each region has."""
     network = layer.network
     nodes = network.first.nodes.detach().double().cpu().numpy()
-    k = nodes.shape[1] // 2
-    first = (nodes[:, :k] + nodes[:, k : 2 * k]).sum(1) + nodes[:, 2 * k :].sum(1)
+    first = nodes.sum(1)
     rest = [each.detach().double().cpu().numpy() for each in network.weights()[1:]]
     layers, pinned = [first, *rest], network.pinned_array > 0
     if not all(np.all(np.isfinite(each)) for each in layers):

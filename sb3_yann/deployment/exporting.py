@@ -12,12 +12,9 @@ from typing import Any
 
 from sb3_yann._archive import atomic_write, digest_of, write_arrays
 from sb3_yann._validation import check_choice, check_options
-from sb3_yann.deployment.c_code import c_files
-from sb3_yann.deployment.checks import Checks
+from sb3_yann.deployment.c_code import c_files, fmu_file
 from sb3_yann.deployment.code import Cost
-from sb3_yann.deployment.describe import Exportable, describe
-from sb3_yann.deployment.estimating import Estimator
-from sb3_yann.deployment.fmu import fmu_file
+from sb3_yann.deployment.describe import Checks, Estimator, Exportable, describe
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
 

@@ -17,20 +17,6 @@ def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
     ``obs`` (batch, n_obs) to ``action`` (batch, m) and ``outside`` (batch,): where the MPC has no
     solution. All regions are asked at once: a batch of B takes B times the largest number of
     half-spaces of a region times the regions.
-
-    Parameters
-    ----------
-    data : dict of str to ndarray
-        As `describe` returns them.
-    precision : {"double", "float"}
-        Of all numbers, in and out.
-    digest : str
-        Goes into the metadata, with the names of all entries.
-
-    Raises
-    ------
-    ImportError
-        If onnx is not installed.
     """
     try:
         import onnx

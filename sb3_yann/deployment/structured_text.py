@@ -52,17 +52,7 @@ first. It also leaves out a FOR loop of one turn, so all loops are WHILE.
 
 
 def st_text(data: Arrays, precision: str, about: str) -> str:
-    """Return a FUNCTION_BLOCK with the step of a controller.
-
-    Parameters
-    ----------
-    data : dict of str to ndarray
-        As `describe` returns them.
-    precision : {"double", "float"}
-        LREAL or REAL.
-    about : str
-        The comment at the top: where it comes from.
-    """
+    """Return a FUNCTION_BLOCK with the step of a controller."""
     interface, constants, variables, body = _parts(data, precision)
     top = "\n".join(f"  {line}".rstrip() for line in _comment(data, about))
     declared = ["".join(f"    {line}\n" for line in lines) for lines in (constants, variables)]

@@ -609,22 +609,8 @@ def plot_gains(runs: Runs, axes: Axes | None = None) -> Axes:
 def plot_decisions(decisions: Sequence[Any], axes: Axes | None = None) -> Axes:
     """Draw each candidate's mean cost by the verdict on it, the accepted policy's and the MPC's.
 
-    A candidate far beyond the accepted policies, or without a cost, is drawn at the edge.
-
-    Parameters
-    ----------
-    decisions : sequence of Decision
-        As in ``guard.decisions``; of none a note says so.
-    axes : matplotlib Axes, optional
-        Where to draw; a new figure's by default.
-
-    Examples
-    --------
-    >>> from sb3_yann import Decision
-    >>> costs = {"candidate_cost": 3.0, "accepted_cost": 3.0, "mpc_cost": 4.0}
-    >>> first = Decision(verdict="accepted", episode=1, **costs)
-    >>> plot_decisions([first]).get_xlabel()
-    'training episodes'
+    A candidate far beyond the accepted policies, or without a cost, is drawn at the edge. Of no
+    decisions a note says so.
     """
     axes = axes_or_new(axes, 8.0, 3.8)
     axes.set(xlabel="training episodes", ylabel="mean cost")

@@ -287,12 +287,6 @@ class AfterstateValue(nn.Module):
         buffers: Any = self._buffers
         return float(buffers["value_scale"].item()) or 1.0
 
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
-        # Weights that were saved without a scale had that of the options, else 30.
-        own = th.where(self.value_scale > 0, self.value_scale, 30.0)
-        state_dict.setdefault(f"{prefix}value_scale", own)
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
     @property
     def compiles(self) -> bool:
         """Whether there is compiled code for such a value where it is now."""

@@ -31,19 +31,7 @@ ROUNDING = 1e-6
 
 
 class LawLayer(nn.Module):
-    """theta -> input in [-1, 1]: a law, and what networks add to it within bounds.
-
-    Parameters
-    ----------
-    law : PiecewiseAffine or OnlineLaw
-        With finite input bounds, which map to -1 and 1.
-    rate : pair of ndarray, shape (m,), optional
-        ``du_min`` and ``du_max``: the input never moves by more from the previous one, the last m
-        entries of theta.
-    kept : KeptSet, optional
-        What networks add never makes the model's next theta leave it, nor go further beyond one of
-        its half-spaces than the law does.
-    """
+    """theta -> input in [-1, 1]: a law, and what networks add to it within bounds."""
 
     theta_half: th.Tensor
     middle: th.Tensor
@@ -240,8 +228,6 @@ class LawLayer(nn.Module):
         self.constants = (scaling, change, kept, limit)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
-        # Weights of before there were such rows act as they did.
-        state_dict.setdefault(f"{prefix}margin", th.tensor(-1.0, dtype=th.float64))
         super()._load_from_state_dict(state_dict, prefix, *rest)
         self._keep_constants()
 

@@ -24,56 +24,27 @@ FEW = 32
 
 
 class PairedLinear(nn.Module):
-    """``x -> sum_j (W_j x + b_j)`` over nodes in pairs of opposite sign: exactly zero at first.
-
-    Parameters
-    ----------
-    in_features, out_features : int
-    n_nodes : int, default 2
-        Nodes summed into each output, at least 2. An odd one out starts with zero weights
-        (the corollary to Theorem 1).
-    n_stacked : int, default 1
-        Number of independent layers in one tensor.
-    scale : float, default 0.01
-        Initial weights and biases are uniform in [-scale, scale].
-    """
+    """``x -> W_1 x + b_1 + W_2 x + b_2`` for a pair of nodes of opposite sign: zero at first."""
 
     def __init__(
         self,
         in_features: int,
         out_features: int,
         *,
-        n_nodes: int = 2,
         n_stacked: int = 1,
         scale: float = 0.01,
     ) -> None:
         super().__init__()
-        check_int("n_nodes", n_nodes, 2, "Zero needs a pair of nodes.")
-        n_pairs = n_nodes // 2
-        self.parts = [n_pairs, n_pairs, n_nodes % 2]
-        first = _drawn((n_stacked, n_pairs), in_features, out_features, scale)
-        rest = th.zeros(n_stacked, n_nodes % 2, *first.shape[2:])
-        self.nodes = nn.Parameter(th.cat([first, -first, rest], 1))
+        first = _drawn((n_stacked, 1), in_features, out_features, scale)
+        self.nodes = nn.Parameter(th.cat([first, -first], 1))
 
     def matrix(self) -> th.Tensor:
         """Return weights and, as the last column, biases: (n_stacked, out_features, n + 1)."""
-        if self.parts[0] == 1:
-            return self.nodes.sum(1)  # a pair, and perhaps zero: exact in any order
-        first, opposite, rest = th.split(self.nodes, self.parts, 1)
-        return th.cat([first + opposite, rest], 1).sum(1)
+        return self.nodes.sum(1)
 
 
 class StackedLinear(nn.Module):
-    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names.
-
-    Parameters
-    ----------
-    in_features, out_features : int
-    n_stacked : int, default 1
-        Number of independent layers in one tensor.
-    scale : float, default 0.01
-        Initial weights are uniform in [-scale, scale]; biases start at zero.
-    """
+    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names."""
 
     def __init__(
         self, in_features: int, out_features: int, *, n_stacked: int = 1, scale: float = 0.01
@@ -152,8 +123,6 @@ class ZeroOutputNetwork(nn.Module):
     activation : callable, default torch.tanh
         Any s with s(0) = 0. Where torch has no slope at 0, as for ReLU, the slope there is 1:
         every unit starts at 0 and would never leave it.
-    n_nodes : int, default 2
-        Nodes summed into each unit of the first layer.
     pinned : Tensor of bool, shape (n_stacked,), optional
         Networks whose output at 0 stays 0; the number of entries is the size of the stack. The
         default is one network that is not pinned.
@@ -176,7 +145,6 @@ class ZeroOutputNetwork(nn.Module):
         hidden: tuple[int, ...] = (16, 16),
         *,
         activation: Activation = th.tanh,
-        n_nodes: int = 2,
         pinned: th.Tensor | None = None,
         scale: float = 0.01,
     ) -> None:
@@ -198,7 +166,7 @@ class ZeroOutputNetwork(nn.Module):
         pinned = th.zeros(1, dtype=th.bool) if pinned is None else pinned
         self.activation = activation
         stack: dict[str, Any] = {"n_stacked": len(pinned), "scale": scale}
-        self.first = PairedLinear(in_features, hidden[0], n_nodes=n_nodes, **stack)
+        self.first = PairedLinear(in_features, hidden[0], **stack)
         widths = (*hidden, out_features)
         self.rest = nn.ModuleList(StackedLinear(a, b, **stack) for a, b in pairwise(widths))
         self.register_buffer("pinned", pinned.float()[:, None])

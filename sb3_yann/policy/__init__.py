@@ -2,12 +2,11 @@
 
 from sb3_yann._validation import NonFiniteWarning
 from sb3_yann.policy.actor_critic import CriticOptions, YannActor, YannCritic
+from sb3_yann.policy.checkpoint import retarget
 from sb3_yann.policy.checks import register_problem
+from sb3_yann.policy.exploring import YannPPOPolicy, YannSACPolicy
 from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.policies import YannPolicy
-from sb3_yann.policy.ppo import YannPPOPolicy
-from sb3_yann.policy.retargeting import retarget
-from sb3_yann.policy.sac import YannSACPolicy
 
 __all__ = [
     "AffineObservation",

@@ -432,18 +432,8 @@ def follow_scale(
     """Let the factor of the critic's networks follow the mean stage cost, by factors of two.
 
     What they put out stays, to the bit: Pop-Art (van Hasselt et al., *Learning values across
-    many orders of magnitude*, 2016).
-
-    Parameters
-    ----------
-    actor, critic, target
-        The target is the critic's.
-    mean : Tensor, shape ()
-        The mean stage cost until now, which takes in that of the critic's batch.
-    taken : int
-        Updates of the critic so far: it is checked after every tenth.
-    eps : float
-        Of both optimizers, in units of their gradients.
+    many orders of magnitude*, 2016). ``mean`` is the mean stage cost until now, which takes in that
+    of the critic's batch, after every tenth of ``taken`` updates.
     """
     if taken % FOLLOWS:
         return

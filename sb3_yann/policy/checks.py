@@ -239,15 +239,7 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
 
 
 def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits:
-    """Return how the env takes inputs; raise unless its bounds are those of the problem.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        With finite bounds of the inputs.
-    action_space : gymnasium.spaces.Box
-        The bounds of the problem, or [-1, 1].
-    """
+    """Return how the env takes inputs; raise unless its bounds are those of the problem."""
     if not np.issubdtype(action_space.dtype, np.floating):
         dtype = action_space.dtype
         raise TypeError(f"action_space has dtype {dtype}: inputs are real, use numpy.float32.")
@@ -273,15 +265,7 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
 
 
 def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
-    """Warn where an env shows deviations, and the problem is in plant units.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        The policy's.
-    theta : ndarray, shape (batch, n_theta)
-        What the policy made of its first observations, in deviations.
-    """
+    """Warn where an env shows deviations, and the problem is in plant units."""
     if words := problem.shown_as_deviation(problem.units.to_plant(theta)):
         warnings.warn(words, stacklevel=4)
 
@@ -382,17 +366,7 @@ class OtherProblemError(ValueError, RuntimeError):
 
 
 def require_own_problem(module: nn.Module, state: Mapping[str, Any], strict: bool) -> None:
-    """Raise unless what follows from the problem is in a state_dict as it is in the module.
-
-    Parameters
-    ----------
-    module : Module
-        A policy or an actor.
-    state : mapping
-        What is to be loaded into it.
-    strict : bool
-        Whether nothing may be missing.
-    """
+    """Raise unless what follows from the problem is in a state_dict as it is in the module."""
     for name, part in module.named_modules():
         if isinstance(part, FIXED):
             prefix = f"{name}." if name else ""

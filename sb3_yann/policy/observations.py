@@ -186,21 +186,7 @@ ObservationSpec = AffineObservation | Mapping[str, ArrayLike]
 
 
 def as_observation(given: ObservationSpec | None, problem: LinearMPC) -> AffineObservation | None:
-    """Return the map from what an env shows to theta in plant units, None for the identity.
-
-    Parameters
-    ----------
-    given : AffineObservation or mapping, optional
-        The mapping has a ``center`` and a ``scale``, both (n_theta,): the env shows
-        ``(theta - center) / scale``. By default it shows theta.
-    problem : LinearMPC
-        Whose theta it is.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If ``given`` is none of these.
-    """
+    """Return the map from what an env shows to theta in plant units, None for the identity."""
     if given is None or isinstance(given, AffineObservation):
         return given
     if isinstance(given, Mapping):
@@ -228,19 +214,7 @@ def with_extra_shown(
     observation: AffineObservation | None,
     extra: int,
 ) -> tuple[LinearMPC, AffineObservation | None]:
-    """Return the problem with extra signals, and the map from what an env shows to its theta.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Without them.
-    space : gymnasium.spaces.Box
-        Its last entries are the signals, with finite bounds.
-    observation : AffineObservation, optional
-        From the others to theta of the problem.
-    extra : int
-        How many there are.
-    """
+    """Return the problem with extra signals, and the map from what an env shows to its theta."""
     box: Any = space
     low, high = (np.ravel(side).astype(np.float64) for side in (box.low, box.high))
     size = len(low) - extra

@@ -67,23 +67,11 @@ else:
 
 
 class StartsAsMPC(KeepsPrecision, _AnyPolicy):
-    """What every policy that starts as a linear MPC is besides its SB3 policy: see `YannPolicy`.
+    """What every policy that starts as a linear MPC is besides its SB3 policy: see `YannPolicy`."""
 
-    Attributes
-    ----------
-    ALGORITHMS : tuple of type
-        Which of SB3's algorithms train it.
-    OWN : tuple of str
-        Its keywords beside those of `YannPolicy`.
-    THEIRS : tuple of str
-        Keywords of its SB3 policy that others have not.
-    CRITIC : type
-        Of the critic.
-    """
-
-    ALGORITHMS: ClassVar[tuple[type[BaseAlgorithm], ...]] = ()
-    OWN: ClassVar[tuple[str, ...]] = ()
-    THEIRS: ClassVar[tuple[str, ...]] = ()
+    ALGORITHMS: ClassVar[tuple[type[BaseAlgorithm], ...]] = ()  # which train it
+    OWN: ClassVar[tuple[str, ...]] = ()  # keywords beside those of `YannPolicy`
+    THEIRS: ClassVar[tuple[str, ...]] = ()  # keywords of its SB3 policy that others have not
     CRITIC: ClassVar[type[YannCritic]] = YannCritic
     actor: YannActor
     actor_target: YannActor
@@ -256,11 +244,6 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         """Load parameters of a policy with the same problem; ValueError for others, before any."""
         require_own_problem(self, state_dict, strict)
         return super().load_state_dict(state_dict, strict, assign)
-
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
-        # Weights that were saved when the scale was a setting.
-        state_dict.setdefault(f"{prefix}mean_stage_cost", th.zeros_like(self.mean_stage_cost))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle holds: it is no longer the policy of the algorithm."""

@@ -9,7 +9,7 @@ from sb3_contrib import TQC
 from sb3_contrib.tqc.policies import TQCPolicy
 
 from sb3_yann.policy.actor_critic import YannCritic
-from sb3_yann.policy.sac import MaximumEntropy
+from sb3_yann.policy.exploring import MaximumEntropy
 
 
 class QuantileCritic(YannCritic):

@@ -1,5 +1,175 @@
 """What was made, how it was checked, and what came of it: one page for an engineer to sign."""
 
-from sb3_yann.reporting.assemble import report
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from datetime import datetime, timezone
+from os import PathLike
+from pathlib import Path
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_yann._archive import atomic_write
+from sb3_yann.guard import ImprovementGuard
+from sb3_yann.improvement import Headroom
+from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
+from sb3_yann.reporting.evidence_parts import (
+    again_part,
+    cost_part,
+    distance_part,
+    guard_part,
+    headroom_part,
+    improve_part,
+    loops_part,
+    statistics_part,
+    twin_part,
+)
+from sb3_yann.reporting.problem_parts import constraints_part, law_part, plant_part
+from sb3_yann.reporting.subject import Html, Part, Subject, clean, page, paragraph, table, tag
+from sb3_yann.rollout import Source, as_seeds
+from sb3_yann.twin import PlantTwin
 
 __all__ = ["report"]
+
+TITLE = "Report on a policy that starts as an MPC"
+PARTS = (
+    plant_part, constraints_part, law_part, loops_part, statistics_part, distance_part, guard_part,
+    improve_part, twin_part, headroom_part, cost_part, again_part,
+)  # fmt: skip
+
+
+def report(
+    model: BaseAlgorithm,
+    path: str | PathLike[str] = "report.html",
+    *,
+    env: Source | None = None,
+    guard: ImprovementGuard | None = None,
+    twin: PlantTwin | None = None,
+    headroom: Headroom | None = None,
+    seeds: Iterable[int] = range(20),
+    title: str = TITLE,
+) -> Path:
+    """Write a page about a model that an engineer can read, print and sign; return its path.
+
+    It is one HTML file without scripts, and loads nothing: pictures are part of it. It has the
+    plant and the problem in plant units, the register of constraints, the law and how it was
+    checked, closed loops against the MPC, what they prove, where and how far the policy leaves the
+    MPC, every decision of the guard, what `improve` did, the twin, the headroom, timing, versions
+    and seeds. A part whose evidence is not given says so in a sentence.
+
+    Parameters
+    ----------
+    model : DDPG, TD3, SAC, TQC or PPO
+        With a :class:`YannPolicy`. The decisions of its guard travel with it.
+    path : path-like, default "report.html"
+        Folders are made as needed. The file is there as a whole or not at all.
+    env : gymnasium.Env, str or callable, optional
+        Where closed loops are played, as of :func:`~sb3_yann.evaluation.evaluate`; by default the
+        guard's simulator, if a guard is given.
+    guard : ImprovementGuard, optional
+        The one that watched `learn`; it adds its settings to the decisions.
+    twin : PlantTwin, optional
+        Of the model's problem.
+    headroom : Headroom, optional
+        As :func:`headroom` has found it.
+    seeds : iterable of int, default range(20)
+        Of the closed loops, best ones that nothing was trained or tried on.
+    title : str, optional
+        The heading.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of another kind, or belongs to another model or problem.
+    OSError
+        If the file cannot be written: before anything is played.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> from sb3_yann import report
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> report(model, "cstr.html", env="CSTR-v0", seeds=range(2)).name
+    'cstr.html'
+    """
+    subject = _subject(model, env, guard, twin, headroom, seeds)
+    target = Path(path)
+    with ExitStack() as stack:
+        try:
+            if target.is_dir():
+                raise IsADirectoryError("it is a folder")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            unfinished = stack.enter_context(atomic_write(target))
+            unfinished.touch()
+        except OSError as error:
+            raise OSError(
+                f"path = {str(target)!r} cannot be written ({error}). Name a file in a folder that "
+                "you may write to."
+            ) from error
+        parts = [make(subject) for make in PARTS]
+        unfinished.write_text(page(title, _body(title, parts)), encoding="utf-8")
+    return target
+
+
+def _subject(
+    model: BaseAlgorithm,
+    env: Source | None,
+    guard: ImprovementGuard | None,
+    twin: PlantTwin | None,
+    headroom: Headroom | None,
+    seeds: Iterable[int],
+) -> Subject:
+    """Return what the report is about, checked."""
+    if not isinstance(model, BaseAlgorithm):
+        raise TypeError(f"model = {model!r} must be an SB3 model with a YannPolicy.")
+    policy = require_yann_policy(model.policy, "report")
+    given = {"guard": (guard, ImprovementGuard), "twin": (twin, PlantTwin)}
+    for name, (value, kind) in {**given, "headroom": (headroom, Headroom)}.items():
+        if value is not None and not isinstance(value, kind):
+            raise TypeError(f"{name} = {value!r} must be a {kind.__name__}, or None.")
+    if guard is not None and getattr(guard, "model", None) is not model:
+        raise ValueError(
+            "The guard has not watched this model: pass the one that was its callback in learn, or "
+            "none. The decisions travel with the model."
+        )
+    if twin is not None:
+        require_problem_of_twin(policy, twin.problem)
+    chosen = tuple(as_seeds(seeds))
+    if not chosen:
+        raise ValueError("seeds is empty: pass one whole number for each episode, e.g. range(20).")
+    played = guard.env if env is None and guard is not None else env
+    return Subject(model, policy, played, guard, twin, headroom, chosen)
+
+
+def _body(title: str, parts: Sequence[Part]) -> list[Html]:
+    """Return heading, summary, contents, the parts themselves, and a table for signatures."""
+    written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    rows, links, sections = [], [], []
+    counts = Counter[str]()
+    for k, part in enumerate(parts, start=1):
+        links.append(tag("li", tag("a", part.title, href=f"#part-{k}")))
+        heading = tag("h2", f"{k}. {part.title}", id=f"part-{k}")
+        sections.append(tag("section", heading, part.content))
+        for found in part.findings:
+            verdict = tag("span", found.verdict, class_=found.verdict)
+            rows.append([verdict, found.text, tag("a", str(k), href=f"#part-{k}")])
+            counts[found.verdict] += 1
+    summary = f"{counts['passed']} checks passed, {counts['failed']} failed."
+    if counts["look"]:
+        summary += f" {counts['look']} to look at: a person decides."
+    if counts["failed"]:
+        summary += " Read what failed before you sign."
+    signatures = [[clean(role), "", "", ""] for role in ("prepared", "checked", "approved")]
+    return [
+        tag("h1", title),
+        tag("p", f"Written {written}.", class_="said"),
+        tag("h2", "Summary"),
+        paragraph(summary, "A note is for information: there is nothing to pass."),
+        table(["", "finding", "part"], rows),
+        tag("nav", tag("ol", *links)),
+        *sections,
+        tag("h2", "Signatures"),
+        tag("div", table(["", "name", "date", "signature"], signatures), class_="sign"),
+    ]

@@ -1,4 +1,4 @@
-"""The guard's decisions, improve, twin, headroom, timing, and what it takes to do it again."""
+"""Closed loops, the guard's decisions, improve, twin, headroom, timing, and how to do it again."""
 
 from __future__ import annotations
 
@@ -13,15 +13,297 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from scipy import stats
 from stable_baselines3.common.type_aliases import TrainFreq
 
+from sb3_yann._validation import Array
+from sb3_yann.audit.meaning import misread_in_words
+from sb3_yann.compare import INPUT_STEP, less_safe
 from sb3_yann.control import PiecewiseAffine
-from sb3_yann.evaluation.plots import plot_decisions, plot_headroom, plot_twin
+from sb3_yann.control.linear_system import with_units
+from sb3_yann.evaluation.plots import (
+    inputs_of,
+    loops_figure,
+    plot_decisions,
+    plot_gains,
+    plot_headroom,
+    plot_twin,
+    surfaces_figure,
+    use_figure,
+)
 from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of
 from sb3_yann.improvement.improving import fingerprint
-from sb3_yann.reporting.html import Html, join, lines, paragraph, picture, table, tag
-from sb3_yann.reporting.subject import Finding, Part, Subject, left_out, make_finding
+from sb3_yann.reporting.subject import (
+    MPC,
+    POLICY,
+    Finding,
+    Html,
+    Part,
+    Subject,
+    join,
+    left_out,
+    lines,
+    make_finding,
+    number,
+    paragraph,
+    picture,
+    table,
+    tag,
+)
+
+NO_ENV = "No env was given: closed loops are left out. Pass report(model, env=...) to play them."
+FAR = 100.0  # % of half the range of an input: as far from the MPC as its middle from a bound
+ROUNDING = 1e-6  # a relative difference of costs, or one in half-widths of inputs, that is none
+
+
+def loops_part(subject: Subject) -> Part:
+    """Return the closed loops against the MPC: costs, and a picture in plant units."""
+    title, loops = "Closed loops against the MPC", subject.loops
+    if loops is None:
+        return left_out(title, NO_ENV)
+    mpc, policy = loops[MPC], loops[POLICY]
+    rows = []
+    for name, of in (("mean", np.mean), ("median", np.median), ("worst", np.max)):
+        old, new = float(of(mpc.costs)), float(of(policy.costs))
+        rows.append([f"{name} cost", f"{old:.6g}", f"{new:.6g}", _change(old, new)])
+    for name, before, after in (
+        ("steps that violate a limit", mpc.violations.sum(), policy.violations.sum()),
+        ("episodes that the env terminates", mpc.terminated.sum(), policy.terminated.sum()),
+    ):
+        rows.append([name, str(before), str(after), f"{after - before:+d}"])
+    first, last, count = subject.seeds[0], subject.seeds[-1], len(subject.seeds)
+    is_range = count > 2 and subject.seeds == (*range(first, first + count),)
+    seeds = f"{first} to {last}" if is_range else ", ".join(map(str, subject.seeds))
+    how = (
+        f"{count} episodes of {subject.env_name}, seeds {seeds}, each played by the MPC "
+        "and by the policy from the same start, without any noise of actions. A cost is minus the "
+        "sum of the rewards."
+    )
+    state = subject.state
+    known = set() if state is None else {*state.evidence.starts.seeds} & {*subject.seeds}
+    warning = (
+        f"{len(known)} of these starts are known to the guard, which chose the policy by them: "
+        "what they say is too favorable. Pass other seeds."
+    )
+    caption = (
+        "Closed loops in plant units. Of more than six episodes a line is the median, and a band "
+        "holds 80 % of them; what has a set-point is drawn as its distance from it. Below: the "
+        "policy less the MPC, from the same starts."
+    )
+    gains = "What the policy costs more than the MPC at each start; below zero it costs less."
+    each = zip(
+        subject.seeds, mpc.costs, policy.costs, mpc.violations, policy.violations, strict=True
+    )
+    single = [
+        [str(seed), f"{a:.6g}", f"{b:.6g}", _change(a, b), str(v), str(w)]
+        for seed, a, b, v, w in each
+    ]
+    head = ["seed", "MPC", "policy", "change", "MPC: violations", "policy: violations"]
+    apart = np.abs(policy.costs - mpc.costs) > ROUNDING * np.abs(mpc.costs)
+    same: Html | str = ""
+    if not apart.any() and np.array_equal(mpc.violations, policy.violations):
+        same = paragraph("Each costs what it costs with the MPC, and violates as often.")
+    content = join(
+        [
+            paragraph(how, warning if known else ""),
+            table(["", "MPC", "policy", "change"], rows),
+            picture(partial(plot_gains, loops), gains),
+            picture(partial(loops_figure, subject.problem, subject.shown_loops), caption),
+            tag("h3", "Every episode"),
+            same if same else table(head, single[:1000]),
+        ]
+    )
+    less = less_safe(policy.unsafe(), mpc.unsafe())[:, :INPUT_STEP]  # the next part has the bounds
+    bad = int(np.sum(less.any(axis=1)))
+    finding = make_finding(
+        not bad,
+        "Episodes in which the policy violates more than the MPC, ends sooner, or has no finite "
+        f"cost: {bad} of {count}.",
+    )
+    if words := misread_in_words(subject.problem, *mpc.steps()):
+        return Part(title, content, (finding, make_finding(False, words)))
+    return Part(title, content, (finding,))
+
+
+def _change(old: float, new: float) -> str:
+    if not old:
+        return f"{new - old:+.4g}"
+    return f"{round(100 * (new - old) / abs(old), 2) + 0.0:+.2f} %"  # no "-0.00"
+
+
+def statistics_part(subject: Subject) -> Part:
+    """Return what the closed loops prove, in words."""
+    title = "Statistics in words"
+    if subject.loops is None:
+        return left_out(title, NO_ENV)
+    mpc, policy = subject.loops[MPC], subject.loops[POLICY]
+    change, count = policy.costs - mpc.costs, len(policy.costs)
+    if not np.all(np.isfinite(change)):
+        text = "Some costs are not finite: no average says anything."
+        return Part(title, paragraph(text), (make_finding(False, text),))
+    mean, finding = _mean_in_words(change, float(np.mean(mpc.costs)))
+    rounding = ROUNDING * np.abs(mpc.costs)
+    less, more = int(np.sum(change < -rounding)), int(np.sum(change > rounding))
+    worst = int(np.argmax(np.where(change > rounding, change, 0.0)))
+    largest = f"{change[worst]:.4g}, from seed {subject.seeds[worst]}" if more else "0"
+    # The upper limit of Clopper and Pearson: how often a violation may still happen.
+    bad = int(np.sum(policy.violations > 0))
+    most = 1.0 if bad == count else float(stats.beta.ppf(0.95, bad + 1, count - bad))
+    sentences = [
+        mean,
+        f"It costs less from {less} starts and more from {more} of {count}; the largest "
+        f"increase is {largest}.",
+        f"{bad} of {count} episodes violate a limit ({int(np.sum(mpc.violations > 0))} with the "
+        f"MPC): with a confidence of 95 % fewer than {100 * most:.1f} % of such starts do.",
+        "These statements hold for starts that are drawn as these are, and for a plant that "
+        "behaves as this env does.",
+    ]
+    return Part(title, join(map(paragraph, sentences)), (finding,))
+
+
+def _mean_in_words(change: Array, typical: float) -> tuple[str, Finding]:
+    """Return what the mean difference and its t interval say."""
+    mean, count, scale = float(change.mean()), len(change), abs(typical) or 1.0
+    if np.all(np.abs(change) <= ROUNDING * scale):
+        text = "From these starts the policy costs what the MPC costs."
+        return text, Finding("note", text)
+    word = "less" if mean < 0 else "more"
+    text = f"On average the policy costs {100 * abs(mean) / scale:.2f} % {word} than the MPC"
+    if count < 2:
+        return f"{text}. One episode says nothing about others.", Finding("note", f"{text}.")
+    width = float(stats.t.ppf(0.975, count - 1) * change.std(ddof=1) / count**0.5)
+    low, high = 100 * (mean - width) / scale, 100 * (mean + width) / scale
+    text += f"; the change lies between {low:+.2f} and {high:+.2f} % with a confidence of 95 %."
+    passed = True if high < 0 else False if low > 0 else None
+    if passed is None:
+        text += " That it differs from the MPC at all is not shown."
+    method = (
+        f"The interval is Student's, of the {count} differences of paired episodes; it takes their "
+        "mean for nearly normal."
+    )
+    return f"{text} {method}", make_finding(passed, text)
+
+
+def distance_part(subject: Subject) -> Part:
+    """Return where, and how far, the policy leaves the MPC."""
+    problem, policy, theta = subject.problem, subject.policy, subject.samples
+    points = {"random points of the box": theta}
+    if subject.loops is not None:
+        visited = [x[:-1] for x in subject.loops[POLICY].observations]
+        points["steps of the closed loops"] = np.concatenate(visited)
+    rows = []
+    for where, of in points.items():
+        apart = _distance(subject, of)
+        for k, name in enumerate(with_units(problem.model)[1]):
+            own, share = apart[:, k], 100 * apart[:, k].max() / problem.u_half[k]
+            values = own.mean(), np.percentile(own, 95), own.max()
+            rows.append([name, where, *map(number, values), f"{share:.2f}"])
+    bound, networks = policy.max_correction, policy.actor.mu.n_networks
+    adds = "networks add" if networks > 1 else "network adds"
+    most = "What it may add is bounded by the range of the inputs alone."
+    if bound is not None:
+        most = f"It may add at most {100 * bound:g} % of the input range."
+    counts = "It counts everywhere."
+    if policy.actor.mu.confines.any():
+        counts = "It counts in a box of parameters only, and fades beyond."
+    keeps = "It knows the bounds of states and outputs by its training alone."
+    if len(policy.actor.mu.constants[2]):
+        kept = problem.kept_set
+        margin = 100 * policy.bounds_margin
+        lasting = "for ever" if kept.for_ever else f"for {kept.steps} steps"
+        keeps = (
+            "Whatever it has learnt, it stops where the model's next state would leave the hard "
+            f"bounds, or the set in which inputs can keep them {lasting} "
+            f"({len(kept.g)} half-spaces, margin {margin:g} % of a half-width)."
+        )
+    head = ["input", "at", "mean", "95 % are below", "largest", "largest, % of half the range"]
+    content = [
+        paragraph(
+            f"The policy is the MPC's law plus what {networks} {adds}, clipped to the bounds of "
+            "the inputs.",
+            most,
+            counts,
+            keeps,
+        ),
+        table(head, rows),
+        _farthest(subject),
+        *_pictures(subject),
+    ]
+    u, rounding = inputs_of(problem, policy, theta), ROUNDING * problem.u_half
+    low, high = problem.deviations.input_range(theta)
+    # Where the MPC has no solution, bounds that change may give way: no further than with it.
+    law = subject.law(theta)
+    low, high = np.minimum(low, law) - rounding, np.maximum(high, law) + rounding
+    inside = bool(np.all((u >= low) & (u <= high)))
+    text = "Inputs leave their bounds at random points of the box of parameters."
+    if inside:
+        text = f"Inputs keep their bounds at {len(theta)} random points of the box of parameters."
+    name, where, *_, share = max(rows, key=lambda row: float(row[-1]))
+    largest = f"The policy is at most {share} % of half the range of {name} from the MPC, at"
+    kind = "look" if float(share) > FAR else "note"
+    findings = make_finding(inside, text), Finding(kind, f"{largest} {where}.")
+    return Part("Where and how far the policy leaves the MPC", join(content), findings)
+
+
+def _distance(subject: Subject, theta: Array) -> Array:
+    """Return the distance of the policy's inputs from the law's (batch, m)."""
+    finite = theta[np.isfinite(theta).all(axis=1)]
+    return np.abs(inputs_of(subject.problem, subject.policy, finite) - subject.law(finite))
+
+
+def _farthest(subject: Subject) -> Html:
+    """Return at which random point the policy is farthest from the MPC."""
+    problem, theta = subject.problem, subject.samples
+    apart = (_distance(subject, theta) / problem.u_half).max(axis=1)
+    if apart.max() < ROUNDING:
+        return paragraph(
+            "At the random points the policy is the MPC: nothing has been learnt there."
+        )
+    far = problem.units.to_plant(theta[int(np.argmax(apart))])
+    named = zip(problem.labels(units=True), far, strict=True)
+    point = ", ".join(f"{name} = {value:.4g}" for name, value in named)
+    rest = float(_distance(subject, problem.theta_rest[None]).max())
+    return paragraph(
+        f"Of the random points it is farthest from the MPC at {point}.",
+        f"At the operating point it differs by {rest:.2g}.",
+    )
+
+
+def _pictures(subject: Subject) -> list[Html]:
+    """Return the regions that are used, and the surface before and after."""
+    problem, policy, loops, found = subject.problem, subject.policy, subject.loops, []
+    if subject.has_regions and loops is not None:
+        caption = (
+            "The regions that the policy's closed loops visit, and how far it is from the MPC in "
+            "each, in the input that is farthest."
+        )
+        found.append(
+            picture(partial(use_figure, problem, policy, subject.shown_loops[POLICY]), caption)
+        )
+    if problem.n_theta < 2:
+        return found
+    plane = subject.steepest_plane
+    entries = [*plane]
+    low, high = problem.theta_min[entries], problem.theta_max[entries]
+    if loops is not None:
+        shown = subject.shown_loops[POLICY].observations
+        visited = np.concatenate([x[:, entries] for x in shown])
+        visited = visited[np.isfinite(visited).all(axis=1)]
+        room = 0.05 * np.ptp(visited, axis=0)
+        low, high = visited.min(axis=0) - room, visited.max(axis=0) + room
+    if not np.all(np.isfinite([low, high])) or np.any(low >= high):
+        return found
+    names = " and ".join(problem.labels()[k] for k in plane)
+    caption = (
+        f"The first input over {names}: before is the MPC, after the policy. The frame holds "
+        f"{'the closed loops' if loops else 'the box of parameters'}; the other "
+        "parameters are at the operating point. A black line, if there is one, surrounds where "
+        "the MPC has a solution."
+    )
+    options = {"entries": plane, "frame": (low, high)}
+    draw = partial(surfaces_figure, problem, subject.law, policy, **options)  # type: ignore[arg-type]
+    return [*found, picture(draw, caption)]
 
 
 def guard_part(subject: Subject) -> Part:

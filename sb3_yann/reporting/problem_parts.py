@@ -16,8 +16,22 @@ from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import labels_of, missing_observer, with_units
 from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
-from sb3_yann.reporting.html import Html, join, lines, number, paragraph, picture, table, tag
-from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject, make_finding
+from sb3_yann.reporting.subject import (
+    MPC,
+    POLICY,
+    Finding,
+    Html,
+    Part,
+    Subject,
+    join,
+    lines,
+    make_finding,
+    number,
+    paragraph,
+    picture,
+    table,
+    tag,
+)
 from sb3_yann.rollout import Trajectories
 
 

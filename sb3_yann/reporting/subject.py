@@ -1,16 +1,21 @@
-"""What a report is about, and what a part of it is."""
+"""What a report is about, what a part of it is, and the pieces of HTML that it is made of."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import base64
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from html import escape
+from io import BytesIO
+from string import Template
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, is_text
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
@@ -21,9 +26,166 @@ from sb3_yann.improvement import Headroom
 from sb3_yann.improvement.improving import Improvement, fingerprint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
-from sb3_yann.reporting.html import Html, tag
 from sb3_yann.rollout import Controller, Source, Trajectories, name_of, one_env, rollout
 from sb3_yann.twin import PlantTwin
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { background: #fff; color: #1a1a1a; font: 16px/1.5 system-ui, -apple-system, "Segoe UI",
+  Roboto, "Helvetica Neue", Arial, sans-serif; margin: 0 auto; max-width: 62rem;
+  padding: 1.5rem 2rem 4rem; }
+h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .3rem; }
+h2 { border-top: 2px solid #0072b2; font-size: 1.25rem; margin: 2.6rem 0 .6rem;
+  padding-top: .5rem; }
+h3 { font-size: 1.02rem; margin: 1.5rem 0 .4rem; }
+h1, h2, h3, p, li { overflow-wrap: anywhere; }
+td, th { overflow-wrap: break-word; }
+p { margin: .5rem 0; max-width: 46rem; }
+.said { color: #555; }
+nav ol { columns: 2; margin: .3rem 0; padding-left: 1.6rem; }
+a { color: #00527f; }
+.wide { margin: .7rem 0; overflow-x: auto; }
+table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+th, td { border-bottom: 1px solid #ddd; padding: .25rem .7rem .25rem 0; text-align: left;
+  vertical-align: top; }
+th { border-bottom: 1.5px solid #888; font-weight: 600; }
+td.number, th.number { text-align: right; }
+td.number { white-space: nowrap; }
+pre { background: #f6f6f6; font: .82rem/1.4 ui-monospace, Menlo, Consolas, monospace;
+  overflow-x: auto; padding: .7rem .9rem; white-space: pre-wrap; }
+figure { margin: 1rem 0; }
+figcaption { color: #555; font-size: .88rem; max-width: 46rem; }
+img { display: block; height: auto; max-width: 100%; }
+.passed, .failed, .look, .note { font-weight: 600; white-space: nowrap; }
+.passed { color: #00694b; } .failed { color: #a83c00; }
+.look { color: #7a5c00; } .note { color: #555; }
+.sign td { height: 3.2rem; min-width: 11rem; vertical-align: bottom; }
+@media (max-width: 640px) {
+  body { font-size: 15px; padding: 1rem .9rem 3rem; }
+  nav ol { columns: 1; }
+  img { max-width: none; width: max(100%, 34rem); }
+}
+@media print {
+  @page { margin: 16mm 14mm; size: A4; }
+  body { font-size: 10pt; max-width: none; padding: 0; }
+  nav { display: none; }
+  a { color: inherit; text-decoration: none; }
+  .wide, pre { overflow: visible; }
+  table { font-size: 8.5pt; }
+  h2, h3 { break-after: avoid; }
+  figure, tr, .sign { break-inside: avoid; }
+}
+"""
+PAGE = Template(
+    """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>$title</title>
+<style>$style</style>
+</head>
+<body>
+$body
+</body>
+</html>
+"""
+)
+
+
+class Html(str):
+    """Text that is HTML already."""
+
+
+def clean(value: Any) -> Html:
+    """Return a value as HTML: escaped, unless it is that already.
+
+    What is no text, such as control characters, becomes a replacement character.
+    """
+    if isinstance(value, Html):
+        return value
+    text = "".join(c if c in "\n\t" or is_text(c) else "\ufffd" for c in str(value))
+    return Html(escape(text))
+
+
+def tag(name: str, *content: Any, **attributes: str) -> Html:
+    """Return an element; ``class_`` is the attribute of that name."""
+    own = "".join(f' {key.rstrip("_")}="{escape(each)}"' for key, each in attributes.items())
+    return Html(f"<{name}{own}>{''.join(map(clean, content))}</{name}>")
+
+
+def join(parts: Iterable[Any]) -> Html:
+    """Return pieces one below the other."""
+    return Html("\n".join(map(clean, parts)))
+
+
+def paragraph(*sentences: str) -> Html:
+    """Return a paragraph."""
+    return tag("p", " ".join(sentences))
+
+
+def lines(text: str) -> Html:
+    """Return text with its lines and columns as they are."""
+    return tag("pre", text)
+
+
+def number(value: float) -> str:
+    """Return a number in four digits; "none" for what is infinite."""
+    return f"{value:.4g}" if np.isfinite(value) else "none"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Html:
+    """Return a table that scrolls on a narrow screen; columns of numbers are set to the right."""
+    body = [[*row] for row in rows]
+    kinds: list[dict[str, str]] = [{} for _ in head]
+    for k, kind in enumerate(kinds):
+        texts = [str(row[k]) for row in body]
+        if texts and all(
+            not text.strip() or text.lstrip("+-−")[:1].isdigit() or text == "none" for text in texts
+        ):
+            kind["class_"] = "number"
+    lines = [
+        tag("tr", *(tag(name, each, **kind) for each, kind in zip(row, kinds, strict=True)))
+        for name, row in [("th", head), *(("td", row) for row in body)]
+    ]
+    whole = tag("table", tag("thead", lines[0]), tag("tbody", *lines[1:]))
+    return tag("div", whole, class_="wide")
+
+
+def picture(draw: Callable[[], Axes | Figure], caption: str) -> Html:
+    """Return a picture with its caption; a name with a dollar sign is no formula.
+
+    Letters that the font lacks become boxes, without a warning. A large SVG becomes a PNG.
+    """
+    import matplotlib
+
+    options: Any = {"text.parse_math": False, "svg.hashsalt": "sb3-yann"}
+    with matplotlib.rc_context(options), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        drawn: Any = draw()
+        figure = getattr(drawn, "figure", None) or drawn  # of Axes, else itself
+        kind, buffer = "svg+xml", BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+        if len(buffer.getvalue()) > 120_000:
+            kind, buffer = "png", BytesIO()
+            figure.savefig(buffer, format="png", dpi=110)
+    source = f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+    shown = Html(f'<img alt="{escape(caption)}" src="{source}">')
+    return tag("figure", tag("div", shown, class_="wide"), tag("figcaption", caption))
+
+
+def page(title: str, body: Iterable[Any]) -> str:
+    """Return the whole page."""
+    return PAGE.substitute(title=clean(title), style=STYLE, body=join(body))
+
 
 POLICY, MPC = "policy", "MPC"
 
@@ -64,17 +226,7 @@ def _as_controller(act: Callable[[Any], Any]) -> Controller:
 
 @dataclass
 class Subject:
-    """What a report is about.
-
-    Attributes
-    ----------
-    model, policy : BaseAlgorithm and YannPolicy
-    env : gymnasium.Env, str, callable or None
-    guard : ImprovementGuard or None
-    twin : PlantTwin or None
-    headroom : Headroom or None
-    seeds : tuple of int
-    """
+    """What a report is about."""
 
     model: BaseAlgorithm
     policy: StartsAsMPC

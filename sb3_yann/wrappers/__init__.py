@@ -1,8 +1,7 @@
 """Wrappers that complete theta, set the reward, and cure faults of episodes."""
 
 from sb3_yann.wrappers.episodes import SeededGlobals, TruncateAtTimeLimit
-from sb3_yann.wrappers.plant_env import PlantEnv
-from sb3_yann.wrappers.stage_cost import StageCost
+from sb3_yann.wrappers.plant_env import PlantEnv, StageCost
 from sb3_yann.wrappers.theta import (
     EstimateState,
     MeasuredDisturbance,

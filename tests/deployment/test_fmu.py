@@ -28,11 +28,11 @@ from test_whole_controller import (
 
 from deployed import COMPILERS, STRICT, needs_compiler, observations, policy_of, with_faults
 from sb3_yann import Controller, export
-from sb3_yann.deployment import fmu
+from sb3_yann.deployment import c_code
 from sb3_yann.deployment.code import ROOM
 from sb3_yann.deployment.controller import MODES, Status
 
-OWN = fmu.LIBRARIES.get((platform.system(), platform.machine()))
+OWN = c_code.LIBRARIES.get((platform.system(), platform.machine()))
 needs_library = pytest.mark.skipif(OWN is None or not COMPILERS, reason="no library is made here")
 ALLOCATE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
 FREE = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
@@ -251,8 +251,10 @@ def test_without_a_compiler_it_holds_the_sources(tmp_path, monkeypatch):
 
 
 def test_a_compiler_that_fails_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(fmu, "COMPILERS", ("false",))
-    monkeypatch.setitem(fmu.LIBRARIES, (platform.system(), platform.machine()), ("linux64", ".so"))
+    monkeypatch.setattr(c_code, "COMPILERS", ("false",))
+    monkeypatch.setitem(
+        c_code.LIBRARIES, (platform.system(), platform.machine()), ("linux64", ".so")
+    )
     with pytest.warns(RuntimeWarning, match="false failed"):
         export(policy_of("reactor"), tmp_path / "plant.fmu")
     with zipfile.ZipFile(tmp_path / "plant.fmu") as archive:
@@ -272,7 +274,7 @@ def test_an_interrupt_leaves_no_files_of_the_compiler_and_none_of_its_processes(
     temporary.mkdir()
     (tmp_path / "cc").write_text(SLOW.format(told))
     (tmp_path / "cc").chmod(0o755)
-    program = "from sb3_yann.deployment import fmu\nfmu._library({'a.c': 'int a;'})"
+    program = "from sb3_yann.deployment import c_code\nc_code._library({'a.c': 'int a;'})"
     path = f"{tmp_path}:{os.environ['PATH']}"
     environment = {**os.environ, "TMPDIR": str(temporary), "PATH": path}
     running = subprocess.Popen(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from functools import cache
 
 import numpy as np
@@ -164,18 +163,3 @@ def test_a_gradient_leads_back_from_a_bound_and_not_beyond_it():
         assert abs(action.item() - 0.5) < 1e-4
         (towards * action.sum()).backward()
         assert bool(layer.network.weights()[-1].grad.any()) is moves
-
-
-def test_the_margin_travels_with_the_weights_and_old_weights_act_as_they_did():
-    mpc = cart()
-    layer, theta = scrambled(layer_of(mpc)), th.as_tensor(drawn(mpc))
-    layer.keep(0.1)
-    other = layer_of(mpc)
-    other.load_state_dict(layer.state_dict())
-    assert th.equal(other(theta), layer(theta))
-    old = copy.deepcopy(layer.state_dict())
-    del old["margin"]
-    other.load_state_dict(old)
-    layer.keep(None)
-    assert th.equal(other(theta), layer(theta))
-    assert not th.equal(layer(theta), layer_of(mpc)(theta))

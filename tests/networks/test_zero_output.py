@@ -64,18 +64,16 @@ def is_positive_zero(x: th.Tensor) -> bool:
 
 @pytest.mark.parametrize("dtype", [th.float32, th.float64])
 @pytest.mark.parametrize("stack", [1, 3])
-@pytest.mark.parametrize("n_nodes", [2, 3, 4, 7])
 @pytest.mark.parametrize("hidden", HIDDEN)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_output_is_zero_bit_for_bit_at_first(
-    activation: str, hidden: tuple[int, ...], n_nodes: int, stack: int, dtype: th.dtype
+    activation: str, hidden: tuple[int, ...], stack: int, dtype: th.dtype
 ) -> None:
     net = ZeroOutputNetwork(
         3,
         2,
         hidden,
         activation=ACTIVATIONS[activation],
-        n_nodes=n_nodes,
         pinned=pins(True, False, True)[:stack],
     ).to(dtype)
     for size in (1.0, 1e3, 1e6):
@@ -89,17 +87,16 @@ def test_output_is_zero_bit_for_bit_at_first(
 
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
-@pytest.mark.parametrize("n_nodes", [2, 3, 5])
 @pytest.mark.parametrize("hidden", [(6,), (5, 6)])
 @pytest.mark.parametrize("activation", ["tanh", "gelu"])
 @pytest.mark.parametrize("pinned", [False, True])
 def test_every_entry_has_moved_after_the_second_update(
-    pinned: bool, activation: str, hidden: tuple[int, ...], n_nodes: int, optimizer: str
+    pinned: bool, activation: str, hidden: tuple[int, ...], optimizer: str
 ) -> None:
     # Every single entry, weights and biases; only the output bias of a pinned network cancels.
     # In float64: the biases of a pinned tanh network have a gradient of the order (W x)^2.
     net = ZeroOutputNetwork(
-        2, 1, hidden, activation=ACTIVATIONS[activation], n_nodes=n_nodes, pinned=pins(pinned)
+        2, 1, hidden, activation=ACTIVATIONS[activation], pinned=pins(pinned)
     ).double()
     before = copy.deepcopy(net)
     x = square(dtype=th.float64)
@@ -123,12 +120,12 @@ def test_each_network_of_a_stack_learns_from_its_own_rows_only() -> None:
 
 
 def test_stack_computes_what_its_networks_compute_alone() -> None:
-    stack = ZeroOutputNetwork(2, 1, (8, 8), n_nodes=3, pinned=pins(True, False, True)).double()
+    stack = ZeroOutputNetwork(2, 1, (8, 8), pinned=pins(True, False, True)).double()
     for parameter in stack.parameters():
         th.nn.init.normal_(parameter)
     x, index = square(dtype=th.float64), th.randint(3, (256,))
     for i in range(3):
-        alone = ZeroOutputNetwork(2, 1, (8, 8), n_nodes=3, pinned=stack.pinned[i].bool()).double()
+        alone = ZeroOutputNetwork(2, 1, (8, 8), pinned=stack.pinned[i].bool()).double()
         with th.no_grad():
             first_layer(alone).copy_(first_layer(stack)[i : i + 1])
             for mine, theirs in zip(later_layers(alone), later_layers(stack), strict=True):
@@ -175,13 +172,6 @@ def test_other_than_one_or_two_hidden_layers_are_refused(hidden: tuple[int, ...]
         ZeroOutputNetwork(2, 1, hidden)
 
 
-def test_fewer_than_two_nodes_are_refused() -> None:
-    with pytest.raises(
-        ValueError, match=r"n_nodes = 1 must be a whole number of at least 2\. Zero needs"
-    ):
-        ZeroOutputNetwork(2, 1, n_nodes=1)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -191,7 +181,6 @@ def test_fewer_than_two_nodes_are_refused() -> None:
         ({"out_features": 1.5}, "out_features = 1.5 must be a whole number"),
         ({"hidden": (0,)}, "hidden = 0 must be a whole number of at least 1"),
         ({"hidden": (8, -1)}, "hidden = -1 must be a whole number of at least 1"),
-        ({"n_nodes": 2.5}, "n_nodes = 2.5 must be a whole number of at least 2"),
         ({"scale": -1}, "scale = -1 must be a finite number of at least 0"),
         ({"scale": float("inf")}, "scale = inf must be a finite number"),
     ],

@@ -27,7 +27,7 @@ from sb3_yann import (
     export,
 )
 from sb3_yann.deployment.controller import Controller
-from sb3_yann.policy.spread import TruncatedNormal
+from sb3_yann.policy.exploring import TruncatedNormal
 
 EXPLORING = pytest.mark.parametrize("algorithm", [SAC, TQC, PPO])
 SMALL = {PPO: {"n_steps": 32, "batch_size": 16}}

@@ -30,11 +30,12 @@ from sb3_yann import (
     PlantTwin,
     offset_free,
     report,
+    reporting,
 )
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement.improving import Improvement
 from sb3_yann.improvement.trial import Check
-from sb3_yann.reporting import assemble, evidence_parts, loop_parts, problem_parts
+from sb3_yann.reporting import evidence_parts, problem_parts
 from sb3_yann.wrappers import PlantEnv
 from sb3_yann_envs import problems
 from weights import last_layer, unpin
@@ -89,7 +90,7 @@ def moved(by: float = 0.1):
 
 def subject_of(model, **given):
     defaults = dict.fromkeys(("env", "guard", "twin", "headroom"))
-    return assemble._subject(model, **{**defaults, "seeds": SEEDS, **given})
+    return reporting._subject(model, **{**defaults, "seeds": SEEDS, **given})
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +248,7 @@ def test_inputs_beyond_a_bound_at_run_time_fail() -> None:
     text = "Inputs leave their bounds at random points of the box of parameters."
     for keeps in (True, False):
         subject = subject_of(model, env=env)
-        part = loop_parts.distance_part(subject)
+        part = evidence_parts.distance_part(subject)
         register = problem_parts.constraints_part(subject)
         assert (text in [each.text for each in part.findings]) is not keeps
         beyond = re.findall(r"<td[^>]*>(\d+)</td>", str(register.content).split("</tr>")[1])
@@ -393,9 +394,12 @@ def test_the_page_says_that_an_observer_is_no_part_of_the_policy(tmp_path) -> No
 def test_starts_that_the_guard_knows_are_named() -> None:
     model, guard = guarded()
     known = subject_of(model, guard=guard, seeds=range(999_995, 1_000_003))
-    text = loop_parts.loops_part(known).content
+    text = evidence_parts.loops_part(known).content
     assert "3 of these starts are known to the guard" in text
-    assert "known to the guard" not in loop_parts.loops_part(subject_of(model, guard=guard)).content
+    assert (
+        "known to the guard"
+        not in evidence_parts.loops_part(subject_of(model, guard=guard)).content
+    )
 
 
 class Untouchable(Wrapper):
