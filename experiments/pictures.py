@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 from functools import reduce
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +17,7 @@ from experiments.measures import DRAWING, IMPROVED, MPC, OBSERVER, OURS
 from experiments.runner import Outcome, Run
 from sb3_yann._validation import Array
 
-# Okabe and Ito's colors, told apart with any color vision; ours is always the first.
+# Okabe and Ito's colors, distinct with any color vision; ours is always the first.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = "osD^vPX"
@@ -51,27 +50,27 @@ def save_in_short(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
     if not panels:
         return []
     folder.mkdir(parents=True, exist_ok=True)
-    figure = Figure(figsize=(2.4 * len(panels) + 0.6, 3.4), layout="constrained")
+    columns = 3  # so that it can be read on a phone
+    rows = -(-(len(panels) + 1) // columns)
+    figure = Figure(figsize=(8.4, 2.7 * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    row = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, (name, found) in zip(row, panels.items(), strict=True):
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for axes, (name, found) in zip(grid, panels.items(), strict=False):
         for k, (label, (shares, mean)) in enumerate(found.items()):
             style = {"color": COLORS[k], "linestyle": STYLES[k], "label": label}
             axes.plot(np.arange(1, len(shares) + 1), np.sort(shares), **style)
             words = {"color": COLORS[k], "transform": axes.transAxes}
-            axes.text(0.05, 0.92 - 0.08 * k, f"mean cost {100 * mean:+.1f} %", **words)
+            axes.text(0.05, 0.9 - 0.09 * k, f"mean cost {100 * mean:+.1f} %", **words)
         axes.axhline(1, color="black", linewidth=1, label=MPC)
-        axes.set(title=name, xlabel="starts, sorted for each")
+        axes.set(title=name, xlabel="starts, sorted for each", ylim=(0, 1.6))
         axes.grid(alpha=0.3)
-    row[0].set(ylabel="cost / the MPC's from the same start", ylim=(0, 1.6))
-    handles: dict[str, Any] = {}
-    for axes in row:
-        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-    figure.legend(
-        [*handles.values()], [*handles], loc="outside lower center", ncols=4, frameon=False
-    )
+    figure.supylabel("cost / the MPC's from the same start")
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    handles, labels = grid[0].get_legend_handles_labels()
+    grid[-1].legend(handles, labels, loc="center", frameon=False)
     path = folder / "in-short.png"
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=130)
     return [path]
 
 

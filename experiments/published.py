@@ -13,8 +13,8 @@ TESTS = 10
 HEADER = ("plant", "learner", "before", "after", "paper, before", "paper, after")
 REPORTED: dict[str, dict[str, tuple[str, str]]] = {
     "CSTR": {
-        "DDPG, best beginning": ("800.24", "664.39"),
-        "DDPG, worst beginning": ("> 3e4", "603.78"),
+        "DDPG, best start": ("800.24", "664.39"),
+        "DDPG, worst start": ("> 3e4", "603.78"),
         OURS: ("94.32", "92.22"),
     },
     "pendulum": {"DDPG": ("1,586.97", "28.42"), OURS: ("270.99", "26.08")},
@@ -47,7 +47,7 @@ def _kind_of(plant: str) -> str:
 def _learners(
     outcomes: Mapping[Run, Outcome], plant: str, kind: str, episodes: int
 ) -> Iterator[tuple[str, Outcome]]:
-    """Yield DDPG, on the reactor its best and its worst beginning, and ours with the first seed."""
+    """Yield DDPG, on the reactor its best and its worst start, and ours with the first seed."""
     found: dict[str, dict[int, Outcome]] = {"DDPG": {}, OURS: {}}
     for run, outcome in outcomes.items():
         if run.plant == plant and run.learner in found and episodes in outcome.checkpoints:
@@ -56,8 +56,8 @@ def _learners(
     ours = found[OURS]
     if plain and kind == "CSTR":
         order = sorted(plain.values(), key=lambda each: float(each.test_costs[0, :TESTS].mean()))
-        yield "DDPG, best beginning", order[0]
-        yield "DDPG, worst beginning", order[-1]
+        yield "DDPG, best start", order[0]
+        yield "DDPG, worst start", order[-1]
     elif plain:
         yield "DDPG", plain[min(plain)]
     if ours:

@@ -92,8 +92,9 @@ def in_short(outcomes: Mapping[Run, Outcome]) -> str:
     legend = (
         f"Mean cost of a test episode after {episodes} training episodes, over {starts} starts "
         "that training and guard never see: the median over the seeds (and the range). "
-        f"**{OURS}** has one set of options for every plant and explores in a simulator. *Worst "
-        "start*: the largest cost above the MPC's over all seeds and starts."
+        f"**{OURS}**, the policy of this package under its guard, has one set of options for every "
+        "plant and explores in a simulator. *Worst start*: by how much the cost of one start is "
+        "above the MPC's at most, over all seeds."
     )
     return f"{table(header, found)}\n\n{legend}"
 

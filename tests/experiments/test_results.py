@@ -62,8 +62,8 @@ def pendulum(final=(1.0, 30.0), mpc=(1.0, 200.0), optimum=(0.9, 29.1)) -> dict[R
 def test_the_papers_table_takes_the_best_and_the_worst_beginning() -> None:
     text = paper_table({**reactor(), **pendulum()}, 50)
     assert text.splitlines()[2:] == [
-        "| CSTR | DDPG, best beginning | 400.00 | 300.00 | 800.24 | 664.39 |",
-        "| CSTR | DDPG, worst beginning | 409.00 | 300.00 | > 3e4 | 603.78 |",
+        "| CSTR | DDPG, best start | 400.00 | 300.00 | 800.24 | 664.39 |",
+        "| CSTR | DDPG, worst start | 409.00 | 300.00 | > 3e4 | 603.78 |",
         "| CSTR | YANN-RL | 200.00 | 191.00 | 94.32 | 92.22 |",
         "| pendulum, Q = I | YANN-RL | 100.50 | 15.50 | 270.99 | 26.08 |",
     ]

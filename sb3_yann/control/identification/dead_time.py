@@ -71,8 +71,8 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
     regressors = np.column_stack([plain, *taps])
     # Behind sensor noise earlier inputs tell of the state, too, but it is the latest that acts.
     prompt = [
-        _told(regressors, 1 + n + j, target)
-        > _told(regressors, plain.shape[1] + sum(best[: j + 1]) - 1, target)
+        _explained(regressors, 1 + n + j, target)
+        > _explained(regressors, plain.shape[1] + sum(best[: j + 1]) - 1, target)
         for j in range(n_inputs)
     ]
     best = [0 if each else lag for lag, each in zip(best, prompt, strict=True)]
@@ -80,13 +80,13 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
     return [0] * n_inputs if any(best) and leftover(longer, best).is_hidden else best
 
 
-def _told(regressors: Array, column: int, target: Array) -> float:
+def _explained(regressors: Array, column: int, target: Array) -> float:
     """Return the sum over targets (k, n) of squared partial correlations with one column."""
     others = np.delete(regressors, column, axis=1)
     left = project_out(others, np.column_stack([target, regressors[:, column]]))
     sizes = np.sum(left**2, axis=0)
-    told = (left[:, :-1].T @ left[:, -1]) ** 2
-    return float(np.sum(told / np.maximum(sizes[:-1] * sizes[-1], np.finfo(float).tiny)))
+    explained = (left[:, :-1].T @ left[:, -1]) ** 2
+    return float(np.sum(explained / np.maximum(sizes[:-1] * sizes[-1], np.finfo(float).tiny)))
 
 
 def _left(gram: Array, delays: list[int], n: int) -> Array:
