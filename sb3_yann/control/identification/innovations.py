@@ -97,14 +97,12 @@ def with_lags(episodes: Sequence[Episode], lags: int, start: int) -> list[Episod
     return found
 
 
-def arx(episodes: Sequence[Episode], lags: int, start: int, ridge: float = 0.0) -> Regression:
+def arx(episodes: Sequence[Episode], lags: int, start: int) -> Regression:
     """Return the ARX model of so many lags; a row of its regressors is as of `with_lags`."""
     rows = with_lags(episodes, lags, start)
-    steps = sum(map(len, rows))
-    q = rows[0].states.shape[1]
-    m = rows[0].inputs.shape[1]
-    sizes = (q, m, rows[0].disturbances.shape[1])
-    return regress(rows, sizes, None, max(ridge, TINY_RIDGE) * steps)
+    first = rows[0]
+    sizes = (first.states.shape[1], first.inputs.shape[1], first.disturbances.shape[1])
+    return regress(rows, sizes, None, TINY_RIDGE * sum(map(len, rows)))
 
 
 def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:

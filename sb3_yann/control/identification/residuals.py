@@ -92,11 +92,6 @@ class Leftover(NamedTuple):
     late: Array
 
     @property
-    def remembers(self) -> NDArray[np.bool_]:
-        """Whether earlier states and inputs explain a part of the residuals."""
-        return np.asarray(self.lags < (1 - SHARE) * self.linear)
-
-    @property
     def bends(self) -> NDArray[np.bool_]:
         """Whether squares and products explain what earlier states and inputs do not."""
         return np.asarray(self.both < (1 - SHARE) * self.lags)

@@ -1,4 +1,4 @@
-"""The notes on a fit: each number against its definition, and the edges where a note begins."""
+"""Curvature is named from its definition's edges on, and is not taken for noise."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def log(steps: int = 300, curved: float = 0.0, noise: float = 0.1, seed: int = 0
 SIZES = (2, 1, 1)
 
 
-def fit(*episodes: Episode, ridge: float = 0.0, origin: np.ndarray | None = None) -> Regression:
-    return regress([*episodes], SIZES, origin, ridge)
+def fit(episode: Episode) -> Regression:
+    return regress([episode], SIZES, None, 0.0)
 
 
 def explained(found: Regression, episodes: list[Episode]) -> tuple[np.ndarray, ...]:
@@ -65,67 +65,12 @@ def test_curvature_is_named_from_a_tenth_on_and_where_chance_does_not_explain_it
     assert len(seen) == 4
 
 
-def told(found: Regression, episode: Episode, tested: int = 40, **changes: object) -> str:
-    """Return the notes on a fit of which nothing is to be said, but for the changes."""
-    sound = {
-        "autocorrelation": np.zeros(2), "excitation": 0.5, "weakest": "u[0]",
-    }  # fmt: skip
-    fits = changes.pop("fits", (np.array([99.0, 98.0]), np.array([90.0, 80.0])))
-    ridge = changes.pop("ridge", 0.0)
-    held = [Episode(np.zeros((tested + 1, 2)), np.zeros((tested, 2)))] if tested else []
-    given = dataclasses.replace(found, **(sound | changes))
-    return "\n".join(quality_notes(given, [episode], held, fits, ridge))
-
-
-def test_the_size_of_the_residuals_and_the_fits_are_stated() -> None:
-    episode = log()
-    found = fit(episode)
-    text = told(found, episode)
-    size = listed(np.sqrt(np.diag(found.covariance)))
-    assert f"Fitted to 300 steps; one step differs from the prediction by {size} (st" in text
-    ahead = "99, 98 % one step ahead, 90, 80 % 10 steps ahead."
-    assert f"Fit over 40 steps held out, 100 % is perfect: {ahead}" in text
-    assert text.count("\n") == 2  # these, and the poles
-    assert "held out" not in told(found, episode, tested=0)
-
-
-def test_a_fit_below_fifty_per_cent_is_poor() -> None:
-    episode = log()
-    found = fit(episode)
-    for ten, poor in ((50.1, False), (49.9, True)):
-        text = told(found, episode, fits=(np.array([10.0, 10.0]), np.array([99.0, ten])))
-        assert ("Poor: 10 steps ahead" in text) == poor
-    none = np.full(2, np.nan)
-    text = told(found, episode, fits=(np.array([99.0, 98.0]), none))
-    assert "99, 98 % one step ahead. No episode of them is 10 steps long." in text
-    assert "The 40 steps held out tell no fit" in told(found, episode, fits=(none, none))
-
-
-def test_a_weak_log_and_a_ridge_are_reported() -> None:
-    episode = log()
-    found = fit(episode)
-    for excitation, weak in ((0.0101, False), (0.0099, True)):
-        text = told(found, episode, excitation=excitation)
-        assert ("Weakly excited: u[0] moved 9.9e-03 times as much" in text) == weak
-    assert "A ridge of 0.5 biases the entries towards zero." in told(found, episode, ridge=0.5)
-    assert "ridge" not in told(found, episode)
-
-
-def test_neighbors_are_correlated_from_three_standard_errors_on() -> None:
-    episode = log()
-    found = fit(episode)
-    edge = 3 / np.sqrt(300)
-    for own, noisy in ((0.99, False), (1.01, True), (-1.01, True)):
-        text = told(found, episode, autocorrelation=np.array([0.0, own * edge]))
-        assert ("of neighboring steps are correlated" in text) == noisy
-    assert f"({listed(np.array([0.0, -1.01 * edge]))})" in text
-
-
 def test_what_curvature_explains_is_no_noise() -> None:
     colour = np.array([0.0, 0.3])
     for curved, noisy in ((0.0, True), (0.25, False), (1.0, False)):
         episode = log(curved=curved)
-        text = told(fit(episode), episode, autocorrelation=colour)
+        found = dataclasses.replace(fit(episode), autocorrelation=colour)
+        text = "\n".join(quality_notes(found, [episode], [], (colour, colour), 0.0))
         assert ("are correlated" in text) == noisy
         share = curvature_test(fit(episode), [episode])[0]
         percent = f"explain {listed(100 * share)} % of the residuals' variance"
