@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -142,8 +143,7 @@ class Log:
         """
         if max(self.every) == 1:
             return self
-        found = _stretches(self.episodes, np.zeros(len(self.every), bool))
-        episodes = [self.episodes[i].part(a, b) for i, a, b in found]
+        episodes = _cut(self.episodes, np.zeros(len(self.every), bool))
         if sum(map(len, episodes)) < 2:
             names = self.state_names or [f"x[{i}]" for i in range(len(self.every))]
             rare = [f"{a} every {k}" for a, k in zip(names, self.every, strict=True) if k > 1]
@@ -188,7 +188,15 @@ class Log:
             For shapes that do not fit, or numbers that are not finite.
         """
         given = {"states": states, "actions": inputs, "disturbances": disturbances}
-        return cls._of(episodes_of(given), dt, time, time_unit)
+        records = _records(given)
+        if sum(map(len, records)) < 2:
+            first = records[0]
+            raise ValueError(
+                f"states has shape {first.states.shape} and actions {first.inputs.shape}: one step "
+                "says nothing. Rows are samples and columns states or inputs; transpose a log "
+                "that has them otherwise."
+            )
+        return cls._of(records, dt, time, time_unit=time_unit)
 
     @classmethod
     def with_gaps(
@@ -196,31 +204,20 @@ class Log:
     ) -> Log:
         """Return the log of arrays, cut where an entry is NaN that is read in most samples."""
         given = {"outputs": outputs, "inputs": inputs, "disturbances": disturbances}
-        records = episodes_of(given, gaps=True)
-        episodes = [records[i].part(a, b) for i, a, b in _stretches(records)]
-        lost = sum(map(len, records)) - sum(map(len, episodes))
-        if sum(map(len, episodes)) < 2:
-            raise ValueError(
-                "outputs and inputs hold no two rows in a row without a missing entry."
-            )
-        return replace(cls._of(episodes, dt), lost_steps=lost)
+        return cls._of(_records(given, gaps=True), dt)
 
     @classmethod
     def _of(
-        cls, episodes: list[Episode], dt: float, time: Arrays | None = None, time_unit: str = ""
+        cls, records: list[Episode], dt: float, time: Arrays | None = None, **names: Any
     ) -> Log:
-        if sum(map(len, episodes)) < 2:
-            first = episodes[0]
-            raise ValueError(
-                f"states has shape {first.states.shape} and actions {first.inputs.shape}: one step "
-                "says nothing. Rows are samples and columns states or inputs; transpose a log "
-                "that has them otherwise."
-            )
+        """Return the log of records, cut at gaps and where a step takes another time."""
         dt = check_positive("dt", dt)
-        lost = 0
-        if time is not None:
-            episodes, lost = _without_gaps(episodes, time, dt)
-        return cls(tuple(episodes), dt, lost_steps=lost, time_unit=time_unit)
+        on_time = None if time is None else _on_time(records, time, dt)
+        episodes = _cut(records, _read_now_and_then(records), on_time)
+        kept = sum(map(len, episodes))
+        if not kept:
+            raise ValueError("The log has no two samples in a row with all that is to be read.")
+        return cls(tuple(episodes), dt, lost_steps=sum(map(len, records)) - kept, **names)
 
     @classmethod
     def from_csv(
@@ -307,9 +304,8 @@ class Log:
             Episode(table[part, :n], table[part, n : n + m][:-1], table[part, n + m :][:-1])
             for part in parts
         ]
-        kept = _stretches(records)
-        if not kept:
-            raise ValueError(f"{path} holds no two rows in a row with all of {wanted}.")
+        if not records:
+            raise ValueError(f"{path} holds no two rows of an episode.")
         times = None
         if time is not None:
             unit = time_unit or _name_and_unit(columns[time])[1]
@@ -317,14 +313,13 @@ class Log:
             if any(stamped for _, stamped in pairs):
                 time_unit = unit or "s"
             instants = np.array([each for each, _ in pairs])
-            times = [instants[parts[i]][a : b + 1] for i, a, b in kept]
-        log = cls._of([records[i].part(a, b) for i, a, b in kept], dt, times)
-        beside = sum(map(len, records)) - sum(b - a for _, a, b in kept)
+            times = [instants[part] for part in parts]
         names = [_name_and_unit(each)[0] for each in wanted]
         units = tuple(_name_and_unit(each)[1] for each in wanted)
-        return replace(
-            log,
-            lost_steps=log.lost_steps + beside,
+        return cls._of(
+            records,
+            dt,
+            times,
             state_names=tuple(names[:n]),
             input_names=tuple(names[n : n + m]),
             disturbance_names=tuple(names[n + m :]),
@@ -341,31 +336,34 @@ RARE = 2 / 3
 """Share of the samples below which isolated readings make a state one that is read now and then."""
 
 
-def _stretches(
-    episodes: Sequence[Episode], rare: NDArray[np.bool_] | None = None
-) -> list[tuple[int, int, int]]:
-    """Return episode, first and stop of all runs of steps in which nothing is missing.
+def _read_now_and_then(records: Sequence[Episode]) -> NDArray[np.bool_]:
+    """Return which states (n,) have isolated readings, as a laboratory's."""
+    read = np.isfinite(np.concatenate([each.states for each in records]))
+    # A reading whose sample before has none begins a run; records count as one.
+    runs = np.sum(read[1:] > read[:-1], axis=0) + read[0]
+    count = np.sum(read, axis=0)
+    return np.asarray((0 < count) & (count < RARE * len(read)) & (runs > count / 2))
 
-    States that are read now and then may be, by default those of isolated readings.
-    """
-    if rare is None:
-        read = np.isfinite(np.concatenate([each.states for each in episodes]))
-        # A reading whose sample before has none begins a run; episodes count as one.
-        runs = np.sum(read[1:] > read[:-1], axis=0) + read[0]
-        count = np.sum(read, axis=0)
-        rare = (0 < count) & (count < RARE * len(read)) & (runs > count / 2)
+
+def _cut(
+    records: Sequence[Episode],
+    rare: NDArray[np.bool_],
+    on_time: Sequence[NDArray[np.bool_]] | None = None,
+) -> list[Episode]:
+    """Return runs of steps in which nothing is missing but rare states, and all are on time."""
     found = []
-    for i, each in enumerate(episodes):
+    for i, each in enumerate(records):
         there: NDArray[np.bool_] = np.all(np.isfinite(each.states[:, ~rare]), axis=1)
         complete = np.isfinite(each.driven).all(axis=1)
-        whole = np.all([there[:-1], there[1:], complete], axis=0)
+        late = [] if on_time is None else [on_time[i]]
+        whole = np.all([there[:-1], there[1:], complete, *late], axis=0)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))
-        found += [(i, int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        found += [each.part(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return found
 
 
-def episodes_of(given: dict[str, Arrays | None], *, gaps: bool = False) -> list[Episode]:
-    """Return episodes of states, inputs and disturbances by name, with NaN where allowed."""
+def _records(given: dict[str, Arrays | None], *, gaps: bool = False) -> list[Episode]:
+    """Return records of states, inputs and disturbances by name, with NaN where allowed."""
     parts = {
         name: as_matrices(name, values, gaps=gaps)
         for name, values in given.items()
@@ -452,38 +450,33 @@ def _require_one_state_more(name: str, parts: list[Array], states: list[Array]) 
             )
 
 
-def _without_gaps(episodes: list[Episode], time: Arrays, dt: float) -> tuple[list[Episode], int]:
-    """Return the episodes cut at steps that do not take dt, and the number of these steps."""
+def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np.bool_]]:
+    """Return which steps of each record take dt."""
     if isinstance(time, (list, tuple)) and len(time) > 0 and np.ndim(time[0]) == 1:
         times = [to_float(f"time of episode {i}", part) for i, part in enumerate(time)]
     else:
         array = to_float("time", time)
         times = list(array) if array.ndim == 2 else [array]
-    if len(times) != len(episodes):
-        raise ValueError(f"time has {len(times)} episodes, states has {len(episodes)}.")
-    parts: list[Episode] = []
-    lost = 0
-    for i, (episode, instants) in enumerate(zip(episodes, times, strict=True)):
-        if instants.shape != (len(episode) + 1,):
-            wanted = f"({len(episode) + 1},): one for each row of states"
+    if len(times) != len(records):
+        raise ValueError(f"time has {len(times)} episodes, states has {len(records)}.")
+    for i, (record, instants) in enumerate(zip(records, times, strict=True)):
+        if instants.shape != (len(record) + 1,):
+            wanted = f"({len(record) + 1},): one for each row of states"
             raise ValueError(f"time of episode {i} has shape {instants.shape}, expected {wanted}.")
-        span = np.diff(instants)
-        if not np.all(span > 0):
+        back = np.diff(instants) <= 0
+        if np.any(back):
             raise ValueError(
-                f"time of episode {i} does not increase after row {int(np.argmax(~(span > 0)))}. "
+                f"time of episode {i} does not increase after row {int(np.argmax(back))}. "
                 "Sort the log, and leave out rows that stand there twice."
             )
-        gaps = np.flatnonzero(np.abs(span - dt) > 0.1 * dt)
-        edges = zip([-1, *gaps], [*gaps, len(episode)], strict=True)
-        parts += [episode.part(a + 1, b) for a, b in edges if b > a + 1]
-        lost += gaps.size
-    if 2 * lost > sum(map(len, episodes)):
-        median = np.median(np.concatenate([np.diff(each) for each in times]))
+    spans = [np.diff(each) for each in times]
+    whole = np.concatenate(spans)
+    if 2 * np.sum(np.abs(whole - dt) > 0.1 * dt) > len(whole):
         raise ValueError(
-            f"dt = {dt:g}, but a step of the log takes {median:g} (the median). Give time and dt "
-            "in the same unit."
+            f"dt = {dt:g}, but a step of the log takes {np.nanmedian(whole):g} (the median). Give "
+            "time and dt in the same unit."
         )
-    return parts, lost
+    return [np.abs(each - dt) <= 0.1 * dt for each in spans]
 
 
 def as_matrices(name: str, value: Arrays, *, gaps: bool = False) -> list[Array]:

@@ -18,12 +18,17 @@ from sb3_yann import (
     identify_outputs,
 )
 from sb3_yann.log import Episode, Log
-from sb3_yann.log import _without_gaps as without_gaps
 from sb3_yann.log import split_episodes as split
 
 
 def numbered(steps: int) -> Episode:
     return Episode(np.arange(steps + 1.0)[:, None], np.arange(steps) + np.zeros((1, steps)).T)
+
+
+def without_gaps(records: list[Episode], times: list, dt: float) -> tuple[tuple[Episode, ...], int]:
+    states, inputs = ([getattr(each, name) for each in records] for name in ("states", "inputs"))
+    log = Log.from_arrays(states, inputs, dt, time=times)
+    return log.episodes, log.lost_steps
 
 
 def test_every_step_but_those_of_another_length_is_kept() -> None:
@@ -181,9 +186,10 @@ def test_a_csv_file_that_does_not_fit_is_named(tmp_path) -> None:
     path.write_text(CSV.replace("1.1", "high"))
     with pytest.raises(ValueError, match=r"row 3: level is 'high', expected a number"):
         Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
-    path.write_text("level,valve\n")
-    with pytest.raises(ValueError, match="no rows below its header"):
-        Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
+    for rows, said in (("", "no rows below its"), ("1,2\n", "no two rows"), ("1,\n,2\n", "no two")):
+        path.write_text("level,valve\n" + rows)
+        with pytest.raises(ValueError, match=said):
+            Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
 
 
 @pytest.mark.parametrize(
