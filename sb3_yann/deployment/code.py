@@ -126,29 +126,14 @@ def index_bytes(indices: Tables) -> int:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a controller needs at worst.
+    """What a controller needs at worst."""
 
-    Attributes
-    ----------
-    numbers, indices : int
-        Entries of its tables.
-    index_bytes : int
-        Bytes of each index.
-    multiplications : int
-        Multiplications, each with an addition, of one step: a search that must ask every region
-        twice.
-    activations : int
-        Calls of the networks' activation in a step.
-    locals : int
-        Numbers that a step keeps on the stack.
-    """
-
-    numbers: int
+    numbers: int  # entries of its tables
     indices: int
     index_bytes: int
-    multiplications: int
-    activations: int
-    locals: int
+    multiplications: int  # of a step, each with an addition: its search asks every region twice
+    activations: int  # of a step
+    locals: int  # numbers that a step keeps on the stack
 
     @classmethod
     def of(cls, data: Arrays) -> Cost:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-FORMAT = 1  # of the arrays: a reader takes no other
+FORMAT = 4  # of the arrays: a reader takes no other
 POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
 MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
 FAR = 1e12  # theta is clipped to so many times its box: beyond, slacks would overflow
