@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG, PPO, SAC
 
-from improvement_samples import quick
+from improvement_samples import quickest
 from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy, export
 from sb3_yann.cli import main
 from twin_samples import Cart, problem
@@ -131,7 +131,7 @@ def test_report_writes_one_page(model, folder) -> None:
 
 
 def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys, monkeypatch) -> None:
-    quick(monkeypatch)
+    quickest(monkeypatch)
     again = ["commission", "cart", "--env", "my_cart:Short", "--record", "record", "--batch", "2"]
     assert main([*again, "--batches", "1", "--save", "done"]) == 0
     assert (folder / "record").exists() and (folder / "done.zip").exists()

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from improvement_samples import quick
+from improvement_samples import quickest
 from sb3_yann.twin import plant_twin
 
 PACKAGES = ("sb3_yann", "sb3_yann_envs")
@@ -131,7 +131,7 @@ def test_the_examples_of_a_docstring_run(example: doctest.DocTest, monkeypatch, 
             pytest.skip(f"{library} is not installed")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plant_twin, "ROWS", 10**9)  # a fit of networks takes seconds
-    quick(monkeypatch)
+    quickest(monkeypatch)
     found = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example)
     assert found.attempted and not found.failed, "\n" + (example.docstring or "")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from improvement_samples import quick
+from improvement_samples import quickest
 from sb3_yann import LinearModel
 from sb3_yann.twin import plant_twin
 
@@ -91,7 +91,7 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, quick_fits) -> None:
 def quick_fits(monkeypatch) -> None:
     """Let twins be of polynomials, and improvements short."""
     monkeypatch.setattr(plant_twin, "ROWS", 10**9)
-    quick(monkeypatch)
+    quickest(monkeypatch)
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from improvement_samples import quick
+from improvement_samples import quickest
 from sb3_yann.twin import plant_twin
 
 
@@ -12,4 +12,4 @@ from sb3_yann.twin import plant_twin
 def no_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no log be long enough for them, but where a test asks for nothing else."""
     monkeypatch.setattr(plant_twin, "ROWS", 10**9)
-    quick(monkeypatch)
+    quickest(monkeypatch)

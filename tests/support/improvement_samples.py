@@ -20,13 +20,18 @@ FEW = {"n_starts": 6, "rounds": 1, "updates": 200}
 
 
 def quick(patch: pytest.MonkeyPatch) -> None:
-    """Let fits be short, and plans begin with the MPC and its inputs on their bounds."""
-    patch.setattr(plan, "WEIGHTS", ())
+    """Let fits be short."""
     patch.setattr(model, "fit_ensemble", partial(fit_ensemble, updates=300))
     patch.setattr(imitation, "FITS", 2)
     patch.setattr(critic, "SAMPLES", 512)
     patch.setattr(critic, "STEPS", 20)
     patch.setattr(critic, "UPDATES", 20)
+
+
+def quickest(patch: pytest.MonkeyPatch) -> None:
+    """Let plans begin with the MPC and with inputs on their bounds alone, too."""
+    quick(patch)
+    patch.setattr(plan, "WEIGHTS", ())
 
 
 class Spring(Cart):
