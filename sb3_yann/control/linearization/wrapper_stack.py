@@ -70,31 +70,6 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
                     )
 
 
-class _Judged(type):
-    """Classes whose instances are recognized by what they hold: a worker process can ask too."""
-
-    def __instancecheck__(cls, layer: Any) -> bool:
-        return bool(cls.judge(layer))  # type: ignore[attr-defined]
-
-
-class KeepsStatistics(metaclass=_Judged):
-    """scales observations or actions by statistics of its own."""
-
-    @staticmethod
-    def judge(layer: Any) -> bool:
-        """Tell whether a wrapper is one."""
-        return _keeps_statistics(layer)
-
-
-class ShowsOtherNumbers(metaclass=_Judged):
-    """rescales or stacks observations."""
-
-    @staticmethod
-    def judge(layer: Any) -> str:
-        """Return how to undo it, empty for other wrappers."""
-        return _other_observation(layer)
-
-
 def _library_names(layer: Any) -> set[str]:
     """Return the names of a layer's classes that are a library's."""
     return {each.__name__ for each in type(layer).__mro__ if _library(each) in LIBRARIES}
@@ -115,19 +90,16 @@ def _keeps_statistics(layer: Any) -> bool:
         return False  # gymnasium's NormalizeObservation, frozen: fixed numbers
     held = {name.lower(): value for name, value in getattr(layer, "__dict__", {}).items()}
     shapes = _shapes(layer)
-    of_entries = {name for name, value in held.items() if _shape(value) in shapes}
-    for name, value in held.items():
-        parts = getattr(value, "mean", None), getattr(value, "var", None)
-        moves = hasattr(value, "update") or hasattr(value, "count")
-        if moves and all(each is not None and not callable(each) for each in parts):
-            if _shape(parts[0]) in shapes or any(part in name for part in ("obs", "act", "state")):
-                return True
-    if any(part in name for name in of_entries for part in ("running", "moving", "ema_")):
+    for value in held.values():  # an object of its own, as gymnasium and Stable-Baselines3 have
+        moves = hasattr(value, "var") and (hasattr(value, "update") or hasattr(value, "count"))
+        if moves and _shape(getattr(value, "mean", None)) in shapes:
+            return True
+    of_entries = " ".join(name for name, value in held.items() if _shape(value) in shapes)
+    if any(part in of_entries for part in ("running", "moving", "ema_")):
         return True
-    means = any("mean" in name for name in of_entries)
-    spreads = any(part in name for name in of_entries for part in ("var", "std", "m2", "sigma"))
+    spreads = any(part in of_entries for part in ("var", "std", "m2", "sigma"))
     counts = {name.strip("_") for name in held} & {"count", "n", "num", "n_samples", "n_seen"}
-    return means and spreads and bool(counts)
+    return "mean" in of_entries and spreads and bool(counts)
 
 
 def _shapes(layer: Any) -> set[tuple[int, ...]]:
@@ -137,11 +109,6 @@ def _shapes(layer: Any) -> set[tuple[int, ...]]:
     spaces = [getattr(side, kind, None) for side in sides for kind in kinds]
     shapes = {getattr(space, "shape", None) for space in spaces}
     return {shape for shape in shapes if shape}
-
-
-def _space(layer: Any) -> Any:
-    """Return the space of one observation."""
-    return getattr(layer, "single_observation_space", layer.observation_space)
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:
@@ -162,7 +129,10 @@ def _other_observation(layer: Any) -> str:
         mean = np.ravel(layer.obs_rms.mean).tolist()
         return f"AffineObservation.normalized({mean}, {np.ravel(spread).tolist()})"
     if "RescaleObservation" in names:
-        shown, meant = _space(layer), _space(layer.env)
+        shown, meant = (
+            getattr(each, "single_observation_space", each.observation_space)
+            for each in (layer, layer.env)
+        )
         if np.array_equal([shown.low, shown.high], [meant.low, meant.high]):
             return ""
         low, high = (np.asarray(each, np.float64) for each in (meant.low, meant.high))
@@ -176,3 +146,22 @@ def _other_observation(layer: Any) -> str:
         size = int(np.prod(inner.observation_space.shape))
         return f"AffineObservation.newest_frame({size}, {frames})" if frames > 1 else ""
     return ""
+
+
+class _Judged(type):
+    """Classes whose instances are recognized by what they hold: a worker process can ask too."""
+
+    def __instancecheck__(cls, layer: Any) -> bool:
+        return bool(cls.judge(layer))  # type: ignore[attr-defined]
+
+
+class KeepsStatistics(metaclass=_Judged):
+    """scales observations or actions by statistics of its own."""
+
+    judge = staticmethod(_keeps_statistics)
+
+
+class ShowsOtherNumbers(metaclass=_Judged):
+    """rescales or stacks observations."""
+
+    judge = staticmethod(_other_observation)

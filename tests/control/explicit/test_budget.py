@@ -11,9 +11,8 @@ import pytest
 from fresh_process import run_python
 from sample_problems import benchmark
 from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC
-from sb3_yann.control.explicit import certificate, facet_walk, solve
+from sb3_yann.control.explicit import certificate
 from sb3_yann.control.explicit.budget import SolveBudget
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
 
 
 def test_the_law_of_each_solver_is_kept() -> None:
@@ -127,24 +126,6 @@ def test_the_limit_of_time_holds_where_a_single_linear_program_takes_seconds() -
     with pytest.raises(ExplicitLimitError, match="0 regions were found"):
         mpc.explicit(time_limit=0.7)
     assert time.process_time() - start < 5  # 0.8 s on a machine with nothing else to do
-
-
-@pytest.mark.parametrize("slow", ["solve_with_multipliers", "farthest_point", "walk", "optimality"])
-def test_the_limit_of_time_is_looked_at_between_any_two_steps(slow, monkeypatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr("sb3_yann.control.explicit.budget.time.monotonic", lambda: clock[0])
-    owners = {"walk": solve, "farthest_point": facet_walk, "optimality": certificate}
-    owner: Any = owners.get(slow, ParametricQP)
-    original = getattr(owner, slow)
-
-    def passing(*args: Any, **options: Any) -> Any:
-        clock[0] += 0.5
-        return original(*args, **options)
-
-    monkeypatch.setattr(owner, slow, passing)
-    with pytest.raises(ExplicitLimitError, match=r"time_limit = 0\.4 s: "):
-        benchmark().explicit(time_limit=0.4)
-    assert clock[0] <= 1.0
 
 
 def test_a_law_of_too_much_effort_is_given_up_before_it_is_found() -> None:

@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks import suite_problems
 from benchmarks.suite import WRONG, Outcome, compare, examine, names
 from benchmarks.suite_problems import SUITE, chain, off_center, quietly
 from sb3_yann.control.explicit.solve import ProgramUnits
@@ -81,15 +80,3 @@ def test_a_bound_that_an_unbounded_input_moves_stays() -> None:
     mpc = chain(0.01, 2, 2.0)
     units = ProgramUnits(mpc.condensed(), np.array([-np.inf]), np.array([np.inf]))
     assert np.all(np.any(units.scaled.G, axis=1))
-
-
-@pytest.mark.parametrize("horizon", [4, 5])
-def test_the_partition_of_a_symmetric_problem_has_its_symmetry(horizon: int) -> None:
-    bounds = {4: (0.5, 0.1, 5, 5), 5: (0.9, 0.2, 10, 10)}[horizon]
-    mpc = suite_problems.cart_pole(horizon - 2, bounds, 3.0)
-    law = mpc.explicit()
-    points = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (500, 4))
-    assert law.n_regions % 2 == 1  # the region of the origin is its own mirror image
-    inside = law.in_domain(points)
-    np.testing.assert_array_equal(law.in_domain(-points), inside)
-    np.testing.assert_allclose(law(-points[inside]), -law(points[inside]), atol=1e-9)

@@ -73,15 +73,6 @@ def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: fl
         assert np.all(change <= 2 * step * steepest(law) + 1e-9)
 
 
-@examples(8)
-@given(problems(), SEEDS)
-def test_online_law_is_the_explicit_law(mpc: LinearMPC, seed: int) -> None:
-    law, online, points = mpc.explicit(), mpc.online(), in_box(mpc, 300, seed=seed)
-    inside = law.in_domain(points)
-    np.testing.assert_array_equal(online.in_domain(points), inside)
-    assert np.all(as_range(law, law(points) - online(points))[inside] <= 1e-9)
-
-
 @pytest.mark.slow
 @examples(8)
 @given(problems(), SEEDS)

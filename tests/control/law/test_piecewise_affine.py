@@ -1,4 +1,4 @@
-"""A PiecewiseAffine law is defined everywhere, bounded, and survives files and copies."""
+"""A law is defined everywhere, bounded, knows its plant, and survives files and copies."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from sample_problems import (
     solved,
     vertices,
 )
-from sb3_yann._archive import write_arrays
-from sb3_yann.control import PiecewiseAffine
+from sb3_yann import LinearModel, LinearMPC, RateLimits, Tracking
+from sb3_yann._archive import read_arrays, write_arrays
+from sb3_yann.control import DisturbanceBounds, OnlineLaw, PiecewiseAffine
 
 PLANAR = ["pendulum", "benchmark", "asymmetric input bounds", "two inputs", "terminal set"]
 
@@ -49,18 +50,6 @@ def test_facets_and_vertices_belong_to_the_domain(name: str) -> None:
     points = special_points(name)
     assert len(points) > 10
     assert law_of(name).in_domain(points).all()
-
-
-@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
-@pytest.mark.parametrize("name", [*PLANAR, "reactor"])
-def test_every_facet_and_vertex_has_exactly_the_input_of_its_one_region(
-    name: str, infeasible: str
-) -> None:
-    law, points = law_of(name, infeasible), special_points(name)
-    region = law.locate(points)
-    for point, i, u in zip(points, region, law(points), strict=True):
-        one = np.clip(law.gains[i] @ point + law.offsets[i], law.u_min, law.u_max)
-        np.testing.assert_allclose(u, one, rtol=0, atol=1e-14 * np.max(law.u_max))
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (0,)])
@@ -174,3 +163,76 @@ def test_theta_that_is_no_point_or_batch_is_named(
     for call in ("__call__", "locate", "in_domain"):
         with pytest.raises(error, match=message):
             getattr(law_of("pendulum"), call)(theta)
+
+
+KINDS: dict[str, Any] = {"explicit": PiecewiseAffine, "online": OnlineLaw}
+
+
+def reactor() -> LinearMPC:
+    model = LinearModel(
+        [[0.9, 0.1], [0.0, 0.8]], [[0.0], [0.5]], dt=0.1, x_ss=[2, 350], u_ss=[40],
+        E=[[0.1], [0.0]], d_ss=[7],
+        state_names=["conversion", "temperature"], input_names=["coolant"],
+        units={"temperature": "K"},
+    )  # fmt: skip
+    return LinearMPC(
+        model, Q=np.eye(2), R=[[0.1]], horizon=3,
+        x_min=[0, 340], x_max=[4, 360], u_min=35, u_max=46,
+        tracking=Tracking([1], 345, 355), disturbances=DisturbanceBounds(6, 8),
+        rate=RateLimits(-2, 2),
+    )  # fmt: skip
+
+
+@pytest.fixture(params=KINDS)
+def saved(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Any, Path, Any]:
+    law = getattr(reactor(), request.param)()
+    law.save(tmp_path / "law.npz")
+    return law, tmp_path / "law.npz", KINDS[request.param]
+
+
+def test_a_file_holds_operating_point_sampling_time_names_and_units(saved: Any) -> None:
+    law, path, kind = saved
+    model, read = reactor().model, kind.load(path)
+    assert read == law and read.model == model
+    for name in ("dt", "state_names", "input_names", "units"):
+        assert getattr(read.model, name) == getattr(model, name)
+    assert read.theta_ss.tolist() == [2, 350, 350, 7, 40]
+
+
+def test_the_plant_takes_what_the_law_says_of_what_it_shows(saved: Any) -> None:
+    law, path, kind = saved
+    shown = np.array([[2.5, 351, 352, 6.5, 41], [2, 350, 350, 7, 40]])
+    u = kind.load(path).plant_input(shown)
+    assert np.array_equal(u, law(shown - [2, 350, 350, 7, 40]) + 40)
+    assert u[1] == pytest.approx(40) and abs(u[0] - 40) > 0.1
+
+
+def test_a_file_without_a_plant_is_a_law_without_one(saved: Any) -> None:
+    law, path, kind = saved
+    arrays = read_arrays(path)
+    own = {k: v for k, v in arrays.items() if k != "theta_ss" and not k.startswith("model_")}
+    write_arrays(path, own)
+    read = kind.load(path)
+    assert read == law and read.model is None
+    with pytest.raises(ValueError, match="knows no operating point"):
+        read.plant_input([2, 350, 350, 7, 40])
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"model_A": np.eye(3)}, {"model_x_ss": [2.0, np.nan]}, {"theta_ss": [1.0]}, {"model_dt": 0.0},
+     {"model_state_names": ["a", "a"]},
+     {"model_B": np.ones((2, 2)), "model_u_ss": [0.0, 0.0], "model_input_names": [],
+      "model_units": []}],
+    ids=lambda damage: "-".join(damage),
+)  # fmt: skip
+def test_a_damaged_plant_is_a_value_error(saved: Any, damage: dict[str, Any]) -> None:
+    _, path, kind = saved
+    write_arrays(path, {**read_arrays(path), **damage})
+    with pytest.raises(ValueError, match=r"law\.npz does not hold"):
+        kind.load(path)
+
+
+def test_a_pickle_keeps_the_plant(saved: Any) -> None:
+    copy = pickle.loads(pickle.dumps(saved[0]))
+    assert copy.model == reactor().model and not copy.theta_ss.flags.writeable

@@ -108,12 +108,6 @@ def test_wrappers_are_part_of_the_plant() -> None:
     np.testing.assert_allclose(model.B, 2 * np.array(UPRIGHT_B), atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["Pendulum-v1", "ClippedPendulum-v0"])
-def test_a_time_limit_of_one_step_does_not_matter(name: str) -> None:
-    env = gym.make(name, max_episode_steps=1)
-    np.testing.assert_allclose(LinearModel.from_env(env, [0, 0]).A, UPRIGHT_A, atol=1e-9)
-
-
 def test_the_users_environment_goes_on_as_if_nothing_had_been() -> None:
     def play(disturb: bool) -> list[Any]:
         env = gym.make("CSTR-v0")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,12 +46,27 @@ def test_a_stable_plant_is_condensed_in_its_inputs() -> None:
     assert problem(1.9, 20).condensed().feedback is not None
 
 
-def test_a_discounted_and_a_short_sighted_problem_keep_their_laws() -> None:
-    model = LinearModel([[1.8, 0.3], [0, 1.1]], [[0], [1]], dt=1)
-    for options in ({"gamma": 0.9}, {"terminal": Terminal(cost=np.zeros((2, 2)))}):
-        mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=60, **BOX, **options)
-        error, _, compared = errors(mpc, 8, explicit=False)
-        assert compared and error < 1e-8
+NO_COST = Terminal(cost=np.zeros((2, 2)))
+SPECIAL: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+    "discounted": ([[1.8, 0.3], [0, 1.1]], [[0], [1]], {"gamma": 0.9}),
+    "short-sighted": ([[1.8, 0.3], [0, 1.1]], [[0], [1]], {"terminal": NO_COST}),
+    # A mode on the unit circle without a weight has no Riccati gain; the law needs none.
+    "no gain of its own": (
+        [[1.8, 0], [0, 1]], [[1], [0.5]], {"Q": np.diag([1, 0]), "terminal": NO_COST},
+    ),
+    "a mode that no input reaches": ([[1.7, 0.2], [0, 1.01]], [[1], [0]], {"gamma": 0.95}),
+    "a large terminal cost": (
+        [[2.3, 0.3], [0, 0.5]], [[1], [1]], {"terminal": Terminal(cost=1e11 * np.eye(2))},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_problems_of_special_gains_and_costs_keep_their_laws(name: str) -> None:
+    A, B, options = SPECIAL[name]
+    given = {"Q": np.eye(2), "R": [[1]], "horizon": 60, **BOX, **options}
+    error, _, compared = errors(LinearMPC(LinearModel(A, B, dt=1), **given), 8, explicit=False)
+    assert compared and error < 1e-8
 
 
 def test_a_law_about_a_feedback_survives_a_file_and_a_pickle(tmp_path) -> None:
@@ -76,31 +92,6 @@ def test_where_digits_are_lost_an_error_names_the_horizon_and_the_pole(kind) -> 
     mpc = LinearMPC(nearly, Q=np.eye(2), R=[[1]], horizon=90, **BOX)
     with pytest.raises(ValueError, match=r"horizon = 90 and the pole 2 of the model"):
         mpc.law(kind)
-
-
-def test_where_the_problems_own_gains_do_not_stabilize_another_one_does() -> None:
-    """A mode on the unit circle without a weight has no Riccati gain; the law needs none."""
-    model = LinearModel([[1.8, 0], [0, 1]], [[1], [0.5]], dt=1)
-    short = Terminal(cost=np.zeros((2, 2)))
-    mpc = LinearMPC(model, Q=np.diag([1, 0]), R=[[1]], horizon=70, terminal=short, **BOX)
-    error, _, compared = errors(mpc, 8, explicit=False)
-    assert compared and error < 1e-8
-
-
-def test_a_mode_that_no_input_reaches_may_grow_beside_one_that_is_steadied() -> None:
-    model = LinearModel([[1.7, 0.2], [0, 1.01]], [[1], [0]], dt=1)
-    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=70, gamma=0.95, **BOX)
-    error, _, compared = errors(mpc, 8, explicit=False)
-    assert compared and error < 1e-8
-
-
-@pytest.mark.parametrize("cost", [1e7, 1e11])
-def test_a_large_terminal_cost_is_no_loss_of_digits(cost) -> None:
-    model = LinearModel([[2.3, 0.3], [0, 0.5]], [[1], [1]], dt=1)
-    stiff = Terminal(cost=cost * np.eye(2))
-    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=50, terminal=stiff, **BOX)
-    error, _, compared = errors(mpc, 8, explicit=False)
-    assert compared and error < 1e-8
 
 
 def test_a_mode_that_grows_and_costs_nothing_is_named_with_the_horizon() -> None:

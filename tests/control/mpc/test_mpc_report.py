@@ -51,16 +51,6 @@ def test_active_constraints_are_shares_of_the_feasible_parameters() -> None:
     assert "never: u[0] at its upper bound" in text
 
 
-def test_soft_bounds_and_their_cost_are_named() -> None:
-    text = solved("one of two states soft, soft outputs").report(samples=20)
-    assert "Soft bounds: x[1], y[0]; a unit costs 300." in text
-
-
-def test_it_shows_the_law_at_the_origin_first() -> None:
-    text = solved("servo").report(samples=20)
-    assert "(x[0], x[1], r[0]):\n  [0, 0, 0] -> u = [0]" in text.replace("-0]", "0]")
-
-
 def test_a_seed_below_zero_is_named() -> None:
     with pytest.raises(ValueError, match="seed = -1 must be a whole number of at least 0"):
         solved("servo").report(seed=-1)

@@ -43,28 +43,6 @@ def test_a_hundred_reachable_references_are_reached_without_offset(name: str) ->
     assert np.max(np.abs(reached - r)) < 1e-6
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("measured", [None, [0]], ids=["all states", "the tracked output"])
-@pytest.mark.parametrize("name", ["servo with a disturbance", "servo with all of it"])
-def test_references_are_reached_under_a_disturbance_nobody_measures(
-    name: str, measured: list[int] | None
-) -> None:
-    mpc = solved(name)
-    observer, law, parts = DisturbanceObserver(mpc.model, measured), mpc.explicit(), mpc.layout
-    r, d = reachable_constants(mpc, 25)
-    worst = 0.0
-    for reference, disturbance in zip(r, d, strict=True):
-        x, u = np.zeros(2), np.zeros(1)
-        x_hat, d_hat = observer.reset(observer.C @ x)
-        for _ in range(200):
-            theta = np.concatenate([x_hat, reference, d_hat, u[: parts.n_previous]])
-            u = law(np.clip(theta, mpc.theta_min, mpc.theta_max))
-            x = mpc.model.step(x, u, disturbance)
-            x_hat, d_hat = observer.update(observer.C @ x, u)
-        worst = max(worst, float(np.max(np.abs(mpc.tracking.C @ x - reference))))
-    assert worst < 1e-6
-
-
 def test_with_as_many_disturbances_as_measurements_a_wrong_model_leaves_no_offset() -> None:
     mpc, observer = solved("two tanks"), DisturbanceObserver(solved("two tanks").model)
     model = mpc.model
@@ -155,11 +133,6 @@ def test_a_reference_of_another_shape_is_named() -> None:
         servo().steady_state([1, 2])
     with pytest.raises(ValueError, match=r"d has shape \(1,\), expected \(0,\)"):
         servo().is_reachable([1], [1])
-
-
-def test_a_regulator_rests_at_the_origin() -> None:
-    x, u = servo(tracking=None).steady_state()
-    assert (x.tolist(), u.tolist()) == ([0, 0], [0])
 
 
 @pytest.mark.parametrize("horizon", [1, 5, 10])

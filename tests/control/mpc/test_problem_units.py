@@ -83,11 +83,6 @@ def test_what_a_problem_tells_is_in_plant_units() -> None:
         mpc.simulate([1.0, 0, 0, 0, 0], 2)
 
 
-def test_a_changed_copy_of_it_is_not_shifted_again() -> None:
-    again = dataclasses.replace(shown(), horizon=3)
-    assert again.deviations == dataclasses.replace(deviations(), horizon=3)
-
-
 COPIES = [
     lambda mpc: mpc,
     copy.copy,
@@ -127,16 +122,6 @@ def test_bounds_stay_where_they_are_when_the_operating_point_moves() -> None:
     np.testing.assert_allclose(own.tracking.r_max + 345, [355])
     np.testing.assert_allclose(own.disturbances.d_min + moved.d_ss, [4])
     np.testing.assert_allclose(own.outputs.y_max + 347.5, [382])
-
-
-def test_a_box_of_theta_and_what_is_not_given() -> None:
-    mpc = LinearMPC(
-        MODEL, **WEIGHTS, theta_min=[300, 0], theta_max=[400, 4], u_min=8, u_max=15,
-        disturbances=DisturbanceBounds(4, 7),
-    )  # fmt: skip
-    assert mpc.theta_min[:2].tolist() == [300, 0]
-    assert mpc.deviations.theta_min[:2].tolist() == [-50, -2]
-    assert np.all(np.isinf(mpc.x_max))
 
 
 def test_the_report_calls_states_by_their_names() -> None:

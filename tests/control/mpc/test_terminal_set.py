@@ -81,15 +81,6 @@ def test_the_set_is_the_largest_one_on_a_plant_with_one_state() -> None:
     assert ends == pytest.approx([lower, upper])
 
 
-def test_no_half_space_of_the_set_is_implied_by_the_others() -> None:
-    mpc = INVARIANT["disturbance and rates"]()
-    F, g = mpc.terminal.set
-    half = (mpc.theta_max - mpc.theta_min) / 2
-    for i in range(len(g)):
-        others = np.arange(len(g)) != i
-        assert not invariant._is_redundant(F[i] * half, g[i], F[others] * half, g[others])
-
-
 def test_steady_states_in_the_set_lie_inside_the_bounds_by_a_hundredth() -> None:
     mpc = INVARIANT["tight servo"]()
     F, g = mpc.terminal.set
