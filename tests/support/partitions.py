@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,23 +66,3 @@ def mixture(mpc: LinearMPC, seed: int) -> Array:
     """Points in the box, beyond it, and on facets."""
     inside, beyond = (in_box(mpc, 100, stretch, seed) for stretch in (1.0, 3.0))
     return np.vstack([inside, beyond, edges(mpc.explicit(), seed, each=2)[0], 0 * inside[:1]])
-
-
-def reordered(law: PiecewiseAffine, order: Array) -> PiecewiseAffine:
-    """The law with its regions in another order."""
-    parts = [half_spaces(law, region) for region in order]
-    place = np.append(np.argsort(order), -1)
-    rows = np.split(np.arange(law.n_halfspaces), law.starts[1:])
-    neighbors = law.neighbors
-    if neighbors.size:
-        neighbors = place[neighbors[np.concatenate([rows[region] for region in order])]]
-    found = dataclasses.replace(
-        law,
-        gains=law.gains[order],
-        offsets=law.offsets[order],
-        A=np.vstack([A for A, _ in parts]),
-        b=np.concatenate([b for _, b in parts]),
-        starts=np.cumsum([0, *[len(b) for _, b in parts[:-1]]]),
-        neighbors=neighbors,
-    )
-    return found.on_plant(law.model, law.theta_ss, law.rate, law.moving)

@@ -17,7 +17,6 @@ from partitions import (
     edges,
     kinds,
     mixture,
-    reordered,
     slacks,
     steepest,
     unit_half,
@@ -71,23 +70,6 @@ def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: fl
         kept = each.in_domain(one) & each.in_domain(other)
         change = as_range(law, each(one) - each(other))[kept]
         assert np.all(change <= 2 * step * steepest(law) + 1e-9)
-
-
-@pytest.mark.slow
-@examples(8)
-@given(problems(), SEEDS)
-def test_order_of_the_regions_changes_nothing(mpc: LinearMPC, seed: int) -> None:
-    law, points = mpc.explicit(), mixture(mpc, seed)
-    order = np.random.default_rng(seed).permutation(law.n_regions)
-    other = reordered(law, order)
-    deepest = np.sort(slacks(law, points), axis=1)
-    tie = 1e-9 * (1 + np.abs(deepest[:, -1]))
-    clear = (law.n_regions == 1) | (deepest[:, -1] - deepest[:, -2:].min(axis=1) > tie)
-    np.testing.assert_array_equal(other(points)[clear], law(points)[clear])
-    np.testing.assert_array_equal(order[other.locate(points)][clear], law.locate(points)[clear])
-    inside = law.in_domain(points)  # on a facet the input is that of a neighbor, to rounding
-    np.testing.assert_array_equal(other.in_domain(points), inside)
-    assert np.all(as_range(law, law(points) - other(points))[inside] <= 1e-8)
 
 
 @examples(8)

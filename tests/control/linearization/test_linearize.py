@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann_envs import clipped_pendulum as pendulum
 from sb3_yann_envs import cstr
 
 # theta+ = theta + dt speed+, speed+ = speed + dt (15 sin(theta) + 3 u), at dt = 0.05 (Gymnasium's
@@ -58,13 +57,6 @@ def test_entries_that_are_nan_are_solved_for() -> None:
     f = cstr.dynamics(cstr.X_SS + model.x_ss, cstr.U_SS + model.u_ss)
     assert model.x_ss[3] == 2.0
     np.testing.assert_allclose(f, 0, atol=1e-5)
-
-
-def test_pendulum_is_linearized_as_its_integrator_is() -> None:
-    model = LinearModel.from_env("ClippedPendulum-v0", [0.0, 0.0])
-    np.testing.assert_allclose(model.A, UPRIGHT_A, atol=1e-10)
-    np.testing.assert_allclose(model.B, UPRIGHT_B, atol=1e-10)
-    assert (model.dt, model.u_ss.tolist()) == (pendulum.DT, [0])
 
 
 def test_input_that_holds_a_tilted_pendulum_is_found() -> None:

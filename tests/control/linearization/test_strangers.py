@@ -235,16 +235,3 @@ def test_a_plant_that_a_search_runs_away_from_is_left_to_settle() -> None:
     model = LinearModel.from_env(Cone(), dt=5)
     assert model.u_ss == 200
     np.testing.assert_allclose(model.x_ss, (200 / 45) ** 2, rtol=1e-6)
-
-
-def test_who_passes_both_functions_is_not_told_to_pass_them() -> None:
-    class Random(Cone):
-        def step(self, action: Any) -> Any:
-            self.h = self.h + np.random.normal()  # noqa: NPY002 (of no seed)
-            return super().step(action)
-
-    def put(env: Any, x: Any) -> None:
-        env.unwrapped.h = x
-
-    with pytest.raises(ValueError, match=r"two steps from the same state .*from_data\)$"):
-        LinearModel.from_env(Random(), dt=5, set_state=put, get_state=lambda env: env.unwrapped.h)

@@ -142,14 +142,6 @@ def test_a_file_without_a_law_is_named(tmp_path) -> None:
         OnlineLaw.load(tmp_path / "other.npz")
 
 
-def test_a_box_without_ends_is_no_obstacle() -> None:
-    mpc = regulator(x_min=None, x_max=None)
-    law = mpc.online()
-    assert np.all(np.isinf(law.theta_max))
-    assert law([100.0, 0.0]) == pytest.approx(-1)
-    assert law([0.0, 0.0]) == 0
-
-
 def test_a_program_that_has_no_unique_solution_is_refused() -> None:
     law = regulator().online()
     skew = law.H.copy()
