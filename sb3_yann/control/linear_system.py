@@ -18,23 +18,8 @@ LARGEST_EXPONENT = 709.0
 class LinearSystem(ReadOnlyArrays):
     """``x[k+1] = A x[k] + B u[k] + E d[k]`` about ``(x_ss, u_ss, d_ss)``: data, not validated.
 
-    Linearization and identification return it; `LinearModel` validates it.
-
-    Attributes
-    ----------
-    A, B, E, dt : ndarray, shapes (n, n), (n, m) and (n, d), and float
-        The matrices in discrete time, and the sampling time.
-    x_ss, u_ss, d_ss : ndarray, shapes (n,), (m,) and (d,)
-    notes, drift : tuple of str, and ndarray, shape (n,), optional
-        Remarks, and the measured motion in one sample at the operating point.
-    state_names, input_names, units : tuple of str, of n, m and n + m entries
-        Empty where there are none.
-    estimated : tuple of int
-        Which disturbances an observer estimates.
-    C : ndarray, shape (q, n), optional
-        The outputs that sensors show, ``y = C x``. None where they show the states.
-    time_unit : str
-        Of ``dt``, for reports and plots.
+    Linearization and identification return it; `LinearModel` validates it, and says what each
+    field means.
     """
 
     A: Array

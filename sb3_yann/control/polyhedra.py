@@ -15,15 +15,8 @@ from sb3_yann._validation import Array
 class Region:
     """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal.
 
-    Attributes
-    ----------
-    active_set : tuple of int
-        The rows of the program that hold with equality, in ascending order.
-    gain, offset, A, b : ndarray, shapes (v, n), (v,), (q, n) and (q,)
-    inside : ndarray, shape (n,), optional
-        A point well inside, if known.
-    across : tuple, optional
-        The active set beyond each row, None where there is none, or none is known.
+    The rows of ``active_set`` hold with equality, in ascending order. ``inside`` is a point well
+    inside, if known. ``across`` are the active sets beyond each row, None where none is known.
     """
 
     active_set: tuple[int, ...]

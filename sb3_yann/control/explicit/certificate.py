@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
@@ -37,6 +37,7 @@ class ExplicitSolutionError(RuntimeError):
     """An explicit solution failed its check: it does not solve the program it came from."""
 
 
+@dataclass(eq=False)
 class Certificate:
     """The check of the regions of a scaled program, without trust in what found them.
 
@@ -55,23 +56,16 @@ class Certificate:
     played, may be far steeper. ``center`` and ``half`` (n,) take theta to the units of the problem.
     """
 
-    def __init__(
-        self,
-        program: ParametricQP,
-        regions: list[Region],
-        to_inputs: Array,
-        center: Array,
-        half: Array,
-        timer: BudgetTimer,
-    ) -> None:
-        self.program = program
-        self.regions = regions
-        self.to_inputs = to_inputs
-        self.center = center
-        self.half = half
-        self.timer = timer
-        self.outer = np.column_stack(program.theta_rows())
-        self.qp_effort = effort_of_qp(*program.G.shape)
+    program: ParametricQP
+    regions: list[Region]
+    to_inputs: Array
+    center: Array
+    half: Array
+    timer: BudgetTimer
+
+    def __post_init__(self) -> None:
+        self.outer = np.column_stack(self.program.theta_rows())
+        self.qp_effort = effort_of_qp(*self.program.G.shape)
 
     def check(self) -> list[Region]:
         """Return the regions, with the laws of steep ones more exact, and trimmed by 1e-8 at most.

@@ -20,16 +20,11 @@ ten times as much as one does, and a plant that forgets a state within a sample 
 
 @dataclass(frozen=True, eq=False)
 class Jacobian:
-    """A Jacobian, and what its differences showed.
+    """A Jacobian (r, c), and what its differences showed.
 
-    Attributes
-    ----------
-    value, dropped : ndarray, shape (r, c), and float
-        Exactly zero where not above its own error, and the largest derivative set to zero.
-    steps, change : ndarray, shape (c,)
-        The longest steps, and their errors relative to the column, NaN without a value.
-    doubt : float
-        The largest error left, relative to the column: how far two step sizes agree.
+    It is exactly zero where not above its own error; ``dropped`` is the largest entry set to zero.
+    ``change`` (c,) are errors of the longest ``steps`` (c,), relative to the column, NaN without a
+    value. ``doubt`` is the largest error left: how far two step sizes agree.
     """
 
     value: Array

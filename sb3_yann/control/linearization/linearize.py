@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -363,15 +363,15 @@ def _remarks(simulator: Simulator, point: Array) -> list[str]:
     return remarks
 
 
+@dataclass(frozen=True)
 class Rate:
     """``dx/dt`` (n,) at a point ``[x, u, d]``, of an f of vectors of these sizes; n is the first.
 
     f returns dx/dt of shape (n,), (n, 1) or (1, n), or a list.
     """
 
-    def __init__(self, f: Callable[..., ArrayLike], sizes: Sequence[int]) -> None:
-        self.f = f
-        self.sizes = tuple(sizes)
+    f: Callable[..., ArrayLike]
+    sizes: tuple[int, ...]
 
     def __call__(self, point: Array) -> Array:
         """Return dx/dt (n,) at ``[x, u, d]``."""

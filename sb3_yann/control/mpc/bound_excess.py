@@ -143,18 +143,11 @@ class BoundNames(NamedTuple):
 class BoundExcess(NamedTuple):
     """By how much trajectories exceed the bounds of their problem, one number for each.
 
-    Attributes
-    ----------
-    largest, summed : ndarray, shape (...,)
-        Of the hard bounds, in half-widths: at the worst step, and summed over steps and bounds.
-    any_bound : ndarray, shape (...,)
-        The largest of hard and soft bounds.
-    penalty : ndarray, shape (...,)
-        What soft bounds cost, summed over the steps: ``penalty (s + s^2)`` of the largest
-        violation s of the states' bounds at a step, and of the outputs'.
-    worst : ndarray, shape (...,)
-        Number of the bound that ``largest`` is of, as in `BoundNames`; where no hard bound is
-        exceeded, of the soft one that ``any_bound`` is of, and -1 where none is.
+    ``largest`` and ``summed`` are of the hard bounds, in half-widths: at the worst step, and over
+    steps and bounds. ``any_bound`` is the largest of hard and soft ones. ``penalty`` is what soft
+    bounds cost over the steps: ``penalty (s + s^2)`` of the largest violation s of the states'
+    bounds at a step, and of the outputs'. ``worst`` is the number of the bound that ``largest`` is
+    of, as in `BoundNames`; without any, of the soft one that ``any_bound`` is of, else -1.
     """
 
     largest: Array

@@ -27,13 +27,9 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     bounds of x, u, y and the rate for ever on the model, with r and d constant. The boxes of r, d
     and ``u_prev`` are taken for granted, that of the states is no bound. Steady states lie inside
     by one percent: the number of steps is finite (Gilbert & Tan, Linear systems with state and
-    control constraints, IEEE Trans. Autom. Control 36 (1991), Section V).
-
-    Raises
-    ------
-    ValueError
-        If the gain does not stabilize the model, the origin is not inside all bounds, or 500 steps
-        or 200 rows are not enough.
+    control constraints, IEEE Trans. Autom. Control 36 (1991), Section V). ValueError if the gain
+    does not stabilize the model, the origin is not inside all bounds, or 500 steps or 200 rows are
+    not enough.
     """
     errors, parts = problem.error_system, problem.layout
     K = lqr.gain(errors.model, errors.R, cost, problem.gamma, errors.cross)
@@ -168,18 +164,11 @@ ROOM = 1e-5
 class KeptSet(ReadOnlyArrays):
     """Half-spaces ``F theta <= g`` in deviations: in all of them hard bounds can be kept.
 
-    Attributes
-    ----------
-    F, g : ndarray, shapes (q, n_theta) and (q,)
-        None for a problem without hard bounds of states or outputs. Slacks are in half-widths:
-        a state that is off by as much moves them by no more than 1.
-    ahead : ndarray, shape (q, n_theta + m + 1)
-        Rows ``[a, b, c]``: where ``a theta + b u <= c`` the predicted next theta lies in the set,
-        and mixed bounds and those that change at run time hold.
-    steps : int
-        From each theta in it some inputs within bounds keep the bounds for so many steps.
-    for_ever : bool
-        Whether they do for ever.
+    There are none for a problem without hard bounds of states or outputs. Slacks are in
+    half-widths: a state that is off by as much moves them by no more than 1. Of rows ``[a, b, c]``
+    of ``ahead``, where ``a theta + b u <= c`` the predicted next theta lies in the set, and mixed
+    bounds and those that change at run time hold. From each theta in it some inputs within bounds
+    keep the bounds for so many ``steps``, or ``for_ever``.
     """
 
     F: Array
@@ -195,13 +184,8 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     Preimages are intersected until nothing changes by more than 1e-7 half-widths (Blanchini, Set
     invariance in control, Automatica 35 (1999)), with references and disturbances constant. With a
     terminal set, they are as many as the horizon is long: the set in which the MPC has a solution.
-
-    Parameters
-    ----------
-    problem : MPCProblem
-        Its inputs need bounds.
-    most_steps, most_rows : int
-        Where these are not enough the last set is taken, which looks fewer steps ahead.
+    Inputs need bounds. Where ``most_steps`` or ``most_rows`` are not enough the last set is taken,
+    which looks fewer steps ahead.
     """
     problem = problem.deviations
     half, u_half = problem.theta_half, problem.u_half

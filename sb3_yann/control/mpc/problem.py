@@ -40,20 +40,9 @@ if TYPE_CHECKING:
 class MPCProblem(ReadOnlyArrays):
     """The arguments of a :class:`LinearMPC`, whose constructor has checked them.
 
-    Attributes
-    ----------
-    model, Q, R : LinearModel, and ndarray, shapes (n, n) and (m, m)
-    horizon, gamma, infeasible : int, float and str
-    x_min, x_max, u_min, u_max, theta_min, theta_max : ndarray, shapes (n,), (m,) and (n_theta,)
-        Infinite where there is no bound.
-    tracking, disturbances, rate, outputs, soft, terminal, mixed, price
-        Groups such as `Tracking`, never None, and in the sizes of the model.
-    parametric_bounds : tuple of str
-        Such as "u_max[0]".
-    control_horizon : int, tuple of int or None
-
-    All of it is in plant units where the model has an operating point, and in the model's own
-    coordinates where it has none.
+    Bounds are infinite where there is none, theta's box is (n_theta,), and groups such as
+    `Tracking` are never None and have the sizes of the model. All of it is in plant units where the
+    model has an operating point, and in the model's own coordinates where it has none.
     """
 
     model: LinearModel
