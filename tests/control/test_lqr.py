@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import optimize
 
 from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel
 from sb3_yann.control import lqr
 from sb3_yann_envs import problems
 
@@ -19,23 +21,6 @@ MPCS = {
     "reactor": problems.cstr,
     "two inputs": lambda: input_bounds_only(TWO_BY_TWO, Q=Q, R=R),
 }
-
-
-def discounted(mpc: LinearMPC, gamma: float) -> LinearMPC:
-    """The same problem with the MPC's own discount."""
-    return LinearMPC(
-        mpc.model,
-        Q=mpc.Q,
-        R=mpc.R,
-        horizon=mpc.horizon,
-        x_min=mpc.x_min,
-        x_max=mpc.x_max,
-        u_min=mpc.u_min,
-        u_max=mpc.u_max,
-        theta_min=mpc.theta_min,
-        theta_max=mpc.theta_max,
-        gamma=gamma,
-    )
 
 
 @pytest.mark.parametrize("gamma", [*GAMMAS, 1.0])
@@ -93,7 +78,7 @@ def test_a_law_that_does_not_stabilize_has_no_value() -> None:
 @pytest.mark.parametrize("gamma", GAMMAS)
 @pytest.mark.parametrize("name", MPCS)
 def test_with_equal_discounts_the_law_maximizes_its_own_critic(name: str, gamma: float) -> None:
-    mpc = discounted(MPCS[name](), gamma)
+    mpc = replace(MPCS[name](), gamma=gamma, terminal=None)
     M, n = mpc.state_action_matrix(gamma), mpc.n_theta
     law = mpc.explicit()
     gain = law.gains[law.locate(np.zeros(n))]

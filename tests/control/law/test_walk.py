@@ -82,16 +82,6 @@ def test_no_point_is_left_to_a_scan() -> None:
     assert np.array_equal(found, law.locate(points))
 
 
-def test_neighbors_share_the_facet_between_them() -> None:
-    law = chain()
-    owner = np.repeat(np.arange(law.n_regions), np.diff([*law.starts, law.n_halfspaces]))
-    assert np.mean(law.neighbors >= 0) > 0.5
-    for row in np.flatnonzero(law.neighbors >= 0):
-        other = owner == law.neighbors[row]
-        same = np.abs(law.A[other] + law.A[row]).max(axis=1) + np.abs(law.b[other] + law.b[row])
-        assert same.min() < 1e-9
-
-
 def test_where_neighbors_are_unknown_or_wrong_the_scan_finds_it() -> None:
     law, points = chain(), in_box(chain(), 500)
     random = np.random.default_rng(0)

@@ -70,22 +70,6 @@ def test_what_grows_is_named_where_more_decays_beside_it() -> None:
         LinearModel.from_continuous([[800, 0], [0, -900]], [[1], [1]], 1)
 
 
-def test_dynamics_are_linearized_by_their_jacobian() -> None:
-    def raw(x: Any, u: Any) -> Any:
-        return np.array([np.sin(x[1]) * x[0] + u[0] ** 2, np.exp(x[0]) - x[1] * u[1]])
-
-    x, u = np.array([0.3, -0.7]), np.array([0.5, 2.0])
-
-    def f(state: Any, inputs: Any) -> Any:
-        return raw(state, inputs) - raw(x, u)  # at rest in (x, u)
-
-    A = [[np.sin(x[1]), x[0] * np.cos(x[1])], [np.exp(x[0]), -u[1]]]  # by hand
-    B = [[2 * u[0], 0], [0, -x[1]]]
-    model, exact = LinearModel.from_dynamics(f, x, u, 0.1), LinearModel.from_continuous(A, B, 0.1)
-    np.testing.assert_allclose(model.A, exact.A, atol=1e-6)
-    np.testing.assert_allclose(model.B, exact.B, atol=1e-6)
-
-
 def test_dynamics_take_measured_disturbances() -> None:
     def f(x: Any, u: Any, d: Any) -> Any:
         return [-x[0] * d[0] + u[0] + 6 + d[1] ** 2 - 1]

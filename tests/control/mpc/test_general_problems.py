@@ -90,22 +90,6 @@ def test_the_law_reaches_beyond_a_soft_bound_without_a_note() -> None:
         servo(**soft, theta_min=-1.2, theta_max=1.2)
 
 
-def test_bounded_outputs_are_bounded_states_in_other_words() -> None:
-    as_states = servo(x_max=[9.0, 0.3], x_min=[-9.0, -0.3], theta_min=-3, theta_max=3)
-    check_outputs = servo(
-        x_min=[-9.0, -np.inf],
-        x_max=[9.0, np.inf],
-        outputs=OutputBounds([1], -0.3, 0.3),
-        theta_min=-3,
-        theta_max=3,
-    )
-    points = box_points(as_states, 1000)
-    one, other = as_states.explicit(), check_outputs.explicit()
-    np.testing.assert_array_equal(one.in_domain(points), other.in_domain(points))
-    inside = points[one.in_domain(points)]
-    assert relative_error(as_states, one(inside), other(inside)) <= 1e-9
-
-
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> None:
@@ -160,17 +144,6 @@ def test_a_weight_on_the_rate_has_the_gain_of_the_augmented_lqr() -> None:
     law = mpc.explicit()
     gain = law.gains[law.locate(np.zeros(4))]
     np.testing.assert_allclose(gain[:, [0, 1, 3]], -K, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_a_problem_with_one_thing_replaced_is_that_problem(name: str) -> None:
-    mpc = solved(name)
-    assert dataclasses.replace(mpc) == mpc
-    r_max = mpc.tracking.r_max
-    tracking = dataclasses.replace(mpc.tracking, r_max=r_max / 2)
-    changed = dataclasses.replace(mpc, tracking=tracking)
-    assert (changed == mpc) == (r_max.size == 0)
-    assert changed.theta_max[changed.layout.reference].tolist() == (r_max / 2).tolist()
 
 
 BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [

@@ -138,17 +138,10 @@ def test_a_reference_of_another_shape_is_named() -> None:
 @pytest.mark.parametrize("horizon", [1, 5, 10])
 def test_of_inputs_that_cost_their_moves_alone_the_least_norm_is_taken(horizon: int) -> None:
     mpc = LinearMPC(
-        LinearModel([[0.8]], [[0.3, 0.2]], 1),
-        Q=[[1]],
-        R=np.zeros((2, 2)),
-        horizon=horizon,
-        u_min=-1,
-        u_max=1,
-        theta_min=-1,
-        theta_max=1,
-        tracking=Tracking([0], -0.5, 0.5),
+        LinearModel([[0.8]], [[0.3, 0.2]], 1), Q=[[1]], R=np.zeros((2, 2)), horizon=horizon,
+        u_min=-1, u_max=1, theta_min=-1, theta_max=1, tracking=Tracking([0], -0.5, 0.5),
         rate=RateLimits(R_du=np.eye(2)),
-    )
+    )  # fmt: skip
     np.testing.assert_allclose(mpc.steady_states.u.ravel(), np.array([0.3, 0.2]) * 0.2 / 0.13)
     law, x, u = mpc.online(), 0.0, np.zeros(2)
     for _ in range(80):
