@@ -6,7 +6,7 @@ much on average (their conditional value at risk), is the mean cost higher?
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -30,18 +30,16 @@ ENDED, INPUT_STEP, LARGEST, ANY_BOUND, MISSING, WORST = 1, 3, 4, 6, 7, 8
 """Columns: how an episode ends; steps in which an input moves too far; the excess over hard bounds,
 and over soft ones too; minus the number of steps; which bound is exceeded most."""
 SUCCESS_HINT = 'where an end is a success, the env says so by info["is_success"]'
-EXCESS_ROOM = 1e-3
-"""Half-widths of a bound by which an excess may be larger: less is noise."""
+EXCESS_ROOM = 1e-3  # half-widths of a bound by which an excess may be larger: less is noise
 EXCESS_SHARE = 0.1
 """Share of the MPC's own excess by which it may be larger: an MPC that rides a bound is no veto."""
 COST_ROUNDING = 1e-6
 """Of a mean cost: what float32 actions and batches of other sizes make of one policy's."""
-WORST_START = 10.0
-"""With a CVaR: how many times as much as on average a single start may cost more."""
+WORST_START = 10.0  # with a CVaR: how many times as much as on average a single start may cost more
 FEW_PAIRS = 12
 """Pairs that a drift can line up by the order that is drawn, which no standard error shows."""
-HARDEST = 10
-"""New starts that join those of every later candidate at a time."""
+HARDEST = 10  # new starts that join those of every later candidate at a time
+TOO_LITTLE = "too little a gain"
 
 
 @dataclass(frozen=True)
@@ -287,6 +285,10 @@ class Difference(NamedTuple):
             return np.inf
         return float(special.stdtrit(self.pairs - 1, 1 - level) * self.error)
 
+    def is_hopeless(self, least_gain: float) -> bool:
+        """Return whether more pairs would hardly show that the mean is below minus a gain."""
+        return self.mean - self.error > -least_gain / 2
+
     def is_below_zero(self, level: float) -> bool:
         """Return whether the mean is negative by chance with a probability of ``level`` at most."""
         return self.chance <= level and self.mean + self.room(level) < 0
@@ -335,11 +337,9 @@ def no_worse(
     of_mpc = mpc.costs[n_hard:]
     before = of_mpc if accepted is mpc else accepted.costs[n_hard:]
     above_mpc = is_above(costs, of_mpc)
-    typical = np.maximum(np.abs(of_mpc), np.median(np.abs(of_mpc)))  # each relative to its own cost
-    gain = Difference.of((costs - before) / np.where(typical > 0, typical, 1.0))
-    best = float((costs - before).mean() / max(np.abs(of_mpc).mean(), 1e-300))
+    gain = Difference.of(relative_costs(costs - before, of_mpc))
     is_sure = gain.is_below_zero(level)
-    hopeless = gain.mean - gain.error > -least_gain / 2 and best > -least_gain
+    hopeless = gain.is_hopeless(least_gain) and mean_change(costs - before, of_mpc) > -least_gain
     reason = ""
     if less.any():
         column = int(np.argmax(less.any(axis=0)))
@@ -401,6 +401,122 @@ class Starts:
         order = np.argsort(np.where(less, -np.inf, -excess), kind="stable")
         count = self.lost(policy).sum() or np.count_nonzero(excess > 0)
         return order[: min(HARDEST, count)]
+
+
+@dataclass
+class NewSeeds:
+    """Gives seeds of episodes that nothing has seen, from the ``next`` one on."""
+
+    next: int
+
+    def __call__(self, count: int) -> range:
+        """Return so many of them."""
+        first = self.next
+        self.next += count
+        return range(first, self.next)
+
+
+class PairedTrial:
+    """Policies beside the MPC from the same starts, in stages, until they decide.
+
+    Every trial of a guard and of `improve` is one. ``play`` returns the scores of a policy, or of
+    ``mpc``, from seeds. The MPC plays each start once; where its own cost is no finite number
+    nothing can be compared, and the start is left out. After the ``starts`` that it has played
+    others follow, of ``new_seeds``; then ``tolerance``, if there is one, says anew what may cost
+    more. ``scores`` are those of the policy that is on trial, from the first starts.
+    """
+
+    def __init__(
+        self,
+        play: Callable[[Any, Sequence[int]], Scores],
+        mpc: Any,
+        starts: Starts,
+        new_seeds: Callable[[int], Sequence[int]],
+        tolerance: Callable[[Array], Tolerance] | None = None,
+    ) -> None:
+        self.play, self.mpc, self.starts, self.new_seeds = play, mpc, starts, new_seeds
+        self.tolerance = tolerance
+        self.scores = starts.mpc.at(slice(0))
+
+    def extend(self, count: int) -> None:
+        """Let the MPC play more, until it has played so many starts."""
+        missing = count - len(self.starts.seeds)
+        if missing <= 0:
+            return
+        seeds = self.new_seeds(missing)
+        mpc = self.play(self.mpc, seeds)
+        finite = np.flatnonzero(np.isfinite(mpc.costs))
+        if len(finite) == 0 and not self.starts.seeds:
+            raise ValueError(
+                f"The MPC's own cost is a finite number on none of {missing} new starts of the "
+                "simulator, so policies cannot be compared there. Its rewards must be finite."
+            )
+        known = (*self.starts.seeds, *(seeds[i] for i in finite))
+        mpc = self.starts.mpc.extended_by(mpc.at(finite))
+        tolerance = self.tolerance(mpc.costs) if self.tolerance else self.starts.tolerance
+        self.starts = replace(self.starts, seeds=known, mpc=mpc, tolerance=tolerance)
+
+    def stages(self, policy: Any, counts: Sequence[int]) -> Iterator[int]:
+        """Play a policy from ever more starts; yield the number of each look, from 1."""
+        self.scores = self.starts.mpc.at(slice(0))
+        for look, count in enumerate(counts, start=1):
+            self.extend(count)
+            seeds = self.starts.seeds[len(self.scores.costs) : count]
+            self.scores = self.scores.extended_by(self.play(policy, seeds))
+            yield look
+
+    @property
+    def mpc_scores(self) -> Scores:
+        """Those of the MPC from the starts that the policy has played."""
+        return self.starts.mpc.at(slice(len(self.scores.costs)))
+
+    def verdict(
+        self,
+        level: float,
+        accepted: Scores | None = None,
+        *,
+        least_gain: float = 0.0,
+        must_gain: bool = False,
+        tail_errors: float = 0.0,
+    ) -> Verdict:
+        """Return whether the policy is no worse than the MPC, and than what was accepted before.
+
+        With ``must_gain`` a gain must be sure at the ``level`` and ``least_gain`` at least, else
+        "no worse" is enough. See :func:`no_worse`.
+        """
+        mpc, scores = self.mpc_scores, self.scores
+        found = no_worse(
+            scores,
+            mpc if accepted is None else accepted,
+            mpc,
+            self.starts.tolerance,
+            names=self.starts.seeds,
+            n_hard=self.starts.n_hard,
+            level=level,
+            least_gain=least_gain,
+            tail_errors=tail_errors,
+        )
+        if found.reason or not must_gain:
+            return found
+        more = scores.costs - mpc.costs
+        change = mean_change(more, mpc.costs)
+        enough = change <= -least_gain
+        if enough and found.is_sure:
+            return found
+        error = Difference.of(relative_costs(more, mpc.costs)).error
+        said = f"{100 * change:+.2g} % (± {100 * error:.1g}) in {len(more)} pairs"
+        return found._replace(reason=f"{said}: {'not sure' if enough else TOO_LITTLE}")
+
+
+def relative_costs(more: Array, mpc_costs: Array) -> Array:
+    """Return what starts cost more, each relative to the MPC's cost of it, or its typical one."""
+    own = np.maximum(np.abs(mpc_costs), np.median(np.abs(mpc_costs)))
+    return np.asarray(more / np.where(own > 0, own, 1.0))
+
+
+def mean_change(more: Array, mpc_costs: Array) -> float:
+    """Return what starts cost more on average, relative to the MPC's mean: -0.02 is 2 % less."""
+    return float(more.mean()) / max(float(np.abs(mpc_costs).mean()), 1e-300)
 
 
 def summary_lines(verdict: str, **rows: str) -> str:

@@ -27,27 +27,20 @@ from sb3_yann.twin.dynamics import Dynamics, law_of
 Mask = NDArray[np.bool_]
 Policy = Callable[[int, Array], Array]  # step and thetas (k, n_theta) -> inputs (k, m)
 
-SIZES = (1.0, 0.5, 0.2, 0.05)
-"""Parts of a correction that are tried, the first first."""
-SETTLED = 1e-5
-"""A start is done when a correction saves less than this part of its cost."""
-ROUNDS, RACE = 40, 4
-"""Corrections at most; after how many the best of several initial guesses goes on."""
-SOFT = 1e-2
-"""Bounds count so much less at first: stiff ones would end a search where it meets them."""
+SIZES = (1.0, 0.5, 0.2, 0.05)  # parts of a correction that are tried, the first first
+SETTLED = 1e-5  # A start is done when a correction saves less than this part of its cost
+ROUNDS, RACE = 40, 4  # corrections at most; after how many the best of several guesses goes on
+SOFT = 1e-2  # bounds count so much less at first: stiff ones would end a search where it meets them
 DAMPED, PATIENCE = 10.0, 5
 """Factor of the damping where no correction helps; how often in a row, at most."""
 INSIDE, WEIGHT = 1e-3, 1e4
 """How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
 a step, in mean costs of a step."""
-BURSTS = 25
-"""Some searches begin with all inputs on a bound, for this part of the episode."""
-WEIGHTS = 0.1, 10.0
-"""Factors of weights of the MPC, for laws that are tried instead of it."""
+BURSTS = 25  # some searches begin with all inputs on a bound, for this part of the episode
+WEIGHTS = 0.1, 10.0  # factors of weights of the MPC, for laws that are tried instead of it
 CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
-PAUSE = 10
-"""Steps after a plan for which an estimated disturbance makes no new one."""
+PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new one
 Law = Callable[[Array], Array]
 
 

@@ -33,8 +33,7 @@ Rows = NDArray[np.intp]
 Controller = Callable[[int, NDArray[Any], Rows], NDArray[Any]]
 """From the step, observations (r, n) and the numbers (r,) of the episodes that show them to actions
 (r, m). At step 0 it is asked for all episodes."""
-LONG_EPISODE = 100_000
-"""Steps of an episode after which a warning is given."""
+LONG_EPISODE = 100_000  # steps of an episode after which a warning is given
 MAX_EPISODE_STEPS = 1_000_000
 """Steps of an episode after which it counts as endless, which is an error."""
 
@@ -230,22 +229,12 @@ def rollout(
     problem: LinearMPC | None = None,
     check: Callable[[Any], None] = lambda env: None,
 ) -> Trajectories:
-    """Return one whole episode for each seed.
+    """Return one whole episode for each seed; for ``seeds`` and ``starts`` see :func:`evaluate`.
 
-    Parameters
-    ----------
-    controller : callable
-        What acts in all episodes; see `Controller`.
-    plant : gymnasium.Env, str, callable or EnvPool
-        As for :func:`evaluate`. A registered env whose copies step as one array is stepped so.
-    seeds, starts : iterable of int, and sequence of array_like
-        As for :func:`evaluate`.
-    problem : LinearMPC, optional
-        Whose theta the plant shows, and whose inputs it takes, both in deviations: then ``costs``
-        are its stage costs, and ``excess`` is known. Inputs reach the plant in the type of its
-        action space.
-    check : callable, optional
-        Is called with the first env, and raises if it does not fit.
+    A registered env whose copies step as one array is stepped so. The plant shows theta of a
+    ``problem``, and takes its inputs, both in deviations: then ``costs`` are its stage costs, and
+    ``excess`` is known. Inputs reach the plant in the type of its action space. ``check`` is called
+    with the first env, and raises if it does not fit.
     """
     seeds = as_seeds(seeds)
     options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]

@@ -47,8 +47,7 @@ class SimulatedEpisodes(BaseCallback):
 
     When training begins, and after each training episode, the policy as it is plays episodes in
     envs of its own, with noise and step tests. Their steps join those of the training env in the
-    replay buffer, and none of its episodes changes: the plant meets the policy alone. What the
-    buffer holds of a simulator, :meth:`PlantTwin.from_buffer` leaves out.
+    replay buffer, and none of its episodes changes: the plant meets the policy alone.
 
     A policy that acts without noise sees little but what it does already. Where the way to a better
     one leads through other actions, a simulator shows them without harm. It may differ from the
@@ -179,7 +178,6 @@ class SimulatedEpisodes(BaseCallback):
             last = buffer.pos - 1
             buffer.timeouts[last] = np.maximum(buffer.timeouts[last], buffer.dones[last] == 0)
         n = buffer.n_envs
-        marks = vars(buffer).setdefault("simulated", np.zeros((buffer.buffer_size, n), dtype=bool))
         columns = []
         for i in range(n):
             own = range(i, len(scaled), n)
@@ -202,10 +200,8 @@ class SimulatedEpisodes(BaseCallback):
             if k == length - 1:  # longer columns end here
                 stopped = stopped | ~done
                 done = np.ones(n, dtype=bool)
-            at = buffer.pos
             infos = [{"TimeLimit.truncated": bool(each)} for each in stopped]
             buffer.add(obs, after, u, reward, done, infos)
-            marks[at] = True
 
 
 class _Exploration:

@@ -28,8 +28,8 @@ from sb3_yann import (
     offset_free,
     restore_accepted,
 )
+from sb3_yann.commissioning.journal import Record, _with_digest
 from sb3_yann.commissioning.plant import Plant
-from sb3_yann.commissioning.record import Record, _with_digest
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.evaluation import comparison_table, evaluate, summary_table
 from sb3_yann.evaluation.plots import loops_figure

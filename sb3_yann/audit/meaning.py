@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from functools import partial
 from itertools import combinations, permutations
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.reward import CostMismatchWarning
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.rollout import Trajectories
+from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers import SetPoint
+from sb3_yann.wrappers.theta import require_vector
 
 WRONG = 0.5
 """Share of the states' movement in a step that the model leaves open, at least, as they are shown.
@@ -25,10 +29,8 @@ WRONG = 0.5
 RIGHT = 0.05
 """The most that it leaves open in another order, or in other units, where those are meant: no noise
 and no wrong model does that."""
-STEPS_PER_STATE = 10
-"""Steps for each state that must be seen."""
-MOST_REORDERED = 5
-"""States of which all orders are tried; of more, two are exchanged."""
+STEPS_PER_STATE = 10  # steps for each state that must be seen
+MOST_REORDERED = 5  # states of which all orders are tried; of more, two are exchanged
 UNITS = (
     *((factor, 0.0) for factor in (1000.0, 100.0, 60.0, 10.0, 0.1, 1 / 60, 0.01, 0.001)),
     *((1.0, shift) for shift in (-273.15, 273.15)),
@@ -39,34 +41,37 @@ Reading = Callable[[Array], Array]
 """From what is shown (steps, n), in plant units, to what it may mean."""
 SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
-LEAST_EFFECT = 1e-3
-"""Of the states' standard deviation: an effect that is smaller may be rounding."""
+LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
 Mask = NDArray[np.bool_]
 EXPLAINED_REWARD = 0.95
 """Share of the rewards' variance from which on they are taken for minus the stage cost."""
-FEWEST_REWARDS = 10
-"""Steps that must be seen."""
+FEWEST_REWARDS = 10  # steps that must be seen
+
+
+class CostMismatchWarning(UserWarning):
+    """The env's reward is not minus the stage cost of the problem."""
+
+
+class CostMismatchError(RuntimeError):
+    """The same as an error, where `CostAudit` is strict.
+
+    It is no ValueError: RL Zoo silently prunes a trial with one.
+    """
 
 
 def warn_of_order(
     problem: LinearMPC, theta: Array, u: Array, following: Array, stacklevel: int
 ) -> None:
     """Warn where the model predicts the steps of an env in another reading of its states alone."""
-    if words := misread_in_words(problem, theta, u, following):
+    if words := misread_states(problem, theta, u, following):
         warnings.warn(words, stacklevel=stacklevel)
 
 
-def misread_in_words(problem: LinearMPC, theta: Array, u: Array, following: Array) -> str:
+def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array) -> str:
     """Return in which other reading alone the model predicts the steps of an env; empty for none.
 
-    That is another order of the states, deviations from the operating point, or other units.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Whose theta the env is to show.
-    theta, u, following : ndarray, shapes (steps, n_theta), (steps, m) and (steps, n_theta)
-        Steps of the env, in deviations.
+    That is another order of the states, deviations from the operating point, or other units. Steps
+    are theta (steps, n_theta), inputs (steps, m) and what follows, in deviations.
     """
     known = np.isfinite(theta).all(axis=1) & np.isfinite(following).all(axis=1)
     steps = theta[known], u[known], following[known]
@@ -170,19 +175,8 @@ def warn_of_signs(
 
     Two steps from one start differ by that input alone: neither noise that the seed repeats, nor
     what is not linear in the states, gets in. It costs a step of the env for each input and start.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Whose model says what an input does.
-    env : gymnasium.Env
-        Repeats an episode from its seed.
-    seeds, played : sequence of int, and Trajectories
-        Starts, and the episodes of the MPC from there.
-    theta, inputs : callable
-        From what the env shows (steps, k) to theta, and from actions (steps, m) to inputs.
-    stacklevel : int
-        Of the warning.
+    ``played`` are the MPC's episodes from the seeds; ``theta`` and ``inputs`` map what the env
+    shows and takes to the problem's.
     """
     names, B, states = labels_of(problem.model)[1], problem.model.B, problem.layout.state
     shown = np.concatenate([theta(each)[:, states] for each in played.observations])
@@ -237,15 +231,6 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories, stacklevel: int
 
     The constant may be each episode's own: it ranks no controllers. The cost may be that of the
     state before the step or after it. Rewards that are all zero are none.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Whose stage cost counts.
-    played : Trajectories
-        Of thetas, inputs and rewards.
-    stacklevel : int
-        Of the warning.
     """
     thetas, inputs, rewards = played.padded()
     costs = [problem.deviations.stage_cost(at, inputs) for at in (thetas[:-1], thetas[1:])]
@@ -283,3 +268,105 @@ def _centered(values: Array, known: Mask) -> Array:
     kept = np.where(known, values, 0.0)
     mean = kept.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.asarray((values - mean)[known])
+
+
+Map = Callable[[Array], Array]  # from an observation to theta
+
+
+class InDeviations(gym.Wrapper[Any, Any, Any, Any]):
+    """An env in plant units as laws compute with it: it shows theta, and takes u, in deviations.
+
+    ``observation`` makes theta in plant units of what the env shows; by default it shows that.
+    """
+
+    def __init__(
+        self, env: gym.Env[Any, Any], units: Units, observation: Map | None = None
+    ) -> None:
+        super().__init__(env)
+        self.units = units
+        self.observation = observation
+        seen: Any = env.observation_space
+        taken: Any = env.action_space
+        self.taken: spaces.Box = taken
+        far = np.full(len(units.theta_ss), np.inf)
+        low, high = (seen.low, seen.high) if observation is None else (-far, far)
+        self.observation_space = spaces.Box(
+            low - units.theta_ss, high - units.theta_ss, dtype=np.float64
+        )
+        self.action_space = spaces.Box(
+            taken.low - units.u_ss, taken.high - units.u_ss, dtype=np.float64
+        )
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(**kwargs)
+        return self._theta(observation), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step with the operating point put on the action, and taken off the observation."""
+        # Rounding must not leave the space of the env.
+        u = np.clip(self.units.input_to_plant(action), self.taken.low, self.taken.high)
+        observation, reward, *ends, info = self.env.step(u.astype(self.taken.dtype))
+        terminated, truncated = ends
+        return self._theta(observation), float(reward), terminated, truncated, info
+
+    def _theta(self, shown: Any) -> Array:
+        return self.units.to_deviations(
+            shown if self.observation is None else self.observation(np.ravel(shown))
+        )
+
+
+def in_deviations(
+    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, observation: Map | None = None
+) -> Callable[[], gym.Env[Any, Any]]:
+    """Return a function that makes envs that show theta, and take inputs, in deviations.
+
+    ``observation`` makes theta in plant units of what the env shows; by default it shows that.
+    Actions in other units are a ValueError.
+    """
+    with closing(make()) as env:
+        space = require_vector(env, "action_space")
+        require_state_shown(env, observation is not None)
+    units = ActionUnits.of(problem, space.low, space.high)
+    if units is not None and units.kind == "normalized":
+        raise ValueError(
+            f"The env takes normalized inputs, from {space.low.tolist()} to {space.high.tolist()}, "
+            f"and the MPC inputs from {problem.u_min.tolist()} to {problem.u_max.tolist()}. Wrap "
+            "it in gymnasium.wrappers.RescaleAction(env, mpc.u_min, mpc.u_max)."
+        )
+    own = problem.deviations
+    if units is None and own is not problem and ActionUnits.of(own, space.low, space.high):
+        raise ValueError(
+            f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "
+            f"the MPC is in plant units, from {problem.u_min.tolist()} to {problem.u_max.tolist()}."
+            " Leave x_ss and u_ss out of its model, or take the env in plant units."
+        )
+    if observation is None and not problem.units.shifted:
+        return make
+    return partial(_wrapped, make, problem.units, observation)
+
+
+def _wrapped(
+    make: Callable[[], gym.Env[Any, Any]], units: Units, observation: Map | None
+) -> gym.Env[Any, Any]:
+    return InDeviations(make(), units, observation)
+
+
+def require_theta_shown(problem: LinearMPC, theta: Array) -> None:
+    """Raise where theta (steps, n_theta), in deviations, was made of what are deviations already.
+
+    Nor may references and measured disturbances lie beyond their box in nearly all steps.
+    """
+    shown = problem.units.to_plant(theta)
+    if words := problem.shown_as_deviation(shown):
+        raise ValueError(f"The env is not that of the MPC. {words}")
+    room = 1e-3 * problem.theta_half
+    most = 0.9  # share of the rows that must speak for it
+    beyond = (shown < problem.theta_min - room) | (shown > problem.theta_max + room)
+    for i in np.flatnonzero(np.mean(beyond, axis=0) >= most):
+        if problem.model.n_states <= i < problem.layout.disturbance.stop:
+            raise ValueError(
+                f"{problem.labels()[i]} is {shown[0, i]:.6g}, and the MPC was solved for "
+                f"{problem.theta_min[i]:.6g} to {problem.theta_max[i]:.6g}: give the wrapper that "
+                "shows it the bounds of the MPC."
+            )

@@ -15,7 +15,6 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import check_bool, check_int, check_range
-from sb3_yann.commissioning.accepted_policy import AcceptedPolicy
 from sb3_yann.commissioning.comparison import (
     Costs,
     compare,
@@ -24,15 +23,14 @@ from sb3_yann.commissioning.comparison import (
     rows_of_pairs,
     why_taken_back,
 )
-from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal, Verdict
-from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
-from sb3_yann.commissioning.record import Record
+from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal, Record, Verdict
+from sb3_yann.commissioning.plant import AcceptedPolicy, Inputs, Plant, PlantEpisode
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import allowed_excess, summary_lines
 from sb3_yann.improvement import improve
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.rollout import Source, one_env
-from sb3_yann.twin.observers import observer_of
+from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
 

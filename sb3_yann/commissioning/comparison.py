@@ -18,15 +18,12 @@ from sb3_yann.control.mpc.bound_excess import (
     bound_excess,
     excess_of_episodes,
 )
-from sb3_yann.improvement.trial import RULE
+from sb3_yann.improvement.confirmation import RULE
 from sb3_yann.twin.plant_twin import PlantTwin
 
-PAIRS_TO_GIVE_UP = 10
-"""So many that show no gain end a trial."""
-MOST = 0.05
-"""What a policy may cost more than the MPC in any case, as a fraction of the MPC's cost."""
-OWN = 0.95
-"""Share of the episodes' rewards that the stage cost explains where they are the same."""
+PAIRS_TO_GIVE_UP = 10  # so many that show no gain end a trial
+MOST = 0.05  # what a policy may cost more than the MPC in any case, as a fraction of the MPC's cost
+OWN = 0.95  # share of the episodes' rewards that the stage cost explains where they are the same
 ALARMS = 0.25
 """Share of a policy's episodes with an alarm from which on it is taken back, two at least."""
 
@@ -34,21 +31,12 @@ ALARMS = 0.25
 class Costs(NamedTuple):
     """What the plant has shown; NaN where nothing is known.
 
-    Attributes
-    ----------
-    actual, predicted : float
-        The mean cost of the episodes of the one that acted in the batch, those with an alarm
-        included, and what the twin had predicted of them.
-    mpc : float
-        What the MPC cost on the plant, in turns with the policy.
-    difference : Difference
-        Of all pairs since the policy is on trial, in the order in which they were played.
-    look : int
-        Looks at the policy so far, this one included.
-    own_reward : bool
-        Whether the costs are minus the rewards, which are not the stage cost: no twin knows them.
-    longer : str
-        By how much more than the MPC the policy exceeds hard bounds, summed over an episode.
+    ``actual`` is the mean cost of the episodes of the one that acted in the batch, those with an
+    alarm included, ``predicted`` what the twin had predicted of them, ``mpc`` what the MPC cost in
+    turns with the policy. ``difference`` is of all pairs since the policy is on trial, in the order
+    in which they were played; ``look`` counts the looks at it. With ``own_reward`` costs
+    are minus the rewards, which are not the stage cost: no twin knows them. ``longer`` says by how
+    much more than the MPC the policy exceeds hard bounds, summed over an episode.
     """
 
     actual: float = np.nan
@@ -67,16 +55,8 @@ def compare(
 
     A plant does not repeat a start. Which of a pair plays first is drawn, so their starts differ by
     nothing on average, and so does what a twin says that the MPC costs from them: it is a control
-    variate, taken where the differences vary less with it. It biases nothing, however wrong.
-
-    Parameters
-    ----------
-    journal : Journal
-        Its batch is compared.
-    plant : Plant
-        The policy that acted, and the MPC.
-    before, now : PlantTwin, optional
-        The twin that was in force, and the one that has learnt from the batch.
+    variate, taken where the differences vary less with it. It biases nothing, however wrong. The
+    twin ``before`` was in force, ``now`` is the one that has learnt from the batch.
     """
     problem = plant.problem
     by_policy = any(each for _, each in journal.batch)
@@ -168,9 +148,9 @@ def is_kept(costs: Costs) -> bool:
 
 def is_hopeless(costs: Costs) -> bool:
     """Return whether more pairs would hardly show a gain that counts."""
-    more = costs.difference
     least = RULE.least_gain * abs(costs.mpc)
-    return bool(more.pairs >= PAIRS_TO_GIVE_UP and more.mean - more.error > -least / 2)
+    more = costs.difference
+    return more.pairs >= PAIRS_TO_GIVE_UP and more.is_hopeless(least)
 
 
 def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:

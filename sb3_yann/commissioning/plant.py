@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
 from typing import Any, cast
@@ -19,38 +21,33 @@ from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
 from sb3_yann.improvement.imitation import policy_of
 from sb3_yann.improvement.simulator import Excited
+from sb3_yann.policy.checkpoint import (
+    ActorCheckpoint,
+    all_or_nothing,
+    restore_whole,
+    whole_policy,
+)
+from sb3_yann.policy.checks import LOST_STATISTICS
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.replay_buffer import normalization_of
 
 Inputs = Callable[[Array], Array]
-LONGEST = 1_000_000
-"""Steps after which an episode is taken for one that never ends."""
+LONGEST = 1_000_000  # steps after which an episode is taken for one that never ends
 
 
 @dataclass(frozen=True)
 class PlantEpisode:
     """One episode as it was played.
 
-    Attributes
-    ----------
-    thetas, actions : ndarray, shapes (T + 1, n_theta) and (T, m)
-        What was measured (estimates, where it was not finite), and the inputs.
-    reward : float
-        The plant's own, summed.
-    violations : int
-        Steps with ``info["violation"]`` or too large an excess over a hard bound of the problem,
-        and an end that is no time limit.
-    alarm : Alarm or None
-        Why the MPC took over.
-    step : int
-        The step after which it did, -1 where it did not.
-    apart : float
-        The largest distance of the policy's inputs from the MPC's, in input ranges, whichever of
-        them acted.
-    excited : bool
-        Whether random steps were added to the MPC's inputs: its cost is not the MPC's.
+    ``thetas`` (T + 1, n_theta) were measured, or estimated where that was not finite; ``actions``
+    are (T, m), ``reward`` the plant's own, summed. ``violations`` counts steps with
+    ``info["violation"]`` or too large an excess over a hard bound, and an end that is no time
+    limit. After ``step`` the MPC took over because of ``alarm``, -1 where it did not. ``apart`` is
+    the largest distance of the policy's inputs from the MPC's, in input ranges, whichever of them
+    acted. Where it was ``excited`` random steps were added to the MPC's inputs: its cost is not the
+    MPC's.
     """
 
     thetas: Array
@@ -69,20 +66,14 @@ class PlantEpisode:
 
 
 class Plant:
-    """A plant's env, and the two that may act on it.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-    model : DDPG or TD3
-        Its actor is the policy.
-    """
+    """A plant's env, and the two that may act on it: the MPC and the actor of a model."""
 
     def __init__(self, env: gym.Env[Any, Any], model: OffPolicyAlgorithm) -> None:
         self.env, self.model = env, model
         self.yann = require_yann_policy(model.policy, "Commissioning")
         self.problem = self.yann.problem
-        normalization_of(model)  # or raise, before anything acts on the plant
+        if model.get_vec_normalize_env() is None and getattr(model, "sees_normalized", False):
+            raise ValueError(LOST_STATISTICS)  # before anything acts on the plant
         require_state_shown(env, self.yann.observation_given)
         for name in ("observation_space", "action_space"):
             own, its = getattr(model, name), getattr(env, name)
@@ -129,10 +120,7 @@ class Plant:
     def begin(self, seed: int) -> Array:
         """Reset the plant, and return the first theta (n_theta,).
 
-        Raises
-        ------
-        ValueError
-            If it is not finite: no prediction could take its place.
+        If it is not finite that is a ValueError: no prediction could take its place.
         """
         known = self._theta(self.env.reset(seed=seed)[0])
         if not np.isfinite(known).all():
@@ -149,19 +137,12 @@ class Plant:
         watchdog: Watchdog | None,
         allowed: float = np.inf,
     ) -> PlantEpisode:
-        """Play an episode; after an alarm the MPC acts, from the very sample on.
+        """Play an episode from :meth:`begin`; after an alarm the MPC acts, from the very sample on.
 
-        Parameters
-        ----------
-        known : ndarray, shape (n_theta,)
-            From :meth:`begin`.
-        act : callable
-            The one that acts until then: :meth:`policy`, :meth:`mpc` or :meth:`excited_mpc`.
-        watchdog : Watchdog, optional
-            Without one only violations and readings that are not finite are seen.
-        allowed : float, optional
-            Half-widths by which the policy may exceed a hard bound of the problem. A violation that
-            the plant reports is none where its size is known, and allowed.
+        Until then it is ``act``: :meth:`policy`, :meth:`mpc` or :meth:`excited_mpc`. Without a
+        watchdog only violations and readings that are not finite are seen. The policy may exceed a
+        hard bound by the ``allowed`` half-widths: a violation that the plant reports is none where
+        its size is known, and allowed.
         """
         if watchdog is not None:
             watchdog.start(known)
@@ -227,3 +208,113 @@ class Plant:
         """Return which entries are not finite, by name."""
         wrong = np.flatnonzero(~np.isfinite(theta))
         return ", ".join(f"{self.problem.labels()[i]} = {theta[i]}" for i in wrong)
+
+
+class AcceptedPolicy:
+    """A model's policy, its bound, and the MPC that it can always return to.
+
+    A policy that the model has learnt before is nobody's yet: it waits as ``candidate``, and the
+    model is the MPC.
+    """
+
+    def __init__(self, model: OffPolicyAlgorithm) -> None:
+        if not isinstance(model, OffPolicyAlgorithm):
+            raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
+        self.model, self.policy = model, require_yann_policy(model.policy, "Commissioning")
+        with preserve_rng():  # building an actor draws weights
+            mpc = self.policy.make_actor().state_dict()
+        self._first = {name: each.clone() for name, each in self.policy.state_dict().items()}
+        for actor in ("actor", "actor_target"):
+            self._first |= {f"{actor}.{name}": each for name, each in mpc.items()}
+        self.candidate: ActorCheckpoint | None = None
+        self._kept: tuple[ActorCheckpoint, float | None] | None = None
+        self._shown: tuple[ActorCheckpoint, Any] | None = None
+        if self.has_learnt:
+            self.candidate = ActorCheckpoint.of(self.policy)
+            self.give_back()
+        self.hold()
+
+    @property
+    def has_learnt(self) -> bool:
+        """Whether it differs from the MPC anywhere."""
+        return not self.policy.actor.mu.network.is_zero()
+
+    def limit(self, max_correction: float | None) -> None:
+        """Bound it, for good: a model that is saved keeps it."""
+        self.policy.limit_correction(max_correction)
+
+    def give_back(self) -> None:
+        """Make it the MPC, with the critic that the model began with."""
+        self.policy.load_state_dict(self._first)
+        for network in (self.policy.actor, self.policy.critic):
+            network.optimizer.state.clear()  # what other weights were moved by
+
+    def take_candidate(self) -> None:
+        """Make it what the model had learnt before, if that still waits, to be tried."""
+        if self.candidate is not None:
+            self.candidate.restore(self.policy)
+            self.candidate = None
+
+    def keep(self, kept: bool) -> None:
+        """Take it for the one that the plant has confirmed; or forget which one that was."""
+        self._kept = (ActorCheckpoint.of(self.policy), self.policy.max_correction) if kept else None
+
+    def return_to_kept(self) -> None:
+        """Make it the one that the plant has confirmed."""
+        assert self._kept is not None
+        self._kept[0].restore(self.policy)
+        self.limit(self._kept[1])
+
+    def show(self) -> None:
+        """Make it the one that the plant has confirmed, else the MPC, while no episode is played.
+
+        What is on trial goes on from :meth:`restore`.
+        """
+        if self._shown is not None:
+            return
+        whole = whole_policy(self.policy), self.policy.max_correction
+        if self._kept is None:
+            self.give_back()
+        else:
+            self.return_to_kept()
+        self._shown = ActorCheckpoint.of(self.policy), whole
+
+    def hold(self) -> None:
+        """Take it for the accepted one from here on."""
+        self._shown = None
+        self._held = ActorCheckpoint.of(self.policy), self.policy.max_correction
+
+    def restore(self) -> None:
+        """Make it the accepted one again, with a warning where something has changed it."""
+        held, bound = self._held
+        if self._shown is not None:
+            shown, (whole, its_bound) = self._shown
+            self._shown = None
+            if shown.is_actor_of(self.policy):
+                restore_whole(self.policy, whole)
+                self.limit(its_bound)
+        if held.is_actor_of(self.policy) and bound == self.policy.max_correction:
+            return
+        held.restore(self.policy)
+        self.limit(bound)
+        warnings.warn(
+            "The model's actor is not the one that was accepted: that one is restored. Train "
+            "another copy of the model, not the one that is being commissioned.",
+            stacklevel=2,
+        )
+
+    @contextmanager
+    def unless_cut_off(self) -> Iterator[None]:
+        """Leave it as it was if an error or Ctrl-C cuts a decision off."""
+        bound = self.policy.max_correction
+        candidate = self.candidate
+        kept = self._kept
+        try:
+            with all_or_nothing(self.policy):
+                yield
+        except BaseException:
+            self.limit(bound)
+            self.candidate = candidate
+            self._kept = kept
+            raise
+        self.hold()

@@ -27,8 +27,7 @@ NORMAL_MEDIAN = 0.6745
 """Median of what is normally distributed, without its sign, in standard deviations."""
 NOISY = 0.3
 """Correlation of successive errors below which they are noise; those of a model change slowly."""
-FROZEN = 3
-"""Repeats of a reading from which on it may be frozen."""
+FROZEN = 3  # repeats of a reading from which on it may be frozen
 MOVED = 3.0
 """Standard deviations that the twin's prediction moves in a sample while a reading stands."""
 
@@ -58,17 +57,9 @@ class Alarm:
 class PredictiveVariance:
     """How far the twin may be wrong at a point that the log shows little of.
 
-    The standard deviation of fits without each fold of the episodes; beyond the log also what the
-    residual explains, times the distance in widths of the log.
-
-    Attributes
-    ----------
-    dynamics : Dynamics
-        A member for each fold.
-    low, high : ndarray, shape (k,)
-        The box of the logged features ``[x, d, u]``.
-    size : ndarray, shape (n,)
-        What the residual explains.
+    The standard deviation of ``dynamics``, fits without each fold of the episodes; beyond the box
+    of logged features ``[x, d, u]`` also the ``size`` (n,) of what the residual explains, times the
+    distance in widths of the log.
     """
 
     dynamics: Dynamics
@@ -104,19 +95,10 @@ class _Charts:
 class Bands:
     """How far charts may go while all is well, from episodes that a fit has not seen.
 
-    Attributes
-    ----------
-    known : PredictiveVariance
-    error : ndarray, shape (n,)
-        Root mean squares of one-step errors.
-    spread, most : ndarray, shape (gains, n)
-        Typical deviations of the charts, and the largest ratios to their scale.
-    noisy : ndarray of bool, shape (n,)
-        Whether a sensor's errors change from step to step, as noise does.
-    repeats : ndarray of int, shape (n,)
-        How often in a row a reading repeats itself in the log.
-    factor : float
-        By how much the largest ratio is exceeded only where something is wrong.
+    ``error`` (n,) are root mean squares of one-step errors, ``spread`` (gains, n) typical
+    deviations of the charts, ``most`` the largest ratios to their scale, which are exceeded by
+    ``factor`` only where something is wrong. A ``noisy`` (n,) sensor's errors change from step to
+    step; a reading ``repeats`` itself so often in a row in the log.
     """
 
     known: PredictiveVariance
@@ -262,7 +244,7 @@ class Watchdog:
         first = check_array("theta", theta, (self.dynamics.problem.n_theta,))
         self.alarm, self._episode = None, _Episode(self.dynamics, self.dynamics.row.begin(first))
 
-    def watch(self, theta: Array, u: Array, after: Array, violation: bool = False) -> Alarm | None:
+    def watch(self, theta: Array, u: Array, after: Array) -> Alarm | None:
         """Return an alarm, or None: after one the episode's alarm stays as it is.
 
         Parameters
@@ -271,8 +253,6 @@ class Watchdog:
             Before and after a sample, as read.
         u : ndarray, shape (m,)
             What was commanded.
-        violation : bool, default False
-            Whether the plant reports one.
 
         Raises
         ------
@@ -284,21 +264,19 @@ class Watchdog:
         if self.alarm is None:
             theta, u, after = (np.array(each, np.float64) for each in (theta, u, after))
             with np.errstate(all="ignore"):
-                found = self._seen(self._episode, theta, u, after, violation)
+                found = self._seen(self._episode, theta, u, after)
             if found is not None:
                 kind, said = found
                 self.alarm = Alarm(kind, f"Step {self._episode.steps}: {said}.")
         return self.alarm
 
     def _seen(
-        self, episode: _Episode, theta: Array, u: Array, after: Array, violation: bool
+        self, episode: _Episode, theta: Array, u: Array, after: Array
     ) -> tuple[str, str] | None:
         """Return what is wrong with a transition: the kind, and what is said."""
         for name, values in (("theta", theta), ("the input", u), ("the reading", after)):
             if not np.isfinite(values).all():
                 return "not a number", f"{name} is {np.asarray(values).tolist()}"
-        if violation:
-            return "violation", "the plant reports a violation"
         episode.take(theta, u, after, self.bands.known.doubt)
         return self._frozen(episode) or self._beyond(episode)
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann._validation import check_bool, check_int, check_options, check_range
-from sb3_yann.audit.callback import CostAudit
+from sb3_yann.audit.reward import CostAudit
 from sb3_yann.compare import AcceptanceRule
 from sb3_yann.evaluation.plots import plot_decisions
 from sb3_yann.guard.decide import GuardSettings, Player, decide, decide_at_end

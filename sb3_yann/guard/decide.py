@@ -19,11 +19,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array
 from sb3_yann.compare import (
+    TOO_LITTLE,
     AcceptanceRule,
+    NewSeeds,
+    PairedTrial,
     Scores,
     Starts,
     Verdict,
-    format_distinct,
     less_safe,
     level_of_look,
     looks,
@@ -44,15 +46,12 @@ from sb3_yann.rollout import (
     rollout,
 )
 
-FIRST_LOOK = 5
-"""Starts of a trial of its first look."""
-FIRST_FINAL_LOOK = 40
-"""The same at the end: the worst 5 % of so many are two."""
+FIRST_LOOK = 5  # starts of a trial of its first look
+FIRST_FINAL_LOOK = 40  # the same at the end: the worst 5 % of so many are two
 INTERIM_LEVEL = 0.2
 """Of what confirms a policy until the end, one-sided: it has passed on the known starts."""
 PARTS_OF_THE_WAY = 0.5, 0.25
 """How far towards a refused candidate, and which shares of a correction that lost, are tried."""
-TOO_LITTLE = "too little a gain"
 
 
 class Unplayable(Exception):
@@ -130,27 +129,29 @@ def decide_at_end(
     tried, rule = evidence.accepted, settings.rule
     if settings.n_final_starts == 0 or not tried.has_learned():
         return evidence, None
-    trial = _NewStarts(evidence, play, settings, at_end=True)
-    scores, verdict = trial.verdict(tried, level_of_look(rule.significance, 1))
-    evidence = replace(evidence, next_seed=trial.next_seed)
+    seeds = NewSeeds(evidence.next_seed)
+    trial = _new_trial(evidence, play, seeds, at_end=True)
+    scores, verdict = _confirm(trial, tried, settings, level_of_look(rule.significance, 1))
+    evidence = replace(evidence, next_seed=seeds.next)
     if scores is not None and verdict.accepted:
-        lost = np.flatnonzero(trial.new.lost(scores))
-        return replace(evidence, lost=tuple(trial.new.seeds[i] for i in lost)), None
+        lost = np.flatnonzero(trial.starts.lost(scores))
+        return replace(evidence, lost=tuple(trial.starts.seeds[i] for i in lost)), None
 
     cost = evidence.mean_cost(evidence.scores)
-    after, _ = _with_hard_starts(evidence.without_passed(tried), trial.new, scores)
+    after, _ = _with_hard_starts(evidence.without_passed(tried), trial.starts, scores)
     mpc = after = replace(after, accepted=after.mpc, scores=after.starts.mpc)
-    of_mpc = None if scores is None else trial.new.mpc.at(slice(len(scores.costs)))
+    of_mpc = None if scores is None else trial.mpc_scores
     parts = [each for each, _ in _parts(mpc.mpc, tried, scores, of_mpc, rule)]
     for number, policy in enumerate([*parts, *reversed(mpc.passed)], start=2):
         known, its_scores, found = try_on_known(mpc, policy, play, settings)
         if its_scores is None or not found.accepted:
             continue
         part = known.with_visited(policy, its_scores)
-        if trial.verdict(part.accepted, level_of_look(rule.significance, number))[1].accepted:
+        level = level_of_look(rule.significance, number)
+        if _confirm(trial, part.accepted, settings, level)[1].accepted:
             after = part.with_passed(part.accepted)
             break
-    after = replace(after, next_seed=trial.next_seed)
+    after = replace(after, next_seed=seeds.next)
     regions = _accepted_regions(evidence.mpc, tried, after.accepted)
     reason = f"at the end, {verdict.reason}; {_what_acts(after, tried)}"
     return after, _decision(after, cost, reason, True, regions)
@@ -177,30 +178,23 @@ def try_on_known(
     if candidate.has_diverged():
         reason = "a parameter of the actor is not a finite number, or too large"
         return evidence, None, Verdict(reason, breaks_limit=True)
-    starts, scores, verdict = evidence.starts, evidence.starts.mpc.at(slice(0)), Verdict()
-    for look, count in enumerate(looks(FIRST_LOOK, len(settings.seeds)), start=1):
-        stop = slice(starts.n_hard + count)
-        try:
-            evidence = evidence.known_up_to(stop.stop, play)
-            seeds = starts.seeds[len(scores.costs) : stop.stop]
-            scores = scores.extended_by(play(candidate, seeds))
-        except Unplayable as error:
-            return evidence, None, Verdict(str(error), breaks_limit=True)
-        verdict = no_worse(
-            scores,
-            evidence.scores.at(stop),
-            starts.mpc.at(stop),
-            starts.tolerance,
-            names=starts.seeds,
-            n_hard=starts.n_hard,
-            level=level_of_look(settings.rule.significance, look),
-            least_gain=settings.least_gain,
-        )
-        if verdict.is_hopeless or (verdict.accepted and verdict.is_sure):
-            break
+    known, verdict = evidence.starts, Verdict()
+    trial = PairedTrial(play, evidence.mpc, known, NewSeeds(evidence.next_seed))
+    counts = [known.n_hard + each for each in looks(FIRST_LOOK, len(settings.seeds))]
+    try:
+        for look in trial.stages(candidate, counts):
+            count = len(trial.scores.costs)
+            evidence = evidence.known_up_to(count, play)
+            level = level_of_look(settings.rule.significance, look)
+            accepted = evidence.scores.at(slice(count))
+            verdict = trial.verdict(level, accepted, least_gain=settings.least_gain)
+            if verdict.is_hopeless or (verdict.accepted and verdict.is_sure):
+                break
+    except Unplayable as error:
+        return evidence, None, Verdict(str(error), breaks_limit=True)
     if verdict.accepted and verdict.is_hopeless:
         verdict = verdict._replace(reason=f"{TOO_LITTLE} over the accepted policy")
-    return evidence, scores, verdict
+    return evidence, trial.scores, verdict
 
 
 class _Tried(NamedTuple):
@@ -227,101 +221,68 @@ def _accept(
     after = evidence.with_visited(candidate, scores)
     if settings.n_new_starts == 0 or not after.accepted.has_learned():
         return _Tried(after, verdict, cost, scores, others)
-    trial = _NewStarts(evidence, play, settings)
-    new, verdict = trial.verdict(after.accepted, settings.rule.significance)
+    seeds = NewSeeds(evidence.next_seed)
+    trial = _new_trial(evidence, play, seeds)
+    new, verdict = _confirm(trial, after.accepted, settings)
     if verdict.accepted:
-        after = replace(after, next_seed=trial.next_seed, new=trial.new)
+        after = replace(after, next_seed=seeds.next, new=trial.starts)
         after = after.with_passed(after.accepted)
         return _Tried(after, verdict, cost, scores, others)
     if new is not None:
-        of_mpc = trial.new.mpc.at(slice(len(new.costs)))
-        scores, others = scores.extended_by(new), others.extended_by(of_mpc)
-    evidence = replace(evidence, next_seed=trial.next_seed)
-    after = _after_loss(evidence, trial.new, new, play)
+        scores, others = scores.extended_by(new), others.extended_by(trial.mpc_scores)
+    evidence = replace(evidence, next_seed=seeds.next)
+    after = _after_loss(evidence, trial.starts, new, play)
     return _Tried(after, verdict, cost, scores, others)
 
 
-class _NewStarts:
-    """Starts that have decided on no candidate but by confirming it; the MPC plays them once.
+def _new_trial(
+    evidence: Evidence, play: Play, seeds: NewSeeds, at_end: bool = False
+) -> PairedTrial:
+    """Return a trial on starts that have decided on no candidate but by confirming it.
 
     They are the same until a policy loses there, and others at the end.
     """
+    starts = evidence.starts
+    new = evidence.new
+    if new is None or at_end:
+        new = Starts((), starts.mpc.at(slice(0)), starts.tolerance)
+    return PairedTrial(play, evidence.mpc, new, seeds)
 
-    def __init__(
-        self, evidence: Evidence, play: Play, settings: GuardSettings, at_end: bool = False
-    ) -> None:
-        self.mpc, self.play, self.rule = evidence.mpc, play, settings.rule
-        self.next_seed, self.at_end = evidence.next_seed, at_end
-        self.most = settings.n_final_starts if at_end else settings.n_new_starts
-        self.least_gain = settings.least_gain if at_end else 0.0
-        self.level = 0.0 if at_end else INTERIM_LEVEL
-        starts = evidence.starts
-        none = Starts((), starts.mpc.at(slice(0)), starts.tolerance)
-        self.new = none if at_end or evidence.new is None else evidence.new
 
-    def verdict(self, policy: ActorCheckpoint, level: float) -> tuple[Scores | None, Verdict]:
-        """Return a policy's scores, and whether it is no worse than the MPC.
+def _confirm(
+    trial: PairedTrial,
+    policy: ActorCheckpoint,
+    settings: GuardSettings,
+    significance: float | None = None,
+) -> tuple[Scores | None, Verdict]:
+    """Return a policy's scores on new starts, and whether it is no worse than the MPC.
 
-        At the end the gain must be sure, and large enough, but for a strict rule.
-        """
-        scores, verdict = self.new.mpc.at(slice(0)), Verdict()
-        first = FIRST_FINAL_LOOK if self.at_end else FIRST_LOOK
-        strict = not self.rule.cvar_alpha
-        for look, count in enumerate(looks(first, self.most), start=1):
-            self._extend(count)
-            had = slice(len(scores.costs), count)
-            try:
-                scores = scores.extended_by(self.play(policy, self.new.seeds[had]))
-            except Unplayable as error:
-                return None, Verdict(f"on new starts, {error}")
-            mpc = self.new.mpc.at(slice(count))
-            verdict = no_worse(
-                scores,
-                mpc,
-                mpc,
-                self.new.tolerance,
-                names=self.new.seeds,
-                level=self.level or level_of_look(level, look),
-                least_gain=self.least_gain,
-                tail_errors=self.rule.standard_errors if self.at_end else 0.0,
+    With a ``significance`` it is the final trial: the gain must be sure at it, over all looks, and
+    large enough, but for a strict rule.
+    """
+    rule, at_end = settings.rule, significance is not None
+    strict = not rule.cvar_alpha
+    counts = looks(FIRST_LOOK, settings.n_new_starts)
+    if at_end:
+        counts = looks(FIRST_FINAL_LOOK, settings.n_final_starts)
+    verdict = Verdict()
+    try:
+        for look in trial.stages(policy, counts):
+            verdict = trial.verdict(
+                INTERIM_LEVEL if significance is None else level_of_look(significance, look),
+                least_gain=settings.least_gain if at_end else 0.0,
+                must_gain=at_end and not strict,
+                tail_errors=rule.standard_errors if at_end else 0.0,
             )
-            if self.at_end and not strict and verdict.accepted:
-                verdict = verdict._replace(reason=self._why_not_enough(scores, mpc, verdict))
-            sure = verdict.is_sure and not (self.at_end and strict)
+            sure = verdict.is_sure and not (at_end and strict)
             if verdict.is_hopeless or (verdict.accepted and sure):
                 break
-        if verdict.accepted:
-            return scores, verdict
-        reason = f"on {len(scores.costs)} new starts, {verdict.reason}"
-        return scores, verdict._replace(reason=reason)
-
-    def _why_not_enough(self, scores: Scores, mpc: Scores, verdict: Verdict) -> str:
-        gained = mpc.costs.mean() - scores.costs.mean()
-        little = not gained >= self.least_gain * np.abs(mpc.costs).mean()
-        if verdict.is_sure and not little:
-            return ""
-        shown = format_distinct(scores.costs.mean(), mpc.costs.mean())
-        return f"mean cost {shown[0]}, MPC {shown[1]}: {TOO_LITTLE if little else 'not sure'}"
-
-    def _extend(self, count: int) -> None:
-        """Let the MPC play more, without those where its own cost is not finite."""
-        missing = count - len(self.new.seeds)
-        if missing <= 0:
-            return
-        seeds = range(self.next_seed, self.next_seed + missing)
-        mpc = self.play(self.mpc, seeds)
-        self.next_seed = seeds.stop
-        finite = np.flatnonzero(np.isfinite(mpc.costs))
-        if len(finite) == 0 and not self.new.seeds:
-            raise ValueError(
-                f"The MPC's own cost is a finite number on none of {missing} new starts of the "
-                "guard's env, so policies cannot be compared there. Its rewards must be finite."
-            )
-        self.new = replace(
-            self.new,
-            seeds=(*self.new.seeds, *(seeds[i] for i in finite)),
-            mpc=self.new.mpc.extended_by(mpc.at(finite)),
-        )
+    except Unplayable as error:
+        return None, Verdict(f"on new starts, {error}")
+    if verdict.accepted:
+        return trial.scores, verdict
+    reason = f"on {len(trial.scores.costs)} new starts, {verdict.reason}"
+    return trial.scores, verdict._replace(reason=reason)
 
 
 def _with_hard_starts(

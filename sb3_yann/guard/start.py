@@ -25,10 +25,8 @@ from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import StartsAsMPC, require_problem_of_twin
 from sb3_yann.rollout import Trajectories, preserve_rng
 
-REPEATED = 2
-"""Starts from which the MPC plays twice: a simulator repeats itself."""
-SAME = 0.01
-"""Of the mean cost: a reward that differs by more is another one."""
+REPEATED = 2  # starts from which the MPC plays twice: a simulator repeats itself
+SAME = 0.01  # of the mean cost: a reward that differs by more is another one
 
 
 def first_evidence(

@@ -26,30 +26,20 @@ from sb3_yann.policy.policies import StartsAsMPC
 Play = Callable[[ActorCheckpoint, Sequence[int]], Scores]
 """From a checkpoint and seeds to the scores of its episodes."""
 Outcome = Literal["accepted", "accepted in part", "rejected"]
-MAX_PASSED = 5
-"""Earlier accepted checkpoints that are kept, at most."""
-MAX_PASSED_BYTES = 10_000_000
-"""Their size, at most."""
+MAX_PASSED = 5  # earlier accepted checkpoints that are kept, at most
+MAX_PASSED_BYTES = 10_000_000  # their size, at most
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What a candidate is compared with.
 
-    Attributes
-    ----------
-    accepted, mpc : ActorCheckpoint
-        The policy accepted last, and the MPC with the weights that it goes on to learn from.
-    starts, scores : Starts and Scores
-        The known starts, hard ones that joined them first; the accepted policy's scores on as many
-        of them as it has played.
-    next_seed, rejections : int, of the next new start; refusals in a row
-    passed : tuple of ActorCheckpoint, the latest last
-        Accepted checkpoints that new starts have confirmed.
-    lost : tuple of int
-        Seeds of the final starts that the accepted policy has lost, which the rule allows.
-    new : Starts or None
-        Those on which policies are confirmed, until one loses there.
+    ``accepted`` is the policy accepted last, ``mpc`` has the weights that it goes on to learn from.
+    ``scores`` are the accepted policy's on as many of the known ``starts`` as it has played, of
+    which hard ones come first. ``passed`` are accepted checkpoints that new starts have confirmed,
+    the latest last; ``rejections`` come in a row. ``lost`` are seeds of final starts that the
+    accepted policy has lost, which the rule allows. Policies are confirmed on ``new`` starts until
+    one loses there; the next one has the seed ``next_seed``.
     """
 
     accepted: ActorCheckpoint
@@ -199,16 +189,9 @@ def relative_change(cost: float, mpc_cost: float) -> float:
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
 
-    Attributes
-    ----------
-    settings : dict, what the evidence depends on
-    evidence : Evidence, what is accepted, and what candidates are compared with
-    max_input_step : ndarray, shape (m,), or None
-        How far inputs may move from one sample to the next.
-    step : float, factor of the actor's learning rate
-    episodes : int, training episodes so far
-    last_trial : int or None, training episodes until the last candidate
-    decisions : list of Decision, all so far
+    ``settings`` are what the evidence depends on. Inputs may move by ``max_input_step`` (m,) from
+    one sample to the next. ``step`` is the factor of the actor's learning rate; ``episodes`` of
+    training are over, and so many were when the last candidate was tried.
     """
 
     settings: dict[str, Any]

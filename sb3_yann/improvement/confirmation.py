@@ -1,129 +1,322 @@
-"""Pairs of episodes, one of the policy and one of the MPC: the plant decides."""
+"""Whether a policy is no worse than the MPC: on every member of a twin, or in pairs in a simulator.
+
+In a simulator pairs of episodes are played until they are decisive: the plant decides.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.compare import (
     LARGEST,
+    AcceptanceRule,
     Difference,
+    PairedTrial,
     Scores,
+    Starts,
+    Tolerance,
     Verdict,
     less_safe,
     level_of_look,
     looks,
+    mean_change,
     no_worse,
+    relative_costs,
+    unsafe_columns,
 )
-from sb3_yann.control.mpc.bound_excess import BoundNames
+from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
 from sb3_yann.improvement.imitation import Inputs, controller_of
-from sb3_yann.improvement.simulator import Simulator, of_law
-from sb3_yann.improvement.trial import RULE, Check
+from sb3_yann.improvement.simulator import Scenarios, Simulator, of_law
+from sb3_yann.rollout import Trajectories
+from sb3_yann.twin.dynamics import law_of
+from sb3_yann.twin.env import RARE
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.plant_twin import PlantTwin
+
+RULE = AcceptanceRule()
+"""When a policy is no worse on the starts that begin as the log does: as a guard has it."""
+MARGIN = 0.01  # what one start around the log may cost more on one member, in mean costs of the MPC
+AROUND, RAREST = 0.005, 10.0
+"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
+many times as much at most where it is rare."""
+FURTHER = 0.01  # how much farther than the MPC a run may leave what the log shows, in its widths
+HARDEST = 40  # scenarios that are planned anew after a check, at most
+NEARLY = 0.5  # A start that loses so much of what it may lose is a hard one
+
+Outcome = tuple[Array, Array]  # costs, and what is unsafe (`unsafe_columns`), of all starts
+
+
+@dataclass(frozen=True)
+class Check:
+    """One comparison with the MPC in the twin.
+
+    Attributes
+    ----------
+    iteration : int
+    accepted : bool
+    reason : str
+        Why not; empty where it was.
+    change : float
+        Mean cost against the MPC's, over all starts and members: -0.02 is 2 % less.
+    worst : float
+        The largest increase of one start on one member, in mean costs of the MPC.
+    safe : bool
+        Whether no start violates more than with the MPC.
+    logged, error : float
+        Mean cost against the MPC's of the episodes that go on as those of the log, and its standard
+        error: over the logged episodes, and over the members. In a simulator: what an episode costs
+        against the MPC's on average, relative to its own cost, and the standard error of that.
+    final : bool
+        Whether it decided in the end.
+    interval : tuple of float, optional
+        Where the change lies, with 90 %. In a simulator over all looks; in a twin on the plant, see
+        :meth:`PlantTwin.forecast`: then ``logged`` and ``error`` are its forecast and half-width.
+    """
+
+    iteration: int
+    accepted: bool
+    reason: str
+    change: float
+    worst: float
+    safe: bool
+    logged: float = 0.0
+    error: float = 0.0
+    final: bool = False
+    interval: tuple[float, float] | None = None
+
+
+@dataclass
+class Trial:
+    """Starts (members, starts, size) on every member of a twin, and what came of the MPC there.
+
+    The first ``n_known`` of each member begin as the log does, the others around it. Each goes on
+    with references and disturbances of the logged episode ``follow`` (starts,); with -1 its own
+    stay.
+    """
+
+    twin: PlantTwin
+    starts: Array
+    n_known: int
+    follow: Any
+    steps: int = field(init=False)
+    given: Array = field(init=False)
+    far: Array = field(init=False)
+    mpc: Outcome = field(init=False)
+
+    @classmethod
+    def draw(cls, twin: PlantTwin, count: int, rng: np.random.Generator) -> Trial:
+        """Return a trial on new starts, the same for every member.
+
+        Those that begin as the log does go on so, one logged episode after the other: a policy that
+        gains at set-points that stay may lose where they change. Every other one has set-points
+        between those of the log, which stay.
+        """
+        starts = twin.starts
+        drawn = np.concatenate([starts.draw_between(count, rng), starts.draw_around(count, rng)])
+        between = twin.dynamics.row.given.start < twin.dynamics.row.given.stop
+        follow = np.full(len(drawn), -1)
+        logged = np.arange(count)[int(between) :: 1 + between]
+        follow[logged] = np.arange(len(logged)) % len(twin.episodes)
+        drawn[logged] = starts.draw(len(logged), rng, follow[logged])
+        rows = np.repeat(drawn[None], len(twin.dynamics.members), axis=0)
+        return cls(twin, rows, count, follow)
+
+    def __post_init__(self) -> None:
+        episodes, part = self.twin.episodes, self.twin.dynamics.row.given
+        self.steps = max(map(len, episodes))
+        self.given = np.repeat(self.starts[:1, :, part], self.steps, axis=0)
+        for number, each in enumerate(episodes):
+            rows = each.thetas[np.minimum(np.arange(self.steps), len(each)), part]
+            self.given[:, self.follow == number] = rows[:, None]
+        self._law = law_of(self.twin.problem)
+        runs = self._run(self._law)
+        self.far = np.nan_to_num(self._beyond(runs[0]), nan=np.inf)
+        self.mpc = self._outcome(*runs)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which of all starts, member by member, begin as the log does."""
+        return np.tile(np.arange(self.starts.shape[1]) < self.n_known, len(self.starts))
+
+    @property
+    def mean(self) -> float:
+        """The MPC's mean cost from the known starts."""
+        return float(np.abs(self.mpc[0][self.known]).mean())
+
+    def play(self, act: Inputs) -> Outcome:
+        """Return what comes of a policy."""
+        return self._outcome(*self._run(act))
+
+    def _outcome(self, thetas: Array, inputs: Array) -> Outcome:
+        twin = self.twin
+        shown = twin.dynamics.row.shown(thetas[:-1])
+        excess = bound_excess(twin.problem, twin.dynamics.row.shown(thetas), inputs)
+        excess = BoundExcess(*(each.ravel() for each in excess))
+        with np.errstate(all="ignore"):
+            costs = (
+                twin.problem.deviations.stage_cost(shown, inputs).sum(axis=0).ravel()
+                + excess.penalty
+            )
+        left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
+        return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
+
+    def _run(self, act: Inputs) -> tuple[Array, Array]:
+        with np.errstate(all="ignore"):
+            return self.twin.dynamics.roll_out(act, self.starts, self.steps, self.given)
+
+    def _beyond(self, thetas: Array) -> Array:
+        """Return how far each run gets beyond what the log shows, in its widths; 0 inside."""
+        limits, x = self.twin.limits, thetas[1:][..., self.twin.dynamics.row.state]
+        over = np.maximum(x - limits.high, limits.low - x) / (limits.high - limits.low)
+        return np.asarray(np.maximum(over, 0.0).max(axis=(0, -1)).ravel())
+
+    def check(self, iteration: int, played: Outcome) -> Check:
+        """Compare a policy with the MPC, by what came of it."""
+        costs, unsafe = played
+        known, mean, excess = self.known, self.mean, costs - self.mpc[0]
+        safe = not np.any(less_safe(unsafe, self.mpc[1]))
+        policy, mpc = (Scores(c[known], u[known]) for c, u in (played, self.mpc))
+        allowed_more = RULE.tolerance(self.mpc[0][known], BoundNames.of(self.twin.problem))
+        reason = no_worse(policy, mpc, mpc, allowed_more).reason
+        logged, error = self._as_logged(excess)
+        if not reason and not logged <= 0:
+            reason = f"episodes like the log's cost {100 * logged / mean:.2g} % more"
+        if not reason and not safe:
+            reason = "a start outside the log breaks a bound of the problem"
+        beyond = (excess - self.room())[~known]
+        if not reason and not np.all(beyond <= 0):
+            reason = f"a start outside the log costs {excess[~known][np.argmax(beyond)]:.4g} more"
+        change, worst = float(excess[known].mean()), float(excess[known].max())
+        shown = change / mean, worst / mean, safe, logged / mean, error / mean
+        return Check(iteration, not reason, reason, *shown)
+
+    def _as_logged(self, excess: Array) -> tuple[float, float]:
+        """Return the mean of the starts that go on as the log does, and its standard error.
+
+        The episodes of the log are a sample of the plant's, the members one of the twins that such
+        a log could have made.
+        """
+        by_member = excess.reshape(self.starts.shape[:2])
+        numbers, count = self.follow[self.follow >= 0], len(self.starts)
+        by_start = by_member[:, self.follow >= 0]
+        means = np.array([by_start[:, numbers == each].mean() for each in np.unique(numbers)])
+        by_episodes = means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else 0.0
+        by_members = by_start.mean(axis=1).std(ddof=1) if count > 1 else 0.0
+        return float(by_start.mean()), float(np.hypot(by_episodes, by_members))
+
+    def room(self) -> Array:
+        """Return what each start may cost more than with the MPC."""
+        chance = self.twin.starts.chance_beyond(self.starts).ravel()
+        rare = np.clip(RARE / np.maximum(chance, 1e-300), 1.0, RAREST)
+        more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
+        return np.asarray(MARGIN * self.mean + more)
+
+    def scenarios(self) -> Scenarios:
+        """Return the starts, in each of which another member acts."""
+        numbers = np.arange(self.starts.shape[1])
+        members = numbers % len(self.starts)
+        return Scenarios(self.twin, members, self.starts[members, numbers], self.given)
+
+    def hard(self, played: Outcome) -> Scenarios | None:
+        """Return the scenarios that a policy loses, or nearly, the worst first; None where none."""
+        loses = (played[0] - self.mpc[0]) / np.maximum(NEARLY * self.room(), 1e-300)
+        loses[np.any(less_safe(played[1], self.mpc[1]), axis=1)] = np.inf
+        worst = np.argsort(-np.nan_to_num(loses, nan=np.inf), kind="stable")
+        worst = worst[~(loses[worst] <= 1)][:HARDEST]
+        if not len(worst):
+            return None
+        members, starts = np.divmod(worst, self.starts.shape[1])
+        return Scenarios(self.twin, members, self.starts[members, starts], self.given[:, starts])
+
 
 FIRST_LOOK = 10  # pairs of a trial between rounds
 LOOKS = looks(FIRST_LOOK, 80)  # pairs after which it is decided, or more are played
 ENOUGH = 40  # pairs that an acceptance takes: the worst 5 % of the starts are two of them
 
 
-@dataclass
-class Pairs:
-    """The same starts with the MPC and with a policy.
+class SimulatorTrial(PairedTrial):
+    """Pairs of episodes in a simulator, one of the MPC and one of a policy, of which it learns.
 
-    Attributes
-    ----------
-    simulator : Simulator
-    seeds : list of int
-    mpc, policy : ndarray, shape (pairs,)
-        Costs.
-    unsafe_of_mpc, unsafe : ndarray, shape (pairs, 9)
-        As :func:`~sb3_yann.compare.unsafe_columns` returns it.
-    episodes : list of Episode or None
-        Those of the policy.
+    ``episodes`` are the policy's, None where one is of no use; ``played`` is what was played last.
     """
 
-    simulator: Simulator
-    seeds: list[int] = field(default_factory=list)
-    mpc: Array = field(default_factory=lambda: np.empty(0))
-    policy: Array = field(default_factory=lambda: np.empty(0))
-    unsafe_of_mpc: Array = field(default_factory=lambda: np.empty((0, 9)))
-    unsafe: Array = field(default_factory=lambda: np.empty((0, 9)))
-    episodes: list[Episode | None] = field(default_factory=list)
-
-    def play(self, act: Inputs | None, seeds: Sequence[int]) -> None:
-        """Add pairs, and let the simulator's model learn of them; without a policy the MPC's."""
-        mpc = self.simulator.play(of_law(self.simulator.problem), seeds)
-        ours = mpc if act is None else self.simulator.play(controller_of(act), seeds)
-        known = np.isfinite(mpc.costs)  # where the MPC's own cost is none, nothing is compared
-        self.seeds += [seed for seed, finite in zip(seeds, known, strict=True) if finite]
-        if not self.seeds:
-            raise ValueError(
-                f"The MPC's own cost is finite in none of {len(seeds)} episodes of the simulator: "
-                "there is nothing to compare with."
-            )
-        self.mpc = np.append(self.mpc, mpc.costs[known])
-        self.policy = np.append(self.policy, ours.costs[known])
-        self.unsafe_of_mpc = np.concatenate([self.unsafe_of_mpc, mpc.unsafe()[known]])
-        self.unsafe = np.concatenate([self.unsafe, ours.unsafe()[known]])
-        self.episodes += [e for e, k in zip(self.simulator.learn(ours), known, strict=True) if k]
-
-    def replay(self, act: Inputs) -> Pairs:
-        """Return the pairs of another policy from the same starts; the MPC's are known."""
-        ours = self.simulator.play(controller_of(act), self.seeds)
-        return replace(
-            self, policy=ours.costs, unsafe=ours.unsafe(), episodes=self.simulator.learn(ours)
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator, self.episodes = simulator, list[Episode | None]()
+        self.played: Trajectories | None = None
+        none = Scores(np.empty(0), np.empty((0, 9)))
+        super().__init__(
+            self._play, None, Starts((), none, Tolerance(0.0)), simulator.new_seeds, self._tolerated
         )
+
+    def _play(self, act: Inputs | None, seeds: Sequence[int]) -> Scores:
+        controller = of_law(self.simulator.problem) if act is None else controller_of(act)
+        self.played = self.simulator.play(controller, seeds)
+        if act is not None:
+            self.episodes += self.simulator.learn(self.played)
+        no_regions = np.zeros((len(self.played.costs), 0), dtype=bool)
+        return Scores(self.played.costs, self.played.unsafe(), no_regions)
+
+    def _tolerated(self, mpc_costs: Array) -> Tolerance:
+        names = BoundNames.of(self.simulator.problem)
+        # A rare loss has been taught: the mean of the worst 5 % decides.
+        return replace(RULE.tolerance(mpc_costs, names), worst_start=np.inf)
+
+    def stages(self, policy: Inputs, counts: Sequence[int]) -> Iterator[int]:
+        """Play a policy from ever more starts; see :class:`PairedTrial`."""
+        self.episodes.clear()
+        return super().stages(policy, counts)
 
     @property
     def relative(self) -> Array:
         """What each costs against the MPC, in its own cost or the MPC's typical one."""
-        own = np.maximum(np.abs(self.mpc), np.median(np.abs(self.mpc)))
-        return np.asarray((self.policy - self.mpc) / np.where(own > 0, own, 1.0))
+        mpc = self.mpc_scores.costs
+        return relative_costs(self.scores.costs - mpc, mpc)
 
     @property
-    def change(self) -> float:
-        """Mean cost against the MPC's: -0.02 is 2 % less."""
-        mean = max(float(np.abs(self.mpc).mean()), 1e-300)
-        return float((self.policy - self.mpc).mean()) / mean
+    def less_safe(self) -> NDArray[np.bool_]:
+        """Which of the policy's episodes are less safe than the MPC's."""
+        return np.asarray(less_safe(self.scores.unsafe, self.mpc_scores.unsafe).any(axis=1))
 
     @property
     def lost(self) -> list[Episode]:
         """The policy's episodes that cost more than with the MPC, or are less safe."""
-        worse = (self.relative > 0) | less_safe(self.unsafe, self.unsafe_of_mpc).any(axis=1)
+        worse = (self.relative > 0) | self.less_safe
         return [e for e, lost in zip(self.episodes, worse, strict=True) if lost and e is not None]
 
-    def verdict(self, level: float) -> Verdict:
-        """Return whether the policy is no worse, and its gain sure, at a level of significance."""
-        names = BoundNames.of(self.simulator.problem)
-        ours, mpc = Scores(self.policy, self.unsafe), Scores(self.mpc, self.unsafe_of_mpc)
-        # A rare loss has been taught: the mean of the worst 5 % decides.
-        tolerance = replace(RULE.tolerance(self.mpc, names), worst_start=np.inf)
-        least = RULE.least_gain
-        return no_worse(ours, mpc, mpc, tolerance, names=self.seeds, level=level, least_gain=least)
-
-    def check(self, number: int, level: float, final: bool) -> Check:
-        """Return what they say of the policy, at a one-sided level of significance."""
-        count, found = len(self.seeds), self.verdict(level)
-        mean = max(float(np.abs(self.mpc).mean()), 1e-300)
-        gain = Difference.of(self.relative)
-        reason = found.reason
-        if not reason and not (self.change <= -RULE.least_gain and found.is_sure):
-            reason = f"{100 * self.change:+.2g} % (± {100 * gain.error:.1g}) in {count} pairs: too "
-            reason += "small a gain, or not sure"
-        worst = float((self.policy - self.mpc).max()) / mean if count else np.inf
-        safe = not less_safe(self.unsafe, self.unsafe_of_mpc).any()
-        of_mean = Difference.of((self.policy - self.mpc) / mean)
-        interval = (of_mean.mean - of_mean.room(level), of_mean.mean + of_mean.room(level))
-        shown = self.change, worst, safe, gain.mean, gain.error
-        return Check(number, not reason, reason, *shown, final=final, interval=interval)
-
     @property
-    def ride_a_bound(self) -> bool:
+    def rides_a_bound(self) -> bool:
         """Whether a hard bound is in force: it is exceeded in some episode, also by the MPC."""
-        return bool(self.unsafe_of_mpc[:, LARGEST].any() or self.unsafe[:, LARGEST].any())
+        both = self.starts.mpc.unsafe, self.scores.unsafe
+        return any(bool(each[:, LARGEST].any()) for each in both)
+
+    def check(self, number: int, level: float, final: bool) -> tuple[Check, Verdict]:
+        """Return what the pairs say of the policy, at a one-sided level of significance."""
+        found = self.verdict(level, least_gain=RULE.least_gain, must_gain=True)
+        mpc = self.mpc_scores.costs
+        more = self.scores.costs - mpc
+        gain = Difference.of(self.relative)
+        mean = max(float(np.abs(mpc).mean()), 1e-300)
+        of_mean = Difference.of(more / mean)
+        room = of_mean.room(level)
+        check = Check(
+            number,
+            found.accepted,
+            found.reason,
+            change=mean_change(more, mpc),
+            worst=float(more.max()) / mean,
+            safe=not self.less_safe.any(),
+            logged=gain.mean,
+            error=gain.error,
+            final=final,
+            interval=(of_mean.mean - room, of_mean.mean + room),
+        )
+        return check, found
 
 
 def confirm(
@@ -132,39 +325,24 @@ def confirm(
     number: int,
     say: Callable[[str, int], None] = lambda text, pairs: None,
     significance: float = RULE.significance,
-) -> tuple[Check, Pairs]:
-    """Play pairs from new starts until they are decisive; return the last look, and all pairs.
+) -> tuple[Check, SimulatorTrial]:
+    """Play pairs from new starts until they are decisive; return the last look, and the trial.
 
     Looks come after 10, 20, 40 and 80 pairs; all together err with a probability of no more than
     ``significance``. A policy that breaks a bound, or does not gain, is refused at the first look
     that shows it. Where a hard bound is in force, acceptance takes all 80: it may be exceeded in
-    few episodes, and that is never traded for cost.
-
-    Parameters
-    ----------
-    act : callable
-        The policy.
-    simulator : Simulator
-        It plays them.
-    number : int
-        Of the check.
-    say : callable
-        Called with what each look shows, and after how many pairs.
-    significance : float
-        Probability that a policy that is no better is accepted.
+    few episodes, and that is never traded for cost. ``say`` is called with what each look
+    shows, and after how many pairs.
     """
-    pairs = Pairs(simulator)
-    for look, count in enumerate(LOOKS, start=1):
-        pairs.play(act, simulator.new_seeds(count - len(pairs.seeds)))
-        level = level_of_look(significance, look)
-        found = pairs.check(number, level, final=True)
-        say(f"{len(pairs.seeds)} pairs: {100 * found.change:+.2f} %", len(pairs.seeds))
-        enough = LOOKS[-1] if pairs.ride_a_bound else ENOUGH
-        if found.accepted and len(pairs.seeds) >= enough:
+    trial = SimulatorTrial(simulator)
+    for look in trial.stages(act, LOOKS):
+        found, verdict = trial.check(number, level_of_look(significance, look), final=True)
+        count = len(trial.starts.seeds)
+        say(f"{count} pairs: {100 * found.change:+.2f} %", count)
+        enough = LOOKS[-1] if trial.rides_a_bound else ENOUGH
+        if (found.accepted and count >= enough) or (not found.accepted and verdict.is_hopeless):
             break
-        if not found.accepted and pairs.verdict(level).is_hopeless:
-            break
-    if found.accepted and len(pairs.seeds) < ENOUGH:
-        few = f"{len(pairs.seeds)} pairs whose costs are finite are too few"
+    if found.accepted and count < ENOUGH:
+        few = f"{count} pairs whose costs are finite are too few"
         found = replace(found, accepted=False, reason=few)
-    return found, pairs
+    return found, trial

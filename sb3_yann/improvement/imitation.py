@@ -1,4 +1,4 @@
-"""Nearly optimal plans in a model, and a policy that learns to do what they do."""
+"""Nearly optimal plans in a model, a policy that learns to do what they do, and its critic."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import less_safe
+from sb3_yann.compare import less_safe, relative_costs
 from sb3_yann.control import LinearMPC
-from sb3_yann.improvement.model import Imagined, Scenarios, task_of
-from sb3_yann.improvement.simulator import of_law
+from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.plan import PAUSE, Planning, Plans, follow
+from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Controller, Rows
+from sb3_yann.twin.env import LearntModel
 
 Inputs = Callable[[Array], Array]
 BATCH = 512  # rows in a step of Adam
@@ -28,27 +29,18 @@ SPREAD = 0.1  # how far they are, in standard deviations of the states in the ep
 FITS = 6  # fits to plans in a model, at most: after each the policy's own states are planned from
 HARDEST = 20  # scenarios that are planned anew after a fit
 NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
+RETURNS = 1000  # states whose returns the critic is fitted to
+RETURN_STEPS = 100  # steps of a return; the MPC's value counts after them
+CRITIC_BATCH = 256  # rows in a step of Adam on the critic
+CRITIC_UPDATES = 200  # steps of Adam on the critic
 
 
 class Teacher:
     """Plans the episodes of a model, and keeps what plans and their feedback do.
 
     Plans are those of :func:`headroom`: differential dynamic programming, which knows neither
-    changes of references nor disturbances before they come.
-
-    Parameters
-    ----------
-    scenarios : Scenarios
-        What is planned.
-    seed : int
-        Of the states beside plans, and of the batches.
-
-    Attributes
-    ----------
-    mpc : Imagined
-        What came of the MPC.
-    best : ndarray, shape (k,)
-        The least cost that a plan or the MPC had in each scenario.
+    changes of references nor disturbances before they come. ``best`` (k,) is the least cost that a
+    plan or the MPC had in each scenario.
     """
 
     def __init__(self, scenarios: Scenarios, seed: int) -> None:
@@ -70,7 +62,7 @@ class Teacher:
         return self.saved(self.best)
 
     def saved(self, costs: Array) -> float:
-        """Return what costs (k,) are below the MPC's on average: see `gain_of`."""
+        """Return what costs (k,) are below the MPC's on average."""
         return gain_of(costs, self.mpc.costs)
 
     def show(self, act: Inputs | None = None, played: Imagined | None = None) -> None:
@@ -122,21 +114,9 @@ class Teacher:
 
 
 class SwitchedController:
-    """A controller from a step of each episode on.
+    """A controller that is planned from a step (k,) of each episode on, never where that is -1.
 
-    Parameters
-    ----------
-    planning : Planning
-        Acts from there on.
-    begins : ndarray of int, shape (k,)
-        The steps; where -1, never.
-    act : callable
-        The policy that acts before.
-
-    Attributes
-    ----------
-    plans : list of dict
-        Those of `Planning` at every step.
+    A policy acts before. ``plans`` are those of :class:`Planning` at every step.
     """
 
     def __init__(self, planning: Planning, begins: NDArray[np.int64], act: Inputs) -> None:
@@ -183,18 +163,11 @@ def imitate(
     return most
 
 
-def units_of(mpc: Array) -> Array:
-    """Return what costs are measured in: the MPC's (k,), at least their median."""
-    finite = np.abs(mpc[np.isfinite(mpc)])
-    typical = max(float(np.median(finite)), 1e-300) if len(finite) else 1.0
-    return np.where(np.isfinite(mpc), np.maximum(np.abs(mpc), typical), typical)
-
-
 def gain_of(costs: Array, mpc: Array) -> float:
-    """Return what costs (k,) are below the MPC's (k,) on average, relative to `units_of` those."""
+    """Return what costs (k,) are below the MPC's (k,) on average, relative to those."""
     finite = np.isfinite(mpc)
-    saved = (mpc[finite] - costs[finite]) / units_of(mpc)[finite]
-    return float(np.mean(saved)) if finite.any() else 0.0
+    more = relative_costs((costs - mpc)[finite], mpc[finite])
+    return float(-more.mean()) if finite.any() else 0.0
 
 
 def fit_layer(
@@ -205,20 +178,9 @@ def fit_layer(
     rng: np.random.Generator,
     updates: int,
 ) -> None:
-    """Fit a layer to inputs at theta: least squares on actions in [-1, 1], with Adam.
+    """Fit a layer to inputs (rows, m) at theta: least squares on actions in [-1, 1], with Adam.
 
-    Parameters
-    ----------
-    layer : LawLayer
-        Its networks go on from where they are.
-    problem : LinearMPC
-        Whose theta and inputs they are.
-    rows, inputs : ndarray, shapes (rows, n_theta) and (rows, m)
-        Rows that are not finite are left out.
-    rng : numpy.random.Generator
-        Draws the batches.
-    updates : int
-        Steps of Adam.
+    Rows that are not finite are left out. The networks go on from where they are.
     """
     low, half = problem.deviations.u_min, problem.u_half
     wanted = np.clip((inputs - low) / half - 1, -1, 1)
@@ -250,3 +212,74 @@ def controller_of(act: Inputs) -> Controller:
         return act(np.where(finite, theta, 0.0))
 
     return controller
+
+
+def refit_critic(policy: StartsAsMPC, twin: LearntModel, seed: int) -> None:
+    """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
+    problem, rng = policy.problem, np.random.default_rng([seed, 2])
+    layer, half = copy.deepcopy(policy.actor.mu).cpu(), problem.u_half
+    members = len(twin.dynamics.members)
+    starts = twin.starts.draw_logged(RETURNS // members * members, rng)
+    seen = twin.dynamics.row.shown(starts)
+    first = policy_of(layer, problem)(seen)
+    # The critic must know its slope in the first input.
+    first = first + 0.1 * half * rng.standard_normal(first.shape)
+    first = np.clip(first, problem.deviations.u_min, problem.deviations.u_max)
+    costs = _discounted(policy, twin, layer, starts, first)
+    options = policy.critic_options
+    returns = options.offset_of_return(policy.gamma) - options.reward_scale * costs
+    known = np.isfinite(returns)
+    if np.count_nonzero(known) < CRITIC_BATCH:  # too few to say anything
+        return
+    scaled = (first - problem.deviations.u_min) / half - 1
+    _fit_critic(policy, seen[known], scaled[known], returns[known], rng)
+    policy.critic_target.load_state_dict(policy.critic.state_dict())
+
+
+def _discounted(
+    policy: StartsAsMPC, twin: LearntModel, layer: LawLayer, at: Array, u: Array
+) -> Array:
+    """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
+    problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
+    shape = len(dynamics.members), -1
+    starts, u = at.reshape(*shape, at.shape[-1]), u.reshape(*shape, problem.model.n_inputs)
+    shown = dynamics.row.shown
+    with np.errstate(all="ignore"):
+        first = dynamics.step(starts, u)
+        rows, inputs = dynamics.roll_out(policy_of(layer, problem), first, RETURN_STEPS)
+        thetas = shown(rows)
+        stage = problem.deviations.stage_cost(thetas[:-1], inputs)
+        end = problem.value_terms(gamma).at(thetas[-1])
+        later = (
+            np.tensordot(gamma ** np.arange(RETURN_STEPS), stage, axes=1)
+            + gamma**RETURN_STEPS * end
+        )
+        # What leaves the log is not known, and may be many times as dear as all the rest.
+        later = np.where(twin.limits.violated(rows).any(axis=0), np.nan, later)
+        return np.asarray(problem.deviations.stage_cost(shown(starts), u) + gamma * later).ravel()
+
+
+def _fit_critic(
+    policy: StartsAsMPC, theta: Array, actions: Array, returns: Array, rng: np.random.Generator
+) -> None:
+    """Take steps of Adam on the critics' squared errors, in units of the returns' spread."""
+    critic, device = policy.critic, policy.device
+    points = th.cat([th.as_tensor(theta), th.as_tensor(actions)], dim=1).to(device)
+    wanted = th.as_tensor(returns, dtype=th.float32)[:, None].to(device)
+    unit = float(np.std(returns)) or 1.0
+    if critic.scales_itself and policy.critic_updates == 0:
+        critic.batch = points
+        critic.scale_values(critic.stage_cost_of_batch())
+    optimizer = th.optim.Adam(critic.parameters(), lr=1e-3)
+    for k in range(CRITIC_UPDATES):
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-3 * (1 - k / CRITIC_UPDATES)
+        rows = th.as_tensor(rng.integers(len(returns), size=CRITIC_BATCH), device=device)
+        optimizer.zero_grad()
+        loss = sum(
+            th.mean(((each - wanted[rows]) / unit) ** 2)  # each quantile where it has several
+            for each in critic.values(points[rows])
+        )
+        loss.backward()  # type: ignore[union-attr]
+        optimizer.step()
+    optimizer.zero_grad()

@@ -21,12 +21,24 @@ from sb3_yann._validation import check_bool, check_int
 from sb3_yann.compare import change_in_percent, summary_lines
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
-from sb3_yann.improvement.confirmation import ENOUGH, FIRST_LOOK, LOOKS, Pairs, confirm
-from sb3_yann.improvement.critic import refit_critic
-from sb3_yann.improvement.imitation import Teacher, imitate, policy_of
-from sb3_yann.improvement.model import Model, Scenarios, SimulatorModel, one_step_error
-from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
-from sb3_yann.improvement.trial import RULE, Check, Trial
+from sb3_yann.improvement.confirmation import (
+    ENOUGH,
+    FIRST_LOOK,
+    LOOKS,
+    RULE,
+    Check,
+    SimulatorTrial,
+    Trial,
+    confirm,
+)
+from sb3_yann.improvement.imitation import Teacher, imitate, policy_of, refit_critic
+from sb3_yann.improvement.simulator import (
+    OutOfStepsError,
+    Scenarios,
+    Simulator,
+    SimulatorModel,
+    one_step_error,
+)
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.checkpoint import all_or_nothing
 from sb3_yann.policy.observations import AffineObservation
@@ -37,6 +49,7 @@ from sb3_yann.policy.policies import (
     require_yann_policy,
 )
 from sb3_yann.rollout import Source, maker, name_of, preserve_rng
+from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.row_layout import RowLayout
@@ -300,15 +313,7 @@ def fingerprint(state: dict[str, th.Tensor]) -> str:
 
 
 class _Progress:
-    """Lines that say what is done: they read as well in a file as on a screen.
-
-    Parameters
-    ----------
-    shown : bool
-        Whether to print them.
-    rounds : int
-        How many there may be.
-    """
+    """Lines that say what is done: they read as well in a file as on a screen."""
 
     def __init__(self, shown: bool, rounds: int) -> None:
         self.shown, self.rounds, self.begun = shown, rounds, time.monotonic()
@@ -338,17 +343,7 @@ class _Progress:
 
 
 class _Work:
-    """The search for a better actor: a copy of a policy's layer, which is given back if it passes.
-
-    Parameters
-    ----------
-    policy : YannPolicy
-        Whose actor and critic are changed, or not.
-    n_starts, rounds, updates, seed : int
-        As for :func:`improve`.
-    say : callable
-        Called with what is done.
-    """
+    """The search for a better actor: a copy of a policy's layer, given back if it passes."""
 
     def __init__(
         self,
@@ -380,7 +375,7 @@ class _Work:
         last = [key for key in weights if key.startswith("network.rest.")][-1]
         self.layer.load_state_dict(weights | {last: share * weights[last]})
 
-    def accept(self, model: Model) -> None:
+    def accept(self, model: LearntModel) -> None:
         """Give the policy the layer as it is, and a critic that knows it."""
         policy = self.policy
         with all_or_nothing(policy):
@@ -496,12 +491,15 @@ class _Work:
             simulator.begin()
             self.keep_margin(simulator.row, simulator.episodes)
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
-            trial = Pairs(simulator)
-            known = self.act() if self.has_learnt else None
-            trial.play(known, simulator.new_seeds(FIRST_LOOK))
+            trial = SimulatorTrial(simulator)
             if self.has_learnt:
-                before = trial.check(0, RULE.significance, final=False)
+                next(trial.stages(self.act(), [FIRST_LOOK]))
+                before, _ = trial.check(0, RULE.significance, final=False)
                 self.checks.append(before)
+            else:
+                trial.extend(FIRST_LOOK)
+                assert trial.played is not None
+                simulator.learn(trial.played)
             best = before.change if before is not None and before.accepted else 0.0
             model, note = self._rounds(simulator, trial, best)
             if not note:
@@ -516,7 +514,9 @@ class _Work:
         found = Improvement(tuple(self.checks), change, accepted, before, "the simulator")
         return replace(found, episodes=simulator.played, steps=simulator.steps, note=note)
 
-    def _taught(self, simulator: Simulator, lost: list[Any], number: int) -> tuple[Model, Teacher]:
+    def _taught(
+        self, simulator: Simulator, lost: list[Any], number: int
+    ) -> tuple[LearntModel, Teacher]:
         """Return a model of all episodes so far, and plans in it: of what was lost first."""
         self.say(f"a model of {len(simulator.episodes)} episodes, and {self.n_starts} plans in it")
         model = SimulatorModel.fit(
@@ -531,7 +531,9 @@ class _Work:
         teacher.show()
         return model, teacher
 
-    def _rounds(self, simulator: Simulator, trial: Pairs, best: float) -> tuple[Model, str]:
+    def _rounds(
+        self, simulator: Simulator, trial: SimulatorTrial, best: float
+    ) -> tuple[LearntModel, str]:
         """Fit, plan and imitate until the simulator shows what the model promised."""
         lost: list[Any] = []
         weights, least, note = self.weights(), best, ""
@@ -542,16 +544,16 @@ class _Work:
                 note = f"plans gain {100 * teacher.gain:.2g} %, too little to teach"
                 break
             promised = imitate(self.layer, teacher, self.updates, self.say)
-            played = trial.replay(self.act())
-            found = played.check(number + 1, RULE.significance, final=False)
+            next(trial.stages(self.act(), [len(trial.starts.seeds)]))
+            found, _ = trial.check(number + 1, RULE.significance, final=False)
             self.checks.append(found)
             self.say.end_of_round()
             self.say(
                 f"round {number + 1} of at most {self.rounds}: the model promises "
                 f"{-100 * promised:+.2f} %, the simulator shows {100 * found.logged:+.2f} %"
-                f" from {len(played.seeds)} starts; plans gain {100 * teacher.gain:.2f} %"
+                f" from {len(trial.scores.costs)} starts; plans gain {100 * teacher.gain:.2f} %"
             )
-            lost, useful = played.lost, found.safe and found.change < least
+            lost, useful = trial.lost, found.safe and found.change < least
             stalls = least < best and found.change > (1 + LITTLE) * least
             if useful:
                 weights, least, note = self.weights(), found.change, ""
@@ -563,25 +565,25 @@ class _Work:
         self.layer.load_state_dict(weights)
         return model, note if least == best else ""
 
-    def _confirm(self, simulator: Simulator, model: Model, best: float) -> bool:
+    def _confirm(self, simulator: Simulator, model: LearntModel, best: float) -> bool:
         """Let the simulator decide; teach what is lost, at most three times, then retreat."""
         for attempt in range(TRIES + 1):
             if attempt == TRIES:
                 self.scale(RETREATS[0], self.weights())
             share = RULE.significance / (TRIES + 1)  # all tries together err with no more
-            found, pairs = confirm(self.act(), simulator, len(self.checks) + 1, self.say, share)
+            found, trial = confirm(self.act(), simulator, len(self.checks) + 1, self.say, share)
             if found.accepted and not found.change < best:
                 found = replace(found, accepted=False, reason="the model's own policy is as good")
             self.checks.append(found)
             self.say(
-                f"confirmation on {len(pairs.seeds)} new starts: {100 * found.change:+.2f} %, "
-                f"{found.reason or 'accepted'}",
+                f"confirmation on {len(trial.scores.costs)} new starts: "
+                f"{100 * found.change:+.2f} %, {found.reason or 'accepted'}",
                 pairs=LOOKS[-1],
             )
             if found.accepted:
                 self.accept(model)
                 return True
             if attempt < TRIES - 1:
-                model, teacher = self._taught(simulator, pairs.lost, self.rounds + attempt)
+                model, teacher = self._taught(simulator, trial.lost, self.rounds + attempt)
                 imitate(self.layer, teacher, self.updates, self.say)
         return False

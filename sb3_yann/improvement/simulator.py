@@ -1,25 +1,32 @@
-"""A simulator that supplies episodes and decides; each of its steps is counted."""
+"""A simulator that supplies episodes and decides, and the model that is learnt from them."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
 from sb3_yann.audit.meaning import (
     below_set_points,
+    in_deviations,
+    require_theta_shown,
     warn_of_order,
     warn_of_own_reward,
     warn_of_signs,
 )
-from sb3_yann.control import LinearMPC
+from sb3_yann.compare import NewSeeds, unsafe_columns
+from sb3_yann.control import LinearMPC, StateEstimator
+from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import (
     Controller,
     EnvPool,
@@ -32,10 +39,11 @@ from sb3_yann.rollout import (
     pool_of,
     rollout,
 )
-from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.log import SHORTEST, Episode
-from sb3_yann.twin.observers import observer_of
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
+from sb3_yann.twin.env import LearntModel
+from sb3_yann.twin.log import SHORTEST, Episode, observer_of
 from sb3_yann.twin.row_layout import RowLayout
+from sb3_yann.twin.selection import fit_ensemble
 
 FIRST = 3_000_000  # seed of the first episode: far from those that people try first
 APART = 1_000_000  # how far the episodes of two seeds are apart
@@ -100,30 +108,9 @@ def _play_there(
 class Simulator:
     """Episodes of a simulator of a problem's plant; none before :meth:`begin`.
 
-    Parameters
-    ----------
-    problem : LinearMPC
-        Of the policy.
-    env : gymnasium.Env, str, callable or VecEnv
-        It takes the problem's inputs in plant units.
-    seed : int
-        Of the episodes.
-    max_steps : int, optional
-        How many it may take in all.
-    observation : callable, optional
-        From what it shows to theta in plant units. By default it shows that.
-
-    Attributes
-    ----------
-    played, seconds : int and float
-        Episodes, and how long they took.
-    episodes : list of Episode
-        What is known of it, in rows of ``row``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is no such env.
+    It takes the problem's inputs in plant units, and ``observation`` makes theta of what it shows;
+    by default it shows that. What is known of it is in ``episodes``, rows of the layout ``row``;
+    ``played`` of them took so many ``seconds``.
     """
 
     def __init__(
@@ -143,7 +130,7 @@ class Simulator:
             self.row, self.unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
             require_spaces(problem, one)
             self.name = str(getattr(one.spec, "id", type(one.unwrapped).__name__))
-        self.next_seed, self.longest = FIRST + APART * seed, 0
+        self.new_seeds, self.longest = NewSeeds(FIRST + APART * seed), 0
         self.episodes: list[Episode] = []
 
     def begin(self) -> None:
@@ -208,12 +195,6 @@ class Simulator:
         """Return how many episodes the steps that are left surely suffice for."""
         left = min(self.counted.most - self.counted.steps, sys.maxsize)
         return int(left) // max(self.longest, 1)
-
-    def new_seeds(self, count: int) -> range:
-        """Return seeds of episodes that nothing has seen."""
-        first = self.next_seed
-        self.next_seed += count
-        return range(first, self.next_seed)
 
     def play(
         self, controller: Controller, seeds: Sequence[int], strict: bool = True
@@ -285,19 +266,7 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
 
 
 def require_repeated(problem: LinearMPC, env: Source | EnvPool, seed: int, cost: float) -> None:
-    """Raise unless the MPC's episode from a seed costs the same again.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Whose theta the env shows.
-    env : gymnasium.Env, str, callable or EnvPool
-        It plays the episode.
-    seed : int
-        Of the episode.
-    cost : float
-        What it cost; what is not finite is not compared.
-    """
+    """Raise unless the MPC's episode from a seed costs the same again; inf is not compared."""
     again = rollout(of_law(problem), env, [seed], problem=problem).costs[0]
     if np.isfinite(cost) and not np.isclose(again, cost, rtol=1e-6, atol=0):
         raise ValueError(
@@ -316,14 +285,7 @@ def of_law(problem: LinearMPC) -> Controller:
 class Excited:
     """The MPC with inputs that are moved at random, each for some steps.
 
-    Parameters
-    ----------
-    problem : LinearMPC
-    seed : int
-    push : float, default 0.5
-        Half-widths by which they are moved at most.
-    often : float, default 0.7
-        Share of the time in which they are.
+    They are moved by ``push`` half-widths at most, for a share ``often`` of the time.
     """
 
     def __init__(
@@ -340,3 +302,189 @@ class Excited:
         moved *= times.random((len(moved), 1)) < self.often
         u = self.law(t, theta, rows) + moved[rows]
         return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))
+
+
+MEMBERS = 2  # networks of a model of a simulator, which repeats its steps
+NOISE = 0.01  # standard deviations of the states: what errs less in most steps has no noise
+LACKING = 0.5  # share of the errors of neighboring steps that is not alike: more is noise
+DOUBT = 10.0  # mean costs of a step for members that differ by a standard deviation of a state
+
+
+def one_step_error(row: RowLayout, episodes: Sequence[Episode]) -> float:
+    """Return how far the given model errs in 95 % of the steps at most, in half-widths of theta.
+
+    It is what the inputs that keep the problem's bounds are computed with.
+    """
+    half, errors = row.problem.theta_half[row.problem.layout.state], []
+    for each in episodes:
+        predicted = np.hstack([each.thetas[:-1], each.actions]) @ row.linear[row.state].T
+        errors.append(np.max(np.abs(each.thetas[1:, row.state] - predicted) / half, axis=1))
+    return float(np.nanquantile(np.concatenate(errors), 0.95))
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorModel(LearntModel):
+    """An ensemble of networks on top of the given model, fitted to a simulator's episodes."""
+
+    @classmethod
+    def fit(
+        cls,
+        problem: LinearMPC,
+        episodes: Sequence[Episode],
+        observer: StateEstimator | None,
+        seed: int,
+    ) -> SimulatorModel:
+        """Return the model of some episodes, in rows of the observer's layout."""
+        coordinates = Coordinates.of(problem, episodes, observer)
+        members = fit_ensemble(coordinates, [episodes] * MEMBERS, seed)
+        return cls(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
+
+    def lacks(self) -> tuple[bool, bool]:
+        """Return whether it errs in most steps, and whether that is more than noise.
+
+        Kinks of a plant show in few. Noise of a step says nothing about that of the nearest one,
+        half of whose squared difference is its variance. What a model lacks is alike in both.
+        """
+        from scipy.spatial import cKDTree
+
+        row, units = self.dynamics.row, self.dynamics.coordinates.units
+        rows = np.concatenate([each.thetas[:-1] for each in self.episodes])
+        inputs = np.concatenate([each.actions for each in self.episodes])
+        after = np.concatenate([each.thetas[1:, row.state] for each in self.episodes])
+        predicted = TwinPlant(self.dynamics).advance(rows, inputs, np.arange(len(rows)))
+        near = self.dynamics.coordinates.nearest(predicted[:, row.state], after)
+        errors = (after - near) / units
+        points = row.features(rows, inputs)
+        points = points / np.maximum(points.std(axis=0), 1e-9)
+        other = cKDTree(points).query(points, k=2)[1][:, 1]
+        apart = float(np.mean((errors - errors[other]) ** 2)) / 2
+        whole = float(np.mean(errors**2))
+        errs = bool(np.median(np.abs(errors), axis=0).max() > NOISE)
+        return errs, errs and apart < LACKING * whole
+
+
+@dataclass(frozen=True, eq=False)
+class Disagreement:
+    """A price on the members' disagreement over a step, in standard deviations of the states.
+
+    One of these costs ``weight``. There are two members or more, and no observer.
+    """
+
+    dynamics: Dynamics
+    weight: float
+
+    def costs(self, thetas: Array, inputs: Array) -> Array:
+        """Return what steps cost (T, k)."""
+        return np.asarray(self.weight * np.sum(self._apart(thetas, inputs) ** 2, axis=-1))
+
+    def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
+        """Return gradients (T, k, n_theta + m) and Gauss-Newton curvatures of that."""
+        shape, apart = thetas.shape[:2], self._apart(thetas, inputs)
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (thetas, inputs))
+        slopes = np.concatenate(self.dynamics.jacobians(*flat), axis=-1)
+        slopes = slopes[..., self.dynamics.row.state, :]
+        slopes = (slopes - slopes.mean(axis=0)) / self._units[:, None]
+        members, rows, n, size = slopes.shape
+        J = np.moveaxis(slopes, 0, 1).reshape(rows, members * n, size)
+        gradient = np.einsum("rqi,rq->ri", J, apart.reshape(rows, -1))
+        curvature = np.swapaxes(J, 1, 2) @ J
+        twice = 2 * self.weight
+        return twice * gradient.reshape(*shape, size), twice * curvature.reshape(*shape, size, size)
+
+    @property
+    def _units(self) -> Array:
+        return np.asarray(self.dynamics.coordinates.units * np.sqrt(len(self.dynamics.members)))
+
+    def _apart(self, thetas: Array, inputs: Array) -> Array:
+        """Return how far each member is from their mean, (T, k, members n)."""
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (thetas, inputs))
+        residual = self.dynamics.residual(*flat)
+        apart = (residual - residual.mean(axis=0)) / self._units
+        return np.asarray(np.moveaxis(apart, 0, 1).reshape(*thetas.shape[:2], -1))
+
+
+def task_of(model: LearntModel, unit: float, priced: bool = True) -> Task:
+    """Return what plans in a model are to minimize; ``unit`` is a typical cost of a step.
+
+    Where it is ``priced``, the members' disagreement costs as well; with an observer it does not.
+    """
+    doubt = None
+    if priced and model.dynamics.row.observer is None:
+        doubt = Disagreement(model.dynamics, DOUBT * unit)
+    end, limits = value_at_end(model.problem), model.limits
+    box = limits.low, limits.high
+    return Task(model.problem, *box, end.P, WEIGHT * unit, doubt, end.slope)
+
+
+@dataclass(frozen=True, eq=False)
+class Imagined:
+    """Episodes that were played in a model, side by side.
+
+    ``rows`` (T + 1, k, size), ``thetas`` (T + 1, k, n_theta), ``inputs`` (T, k, m), ``costs`` (k,)
+    with the penalty of soft bounds, and ``unsafe`` (k, 9) of
+    :func:`~sb3_yann.compare.unsafe_columns`.
+    """
+
+    rows: Array
+    thetas: Array
+    inputs: Array
+    costs: Array
+    unsafe: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scenarios:
+    """Starts (k, size), and references and measured disturbances ``given`` (T, k, p) after them.
+
+    ``members`` (k,) act in them, by default their mean.
+    """
+
+    model: LearntModel
+    members: NDArray[np.intp] | None
+    starts: Array
+    given: Array
+
+    @classmethod
+    def like(
+        cls, model: LearntModel, episodes: Sequence[Episode], rng: np.random.Generator
+    ) -> Scenarios:
+        """Return scenarios like some episodes, with their references and disturbances.
+
+        Every other one begins as its episode did, the others in the box of all first states.
+        """
+        row, steps, n = model.dynamics.row, max(map(len, episodes)), model.problem.model.n_states
+        thetas = row.shown(np.array([each.thetas[0] for each in episodes])).copy()
+        moved = thetas[1::2, :n]
+        thetas[1::2, :n] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
+        given = [e.thetas[np.minimum(np.arange(steps), len(e)), row.given] for e in episodes]
+        return cls(model, None, row.begin(thetas), np.stack(given, axis=1))
+
+    @cached_property
+    def plant(self) -> TwinPlant:
+        """What acts in them."""
+        return TwinPlant(self.model.dynamics, self.members)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.starts)
+
+    def play(self, controller: Controller) -> Imagined:
+        """Return the episodes of a controller."""
+        problem, row = self.model.problem, self.model.dynamics.row
+        steps, k = self.given.shape[:2]
+        rows, numbers = np.empty((steps + 1, *self.starts.shape)), np.arange(k)
+        inputs = np.empty((steps, k, problem.model.n_inputs))
+        rows[0] = self.starts
+        low, high = problem.deviations.u_min, problem.deviations.u_max
+        with np.errstate(all="ignore"):
+            for t in range(steps):
+                rows[t][:, row.given] = self.given[t]
+                u = np.asarray(controller(t, row.shown(rows[t]), numbers))
+                inputs[t] = np.clip(np.nan_to_num(u), low, high)
+                rows[t + 1] = self.plant.advance(rows[t], inputs[t], numbers)
+            thetas = row.shown(rows)
+            excess = bound_excess(problem, thetas, inputs)
+            costs = problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
+        lost = ~(np.isfinite(costs) & np.isfinite(thetas).all(axis=(0, 2)))
+        costs = np.where(lost, np.inf, costs)
+        return Imagined(rows, thetas, inputs, costs, unsafe_columns(0, 0, lost, excess))

@@ -26,7 +26,6 @@ from sb3_yann.policy.observations import (
     require_outermost,
     statistics_of,
 )
-from sb3_yann.twin.replay_buffer import LOST_STATISTICS
 from sb3_yann.units import ActionUnits
 from sb3_yann_envs.spaces import resolve_reference
 
@@ -34,6 +33,11 @@ _registered: dict[str, LinearMPC | Callable[[], LinearMPC] | str] = {
     "CSTR-v0": "sb3_yann_envs.problems:cstr",
     "ClippedPendulum-v0": "sb3_yann_envs.problems:clipped_pendulum",
 }
+LOST_STATISTICS = (
+    "The model takes observations as a VecNormalize shows them, and its env has none: Stable-"
+    "Baselines3 saves its statistics apart. Keep them with venv.save(path), and load the model "
+    "with env=VecNormalize.load(path, venv)."
+)
 
 
 def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | str) -> None:

@@ -126,8 +126,6 @@ class FiniteRows:
         total = sum(float(np.vdot(part, part)) for part in parts)
         sure = 1e36  # sums of squares up to this are of entries that are finite in float32
         if total < sure or not (found := _not_finite(buffer, parts)):  # nor is NaN below it
-            if (simulated := vars(buffer).get("simulated")) is not None:
-                simulated[buffer.pos] = False
             type(buffer).add(buffer, obs, next_obs, action, reward, done, infos)
             return
         self.left_out += 1

@@ -17,7 +17,7 @@ from scipy import stats
 from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.meaning import misread_in_words
+from sb3_yann.audit.meaning import misread_states
 from sb3_yann.compare import INPUT_STEP, less_safe
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
@@ -121,7 +121,7 @@ def loops_part(subject: Subject) -> Part:
         "Episodes in which the policy violates more than the MPC, ends sooner, or has no finite "
         f"cost: {bad} of {count}.",
     )
-    if words := misread_in_words(subject.problem, *mpc.steps()):
+    if words := misread_states(subject.problem, *mpc.steps()):
         return Part(title, content, (finding, make_finding(False, words)))
     return Part(title, content, (finding,))
 

@@ -31,22 +31,17 @@ CLEARLY_BETTER = 0.25
 """Another reading of a log counts where it leaves less than so much of the squared error."""
 EXACT_SHARE = 4e-4
 """A regression that leaves less of an input's variance explains all of it: 2 % of its deviation."""
-DITHERED_SHARE = 0.7
-"""The most of an input's variance that a dither on top of the law may be."""
+DITHERED_SHARE = 0.7  # the most of an input's variance that a dither on top of the law may be
 SLOPE_TOLERANCE = 0.1
 """How far from one the slope of an input on the law may be: sensors' noise lowers it."""
 LEAST_GAIN = 0.6
 """A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
 RUN, MUCH_BETTER = 10, 0.8
 """Steps of a run of the model; share of its squared error that a unit's factor leaves at most."""
-ROUNDING = 1e-9
-"""Of a half-width: an input that moves by less stands still."""
-MOVING = 1e-3
-"""Of a standard deviation: a state that moves by more in a step moves."""
-PACES = 1, 2, 3, 4, 5
-"""So many samples of the model may lie between two rows."""
-LEAST_ROWS = 20
-"""Rows of a regression on the law, at least."""
+ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
+MOVING = 1e-3  # of a standard deviation: a state that moves by more in a step moves
+PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
+LEAST_ROWS = 20  # rows of a regression on the law, at least
 CONFIRM = (
     "If its units were checked, and the plant or its controller is so: "
     "PlantTwin.fit(..., units_confirmed=True)."
@@ -71,15 +66,8 @@ def objections(
 ) -> list[str]:
     """Return what speaks against the rows, columns, signs or units of a log.
 
-    Parameters
-    ----------
-    problem, coordinates : LinearMPC and Coordinates
-        Of the twin.
-    episodes : tuple of Episode
-        The log.
-    units_confirmed : bool, default False
-        Whether somebody has checked the log's units: then another gain, zero or pace than the
-        model's is the plant's own, and another law is another controller's.
+    Where its units are confirmed another gain, zero or pace than the model's is the plant's own,
+    and another law is another controller's.
     """
     log = _Log(problem, coordinates, episodes, units_confirmed)
     readings = {s: _on_law(log, s) for s in ROW_NAMES}
@@ -99,20 +87,12 @@ def objections(
 
 @dataclass(frozen=True)
 class _OnLaw:
-    """Each logged input j regressed on each column i of the law, some rows away.
+    """Each logged input j regressed on each column i of the law, some rows away, at [i, j].
 
-    Attributes
-    ----------
-    slope, offset, error : ndarray, shape (m, m)
-        Of column i for input j at [i, j]; the standard error is the slope's.
-    left : ndarray, shape (m, m)
-        Share of the input's variance that the regression leaves.
-    left_of_rows : ndarray, shape (m, m)
-        Share that theta would leave besides, were all that it adds chance.
-    deviation, offset_room : ndarray, shape (m, m)
-        The input's standard deviation, and four standard errors of the offset.
-    unique : ndarray, shape (m,)
-        Whether the law is more than a multiple of one entry of theta.
+    ``slope`` has the standard ``error``; the regression leaves a share ``left`` of the input's
+    variance, and would leave ``left_of_rows`` with theta besides, were all that it adds chance.
+    ``offset_room`` is four standard errors of the offset. ``unique`` (m,): the law is more than a
+    multiple of one entry of theta.
     """
 
     slope: Array
@@ -458,19 +438,10 @@ def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
 class _Effects:
     """A regression of the next states on states and inputs.
 
-    Attributes
-    ----------
-    B : ndarray, shape (n, m)
-    covariance : ndarray, shape (n, n)
-        Of what it leaves.
-    factors : ndarray, shape (m,)
-        Standard errors of a column of B over the deviation of what is left.
-    left : ndarray, shape (n,)
-        Mean squares of that.
-    drift, drift_error : ndarray, shape (n,)
-        The next state of x = 0 and u = 0, and its standard error.
-    follows : ndarray, shape (m,)
-        Deviation of the inputs that the states leave, relative to their own.
+    It finds B (n, m), leaves the ``covariance`` (n, n) and the mean squares ``left`` (n,).
+    ``factors`` (m,) are standard errors of a column of B over the deviation of what is left.
+    ``drift`` (n,) is the next state of x = 0 and u = 0. ``follows`` (m,) is the deviation of the
+    inputs that the states leave, relative to their own.
     """
 
     B: Array

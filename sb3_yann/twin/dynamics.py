@@ -1,4 +1,8 @@
-"""The linear model plus a residual, bounded outside the data: what a twin steps with."""
+"""The dynamics of a twin: the linear model, and what the plant does beyond it.
+
+A residual is a function of states, disturbances and inputs in scaled coordinates: see
+:class:`Coordinates`.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,80 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.row_layout import RowLayout
 
-MARGIN = 0.25
-"""How far the residual reaches beyond the data, in widths of the data."""
+
+class Residual:
+    """``y = tanh(tanh(z W1 + b1) W2 + b2) W3 + b3 + z L + z' Q z``.
+
+    Without hidden units it is a polynomial, and without L, Q and b3 the linear model as it is.
+    Weights are W1 (k, h), b1 (1, h), W2 (h, h), b2 (1, h), W3 (h, n), b3 (1, n), L (k, n) and Q (k,
+    k n), which is symmetric for each of the n. Those of several residuals have an axis of the
+    members before all else.
+    """
+
+    def __init__(self, weights: Sequence[Array]) -> None:
+        self.weights = tuple(weights)
+        self.is_polynomial = self.weights[0].shape[-1] == 0
+        self._is_linear = not np.any(self.weights[7])
+
+    @classmethod
+    def polynomial(cls, L: Array, b: Array | None = None, Q: Array | None = None) -> Residual:
+        """Return ``z L + b + z' Q z`` for L (k, n), b (n,) and a symmetric Q (k, k, n)."""
+        k, n = L.shape
+        hidden = np.zeros((k, 0)), np.zeros((1, 0)), np.zeros((0, 0)), np.zeros((1, 0))
+        constant = np.zeros(n) if b is None else b
+        quadratic = np.zeros((k, k, n)) if Q is None else Q
+        return cls([*hidden, np.zeros((0, n)), constant[None], L, quadratic.reshape(k, k * n)])
+
+    @classmethod
+    def zero(cls, k: int, n: int) -> Residual:
+        """Return zeros (n,) for k features."""
+        return cls.polynomial(np.zeros((k, n)))
+
+    @classmethod
+    def stack(cls, members: Sequence[Residual]) -> Residual:
+        """Return several as one, from z (members, batch, k) to (members, batch, n)."""
+        return cls([np.array(each) for each in zip(*(m.weights for m in members), strict=True)])
+
+    def _hidden(self, z: Array) -> tuple[Array, Array]:
+        W1, b1, W2, b2 = self.weights[:4]
+        first = np.tanh(z @ W1 + b1)
+        return first, np.tanh(first @ W2 + b2)
+
+    def _bent(self, z: Array) -> Array:
+        """Return ``Q z``, (..., batch, k, n)."""
+        found = z @ self.weights[7]
+        return np.asarray(found.reshape(*found.shape[:-1], z.shape[-1], -1))
+
+    def predict(self, z: Array) -> Array:
+        """Return the residual (..., batch, n) at z (..., batch, k)."""
+        W3, b3, L = self.weights[4:7]
+        found = z @ L + b3
+        if not self._is_linear:
+            found = found + np.sum(z[..., None] * self._bent(z), axis=-2)
+        if not self.is_polynomial:
+            found = found + self._hidden(z)[1] @ W3
+        return np.asarray(found)
+
+    def jacobian(self, z: Array) -> Array:
+        """Return its derivatives (..., batch, n, k)."""
+        W1, _, W2, _, W3, _, L, _ = (np.swapaxes(each, -1, -2) for each in self.weights)
+        batch = np.broadcast_shapes(z.shape[:-1], (*L.shape[:-2], 1))
+        found = np.broadcast_to(L[..., None, :, :], (*batch, *L.shape[-2:]))
+        if not self._is_linear:
+            found = found + 2 * np.swapaxes(self._bent(z), -1, -2)
+        if self.is_polynomial:
+            return np.asarray(found)
+        first, second = self._hidden(z)
+        rows = W3[..., None, :, :] * (1 - second**2)[..., None, :]  # (..., batch, n, h)
+        flat = rows.reshape(*rows.shape[:-3], -1, rows.shape[-1]) @ W2
+        rows = flat.reshape(rows.shape) * (1 - first**2)[..., None, :]
+        flat = rows.reshape(*rows.shape[:-3], -1, rows.shape[-1]) @ W1
+        return np.asarray(flat.reshape(*rows.shape[:-1], -1) + found)
+
+
+MARGIN = 0.25  # how far the residual reaches beyond the data, in widths of the data
 FULL_TURNS = 2 * np.pi, 360.0
 """By which an angle jumps that is shown between two ends, such as -pi and pi."""
 
@@ -24,19 +97,10 @@ FULL_TURNS = 2 * np.pi, 360.0
 class Coordinates:
     """Where the data are: what residuals are fed is scaled by it, and never lies far outside.
 
-    Attributes
-    ----------
-    low, high : ndarray, shape (k,)
-        The box of the logged ``[x, d, u]``, or ``[x, u]`` where an observer estimates d, a quarter
-        of its width beyond the data.
-    scale : ndarray, shape (k,)
-        The largest magnitudes.
-    units : ndarray, shape (n,)
-        How far the states move in the log: standard deviations.
-    row : RowLayout
-        What a row of the twin holds: theta alone, unless an observer is a part of it.
-    turn : ndarray, shape (n,), optional
-        A full turn for each state that is an angle and jumps by it, 0 for the others.
+    ``low`` and ``high`` (k,) are the box of the logged ``[x, d, u]``, or ``[x, u]`` where an
+    observer estimates d, a quarter of its width beyond the data; ``scale`` the largest magnitudes;
+    ``units`` (n,) how far the states move in the log: standard deviations. ``turn`` (n,) is a full
+    turn for each state that is an angle and jumps by it, 0 for the others.
     """
 
     low: Array
@@ -122,13 +186,6 @@ class Dynamics:
 
     Where an observer estimates d, a row holds what it remembers behind theta: see
     :class:`RowLayout`. It steps with the plant.
-
-    Attributes
-    ----------
-    problem : LinearMPC
-    coordinates : Coordinates
-    members : tuple of Residual
-        One for each member, all of the same kind.
     """
 
     problem: LinearMPC
@@ -180,21 +237,11 @@ class Dynamics:
 
         References and disturbances are those of the log at each step.
         """
-        parts, n = self.row, self.problem.model.n_states
-        theta = np.broadcast_to(
-            episode.thetas[starts], (len(self.members), len(starts), parts.size)
-        )
-        theta, found = theta.copy(), np.empty((len(self.members), len(starts), steps + 1, n))
-        for k in range(steps + 1):
-            found[:, :, k] = theta[..., parts.state]
-            if k == steps:
-                break
-            theta[..., parts.given] = episode.thetas[starts + k][:, parts.given]
-            u = np.broadcast_to(
-                episode.actions[starts + k], (*theta.shape[:2], len(self.problem.R))
-            )
-            theta = self.step(theta, u)
-        return found
+        times = starts + np.arange(steps)[:, None]
+        begin = np.repeat(episode.thetas[starts][None], len(self.members), axis=0)
+        given = episode.thetas[times][..., self.row.given]
+        rows, _ = self._run(lambda t, _: episode.actions[times[t]], begin, steps, given)
+        return np.moveaxis(rows[..., self.row.state], 0, 2)
 
     def roll_out(
         self,
@@ -205,32 +252,15 @@ class Dynamics:
     ) -> tuple[Array, Array]:
         """Return rows (steps + 1, members, batch, size) and inputs (steps, ...) of a policy.
 
-        Parameters
-        ----------
-        act : callable
-            From theta (rows, n_theta) to inputs (rows, m).
-        starts : ndarray, shape (members, batch, size)
-            Where the runs begin.
-        steps : int
-            How long they are.
-        given : ndarray, shape (steps, batch, p), optional
-            References and measured disturbances at each step. The default is that they stay.
+        ``starts`` are (members, batch, size), ``given`` (steps, batch, p) references and measured
+        disturbances at each step; by default they stay.
         """
-        k, batch, size = starts.shape
-        thetas, inputs = np.empty((steps + 1, *starts.shape)), np.empty((steps, k, batch, self.m))
-        thetas[0] = starts
-        for t in range(steps):
-            if given is not None:
-                thetas[t][..., self.row.given] = given[t]
-            u = np.asarray(act(self.row.shown(thetas[t].reshape(-1, size))), np.float64)
-            inputs[t] = u.reshape(k, batch, self.m)
-            thetas[t + 1] = self.step(thetas[t], inputs[t])
-        return thetas, inputs
 
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return self.problem.model.n_inputs
+        def inputs(t: int, rows: Array) -> Array:
+            u = np.asarray(act(self.row.shown(rows.reshape(-1, rows.shape[-1]))), np.float64)
+            return u.reshape(*rows.shape[:2], self.m)
+
+        return self._run(inputs, starts, steps, given)
 
     def replay_in_closed_loop(self, episode: Episode) -> Array:
         """Return the predicted costs (members,) of a whole episode.
@@ -238,15 +268,34 @@ class Dynamics:
         The inputs are the logged ones, corrected by what the law makes of the deviation of the
         state: where the law made the log, it acts on its own predictions.
         """
-        parts, law = self.row, law_of(self.problem)
-        u_min, u_max = self.problem.deviations.u_min, self.problem.deviations.u_max
-        logged = law(parts.shown(episode.thetas[:-1]))
-        theta = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
-        costs = np.zeros(len(self.members))
-        for k in range(len(episode)):
-            theta[..., parts.given] = episode.thetas[k, parts.given]
-            correction = law(parts.shown(theta[:, 0])) - logged[k]
-            u = np.clip(episode.actions[k] + correction, u_min, u_max)[:, None]
-            costs += self.problem.deviations.stage_cost(parts.shown(theta), u)[:, 0]
-            theta = self.step(theta, u)
-        return costs
+        row, law, own = self.row, law_of(self.problem), self.problem.deviations
+        logged = law(row.shown(episode.thetas[:-1]))
+
+        def inputs(t: int, rows: Array) -> Array:
+            correction = law(row.shown(rows[:, 0])) - logged[t]
+            return np.clip(episode.actions[t] + correction, own.u_min, own.u_max)[:, None]
+
+        begin = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
+        given = episode.thetas[:-1, None, row.given]
+        rows, u = self._run(inputs, begin, len(episode), given)
+        costs = own.stage_cost(row.shown(rows[:-1]), u)
+        return np.asarray(costs[..., 0].sum(axis=0))
+
+    def _run(
+        self, inputs: Callable[[int, Array], Array], starts: Array, steps: int, given: Array | None
+    ) -> tuple[Array, Array]:
+        """Return rows and inputs as :meth:`roll_out` does, of inputs at a step and its rows."""
+        rows = np.empty((steps + 1, *starts.shape))
+        taken = np.empty((steps, *starts.shape[:2], self.m))
+        rows[0] = starts
+        for t in range(steps):
+            if given is not None:
+                rows[t][..., self.row.given] = given[t]
+            taken[t] = inputs(t, rows[t])
+            rows[t + 1] = self.step(rows[t], taken[t])
+        return rows, taken
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.problem.model.n_inputs

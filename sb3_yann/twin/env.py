@@ -1,7 +1,9 @@
-"""A twin as a Gymnasium env, with the plant's spaces."""
+"""Episodes of a twin: where they begin, what is a violation there, and a Gymnasium env of it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -10,15 +12,214 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_int
 from sb3_yann.compare import EXCESS_ROOM
-from sb3_yann.control import StateEstimator
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import bound_excess
-from sb3_yann.twin.dynamics import Dynamics
-from sb3_yann.twin.limits import Limits
+from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, Residual, law_of
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.starts import Starts
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann_envs.spaces import ProblemBox
 
+AROUND, WIDEST, RARE = 3.0, 2.0, 0.05
+"""How many boxes wide starts are drawn at most; how much wider than the log's starts their box is
+at most; how likely a start is, in one coordinate, beyond what the log shows."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """The box of first states, and the logged rows.
+
+    The box is that of a uniform distribution, estimated without bias from the first states of the
+    log: with k of them it is (k + 1) / (k - 1) times as wide as they are, twice at most. ``first``
+    and ``rows`` are the first row of each episode, and all of them.
+    """
+
+    problem: LinearMPC
+    low: Array
+    high: Array
+    first: Array
+    rows: Array
+    observer: StateEstimator | None = None
+
+    @classmethod
+    def of(
+        cls,
+        problem: LinearMPC,
+        episodes: tuple[Episode, ...],
+        observer: StateEstimator | None = None,
+    ) -> Starts:
+        """Return those of a log."""
+        first = np.array([each.thetas[0] for each in episodes])
+        rows = np.concatenate([each.thetas[:-1] for each in episodes])
+        n = problem.model.n_states
+        x, k = first[:, :n], len(first)
+        middle, half = (x.max(0) + x.min(0)) / 2, (x.max(0) - x.min(0)) / 2
+        half = half * _widened(k)
+        low = np.maximum(middle - half, problem.deviations.theta_min[:n])
+        high = np.minimum(middle + half, problem.deviations.theta_max[:n])
+        return cls(problem, low, high, first, rows, observer)
+
+    @cached_property
+    def row(self) -> RowLayout:
+        """What a row holds."""
+        return RowLayout(self.problem, self.observer)
+
+    @property
+    def shown(self) -> tuple[Array, Array]:
+        """The box of theta (n_theta,), twice, that the log shows: all rows, and where it may begin.
+
+        Beyond the latter, in one coordinate, lies one start in twenty: see :meth:`chance_beyond`.
+        """
+        first, rows, k = self.row.shown(self.first), self.row.shown(self.rows), len(self.first)
+        low, high = first.min(0), first.max(0)
+        ranges = 2 * (2 / (k + 1) / RARE) ** (1 / max(k - 1, 1)) - 1
+        further = (high - low) / 2 * max(ranges - 1, 0.0)
+        low, high = np.minimum(rows.min(0), low - further), high + further
+        return low, np.maximum(rows.max(0), high)
+
+    def draw(self, count: int, rng: np.random.Generator, episodes: Any = None) -> Array:
+        """Return rows (count, size) where episodes begin: in the box, the rest as logged.
+
+        Numbers of ``episodes`` (count,) say in which of them; by default they are drawn.
+        """
+        if episodes is None:
+            episodes = rng.integers(len(self.first), size=count)
+        drawn = self.first[episodes]
+        drawn[:, : len(self.low)] = rng.uniform(self.low, self.high, (count, len(self.low)))
+        return self.row.begin(drawn)
+
+    def draw_between(self, count: int, rng: np.random.Generator) -> Array:
+        """Return rows (count, size) where episodes begin, at other set-points as well.
+
+        Every other one has references and disturbances from the box that the log shows: what
+        passes at the few of the log may fail between them.
+        """
+        drawn, layout = self.draw(count, rng), self.problem.layout
+        if not layout.has_constants:
+            return drawn
+        held, some = self.row.given, drawn[::2].copy()
+        low, high = np.clip(
+            self.shown, self.problem.deviations.theta_min, self.problem.deviations.theta_max
+        )
+        some[:, held] = rng.uniform(low[held], high[held], some[:, held].shape)
+        inside = self.problem.law().in_domain(self.row.shown(some))
+        drawn[::2][inside] = some[inside]
+        return drawn
+
+    def draw_logged(self, count: int, rng: np.random.Generator) -> Array:
+        """Return rows (count, size) from amid the log."""
+        return self.rows[rng.integers(len(self.rows), size=count)]
+
+    def draw_around(self, count: int, rng: np.random.Generator) -> Array:
+        """Return rows (count, size) from boxes up to three times as wide: nothing is known.
+
+        How wide is drawn evenly, and wider where :meth:`chance_beyond` says so: the fewer starts
+        there are in the log, the wider. Those that the law has no solution for are replaced by
+        logged ones.
+        """
+        drawn, n, k = self.draw_between(count, rng), len(self.low), len(self.first)
+        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        nearest = (1 + _widened(k)) / 2
+        ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
+        wide = np.maximum(ranges / _widened(k), rng.uniform(1, AROUND, (count, 1)))
+        reach = np.minimum(wide, AROUND) * half
+        drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
+        shown = np.clip(
+            self.row.shown(drawn),
+            self.problem.deviations.theta_min,
+            self.problem.deviations.theta_max,
+        )
+        outside, drawn = ~self.problem.law().in_domain(shown), self.row.begin(shown)
+        drawn[outside] = self.draw_logged(int(outside.sum()), rng)
+        return drawn
+
+    def chance_beyond(self, thetas: Array) -> Array:
+        """Return how likely a start lies so far out or farther, in one coordinate: (...,).
+
+        For rows (..., size), in the one that lies farthest out. Of k draws from a uniform
+        distribution the next one lies beyond ``rho`` times their range with probability
+        ``2 / (k + 1) ((1 + rho) / 2) ** (1 - k)``: spacings are exchangeable.
+        """
+        n, k = len(self.low), len(self.first)
+        x, seen = thetas[..., :n], self.first[:, :n]
+        middle, half = (self.high + self.low) / 2, np.ptp(seen, axis=0) / 2
+        rho = (np.abs(x - middle) / np.maximum(half, 1e-300)).max(axis=-1)
+        return np.asarray(2 / (k + 1) * ((1 + np.maximum(rho, 1.0)) / 2) ** (1.0 - k))
+
+
+def _widened(k: int) -> float:
+    """Return how many times as wide as the range of k starts their box is."""
+    return min(WIDEST, (k + 1) / max(k - 1, 1))
+
+
+ROUNDING = 1e-9
+PLANNED = 200  # runs of the MPC on its own model that tell where it means to go
+
+
+@dataclass(frozen=True)
+class Limits:
+    """A box of states; beyond it is a violation."""
+
+    problem: LinearMPC
+    low: Array
+    high: Array
+    row: RowLayout
+
+    @classmethod
+    def of(cls, problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> Limits:
+        """Return the data's neighborhood, with the starts, as far as hard bounds let it.
+
+        With set-points or disturbances also that of where the MPC would take its own model: the log
+        of a worn plant, which rests beside its set-points, does not show that.
+        """
+        n, soft = problem.model.n_states, problem.soft.x > 0
+        low, high = coordinates.low[:n], coordinates.high[:n]
+        planned = [_planned(problem, coordinates, starts)] if problem.layout.has_constants else []
+        for least, most in [(starts.low, starts.high), *planned]:
+            width = MARGIN * (most - least)
+            low, high = np.minimum(low, least - width), np.maximum(high, most + width)
+        room = ROUNDING * problem.theta_half[:n]
+        bounded = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min))
+        limited = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max))
+        return cls(problem, bounded - room, limited + room, coordinates.row)
+
+    def violated(self, thetas: Array) -> NDArray[np.bool_]:
+        """Return whether states lie beyond, for rows (..., size); NaN does."""
+        x = thetas[..., self.row.state]
+        inside = (x >= self.low) & (x <= self.high)
+        return np.asarray(~inside.all(axis=-1))
+
+
+def _planned(problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
+    """Return the box of the MPC's runs on its own model: as long as the log's, from its starts."""
+    n, steps = problem.model.n_states, len(starts.rows) // len(starts.first)
+    model = Dynamics(problem, coordinates, (Residual.zero(len(coordinates.scale), n),))
+    first = starts.draw(PLANNED, np.random.default_rng(0))
+    rows = model.roll_out(law_of(problem), first[None], steps)[0]
+    x = rows[..., coordinates.row.state].reshape(-1, n)
+    least, most = problem.deviations.theta_min[:n], problem.deviations.theta_max[:n]
+    return np.clip(x.min(axis=0), least, most), np.clip(x.max(axis=0), least, most)
+
+
 Single = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LearntModel:
+    """Dynamics of a plant, and the episodes, in rows of their layout, that taught them."""
+
+    problem: LinearMPC
+    episodes: tuple[Episode, ...]
+    dynamics: Dynamics
+
+    @cached_property
+    def starts(self) -> Starts:
+        """Where episodes begin."""
+        return Starts.of(self.problem, self.episodes, self.dynamics.row.estimator)
+
+    @cached_property
+    def limits(self) -> Limits:
+        """Where it holds, and the problem's own bounds of the states."""
+        return Limits.of(self.problem, self.dynamics.coordinates, self.starts)
 
 
 class TwinEnv(gym.Env[Single, Single]):
@@ -37,14 +238,8 @@ class TwinEnv(gym.Env[Single, Single]):
 
     Parameters
     ----------
-    dynamics : Dynamics
-        The members.
-    episodes : tuple of Episode
-        The log.
-    starts : Starts
-        Where episodes begin.
-    limits : Limits
-        Beyond which there is a violation.
+    model : LearntModel
+        The members, and the log.
     member : int, optional
         The member that acts; by default the seed of an episode decides: seed modulo members.
     """
@@ -52,19 +247,12 @@ class TwinEnv(gym.Env[Single, Single]):
     metadata: dict[str, Any] = {"render_modes": []}
     observation_space: ProblemBox
 
-    def __init__(
-        self,
-        dynamics: Dynamics,
-        episodes: tuple[Episode, ...],
-        starts: Starts,
-        limits: Limits,
-        member: int | None = None,
-    ) -> None:
-        members = len(dynamics.members)
+    def __init__(self, model: LearntModel, member: int | None = None) -> None:
+        members = len(model.dynamics.members)
         if member is not None and check_int("member", member, 0) >= members:
             raise ValueError(f"member = {member} must be below {members}, how many there are.")
-        self.dynamics, self.episodes, self.starts, self.limits = dynamics, episodes, starts, limits
-        self.member, self.render_mode, problem = member, None, dynamics.problem
+        self.model, self.dynamics, problem = model, model.dynamics, model.problem
+        self.member, self.render_mode = member, None
         low, high = (each.astype(np.float32) for each in (problem.theta_min, problem.theta_max))
         self.observation_space = ProblemBox(low, high, problem=problem)
         u_min, u_max = (each.astype(np.float32) for each in (problem.u_min, problem.u_max))
@@ -88,12 +276,12 @@ class TwinEnv(gym.Env[Single, Single]):
         elif seed is not None:
             acting = seed % len(members)
         self._acting = Dynamics(problem, self.dynamics.coordinates, (members[acting],))
-        self._episode = self.episodes[int(self.np_random.integers(len(self.episodes)))]
+        self._episode = self.model.episodes[int(self.np_random.integers(len(self.model.episodes)))]
         row = self.dynamics.row
         theta = row.shown(self._episode.thetas[0]).copy()
         state = problem.layout.state
         units = problem.units
-        theta[state] = self.starts.draw(1, self.np_random)[0, state]
+        theta[state] = self.model.starts.draw(1, self.np_random)[0, state]
         if options:
             given = np.asarray(options.get("state"), np.float64)
             if given.shape not in ((problem.model.n_states,), (problem.n_theta,)):
@@ -129,7 +317,7 @@ class TwinEnv(gym.Env[Single, Single]):
         cost = float(problem.stage_cost(row.shown(before), u))
         info = {
             "cost": cost,
-            "violation": bool(self.limits.violated(after)) or excess > EXCESS_ROOM,
+            "violation": bool(self.model.limits.violated(after)) or excess > EXCESS_ROOM,
             "excess": excess,
             "penalty": float(beyond.penalty),
             "state": theta,

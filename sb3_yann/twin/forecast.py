@@ -17,8 +17,8 @@ from scipy import stats
 from sb3_yann._validation import Array
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.twin.dynamics import Dynamics, law_of
+from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, records
-from sb3_yann.twin.starts import Starts
 
 SURE = 0.95  # probability that a change is not above an interval's end, or not below
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
@@ -37,15 +37,9 @@ Inputs = Callable[[Array], Array]
 class Judge:
     """A twin that a log may refute, fitted without each fold of the episodes.
 
-    Attributes
-    ----------
-    dynamics : Dynamics
-        Member k has not seen fold k: every episode whose number is k modulo the members.
-    says : str
-        What sets it apart.
-    refuted : bool
-        Whether it predicts held-out episodes surely worse than the twin. Dynamics that both lack
-        may feign that: with a memory it counts.
+    Member k has not seen fold k: every episode whose number is k modulo the members. ``says`` is
+    what sets it apart. It is ``refuted`` where it predicts held-out episodes surely worse than the
+    twin; dynamics that both lack may feign that: with a memory it counts.
     """
 
     dynamics: Dynamics
@@ -66,13 +60,8 @@ class Forecast(NamedTuple):
 class _Replays:
     """The episodes of a log side by side, with what comes of policies in a judge.
 
-    Parameters
-    ----------
-    judge : Judge
-    episodes : sequence of Episode
-        Shorter ones count until their end.
-    remembers : bool
-        Whether errors follow earlier inputs and errors.
+    Shorter ones count until their end. A judge that ``remembers`` knows that errors follow earlier
+    inputs and errors.
     """
 
     def __init__(self, judge: Judge, episodes: Sequence[Episode], remembers: bool) -> None:
@@ -205,20 +194,8 @@ def forecast(
     It is the union of the judges' intervals, of runs from the log's own starts, and of others from
     the box of all starts, which no policy was fitted to. Of each, the standard error is that over
     the episodes, with that of a fit without each fold of them (the jackknife). Where its errors
-    follow earlier inputs and errors, the judge is asked again with a memory of them.
-
-    Parameters
-    ----------
-    judges : sequence of Judge
-        The first one is the twin's own.
-    episodes : tuple of Episode
-        The log.
-    starts : Starts
-        Where episodes begin.
-    act : callable
-        The policy, from theta (rows, n_theta) to inputs (rows, m).
-    loosest : str
-        The input that follows the MPC most closely.
+    follow earlier inputs and errors, the judge is asked again with a memory of them. The first
+    judge is the twin's own; ``loosest`` is the input that follows the MPC most closely.
     """
     independent = sum(len(each[::2]) for each in records(episodes))
     count, rng = len(episodes), np.random.default_rng(0)

@@ -1,22 +1,26 @@
-"""A plant's own episodes, checked, in the parts of theta."""
+"""A plant's own episodes, checked, in the parts of theta; and who estimates its disturbances."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, to_float
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
+from sb3_yann.log import Log
+from sb3_yann.rollout import is_vec_env
+from sb3_yann.twin.row_layout import ROUNDED
 
-SHORTEST = 5
-"""Steps that an episode has at least."""
-LARGE = 1e100
-"""Beyond this, squares and their sums overflow."""
+SHORTEST = 5  # steps that an episode has at least
+LARGE = 1e100  # beyond this, squares and their sums overflow
+EXPLAINED = 1e-3  # an estimate's moves follow the model's errors but for so much of their squares
 
 
 @dataclass(frozen=True)
@@ -51,23 +55,11 @@ def as_episodes(
 ) -> tuple[Episode, ...]:
     """Return episodes, given in plant units, as the law sees them: in deviations.
 
-    Parameters
-    ----------
-    problem : LinearMPC
-        Of the plant.
-    episodes : sequence of pairs
-        States (T + 1, n), or all of theta (T + 1, n_theta), and actions (T, m).
-    references, disturbances : sequence of array_like, shapes (T + 1, p) and (T + 1, d)
-        What theta holds besides, one for each episode, or one row for all of it.
-    previous : sequence of array_like, shape (m,), optional
-        The input before each episode; that of the operating point by default.
-    observed : bool, default False
-        Whether an observer estimates the disturbances: they are NaN where none are given.
-
-    Raises
-    ------
-    ValueError
-        For no episodes, wrong shapes, entries that are not finite, inputs beyond their bounds.
+    States are (T + 1, n), or all of theta; references (T + 1, p) and disturbances (T + 1, d) what
+    theta holds besides, one for each episode, or one row for all of it; ``previous`` the input
+    before each episode, by default that of the operating point. Where an observer estimates the
+    disturbances they are NaN where none are given. Wrong shapes, entries that are not finite and
+    inputs beyond their bounds are a ValueError.
     """
     layout, pairs = problem.layout, _pairs(episodes)
     units = problem.units
@@ -109,6 +101,16 @@ def without_copies(episodes: tuple[Episode, ...]) -> tuple[tuple[Episode, ...], 
     if len(kept) == len(episodes):
         return episodes, ()
     return (*kept.values(),), (f"Left out {len(episodes) - len(kept)} copies of other episodes.",)
+
+
+def without_short_pieces(log: Log) -> tuple[list[tuple[Array, Array]], tuple[str, ...]]:
+    """Return the pairs of a log without those of few steps, which gaps leave, and a note."""
+    pairs = [*log]
+    kept = [(states, inputs) for states, inputs in pairs if len(inputs) >= SHORTEST]
+    if not kept or len(kept) == len(pairs):
+        return pairs, ()
+    note = f"Left out {len(pairs) - len(kept)} pieces of less than {SHORTEST} steps"
+    return kept, (f"{note}; {log.lost_steps} steps were gaps.",)
 
 
 def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
@@ -254,3 +256,52 @@ def _theta(
             )
         theta[:, layout.previous] = np.vstack([first - point[layout.previous], u])
     return theta
+
+
+class EstimatedDisturbanceWarning(UserWarning):
+    """The disturbances of a log move as an observer's estimate does, and no observer is given."""
+
+
+def observer_of(env: Any) -> StateEstimator | None:
+    """Return the observer among the wrappers of an env or of a VecEnv, None where there is none.
+
+    An id, a class or a function that makes an env has none.
+    """
+    found = None
+    if is_vec_env(env):
+        found = env.get_attr("observer", 0)[0] if env.has_attr("observer") else None
+    elif isinstance(env, gym.Env) and env.has_wrapper_attr("observer"):
+        found = env.get_wrapper_attr("observer")
+    return found if isinstance(found, StateEstimator) else None
+
+
+def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
+    """Warn where the disturbances of a log move as those of an observer.
+
+    An observer moves its estimate by a fixed matrix times what the model does not predict.
+    """
+    parts, inside = problem.layout, (problem.deviations.theta_min, problem.deviations.theta_max)
+    if not parts.n_disturbances:
+        return
+    d_min, d_max = (each[parts.disturbance] for each in inside)
+    room, errors, moves = ROUNDED * (d_max - d_min), [], []
+    for each in episodes:
+        d = each.thetas[:, parts.disturbance]
+        free = np.all((d > d_min + room) & (d < d_max - room), axis=1)
+        free = free[1:] & free[:-1]
+        left = each.thetas[1:] - problem.deviations.predict(each.thetas[:-1], each.actions)
+        errors.append(left[free, parts.state])
+        moves.append(np.diff(d, axis=0)[free])
+    e, moved = np.concatenate(errors), np.concatenate(moves)
+    half = problem.theta_half[parts.disturbance]
+    if len(e) <= 2 * parts.n_states or not np.any(np.std(moved, axis=0) > 1e-6 * half):
+        return
+    left = moved - e @ np.linalg.lstsq(e, moved, rcond=None)[0]
+    if np.sum((left / half) ** 2) <= EXPLAINED * np.sum((moved / half) ** 2):
+        warnings.warn(
+            "The disturbances of the log follow the model's errors, as an observer's estimate "
+            "does. A twin takes them for measured ones, which the policy does not move. Pass "
+            "observer=, the one of ObserveDisturbance.",
+            EstimatedDisturbanceWarning,
+            stacklevel=4,
+        )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,52 +13,51 @@ from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.log import SECONDS, Log
-from sb3_yann.twin.dynamics import Coordinates, Dynamics
-from sb3_yann.twin.ensemble import fit_ensemble
-from sb3_yann.twin.env import TwinEnv
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
+from sb3_yann.twin.env import LearntModel, TwinEnv
 from sb3_yann.twin.forecast import Forecast, Judge, forecast
-from sb3_yann.twin.limits import Limits
-from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
-from sb3_yann.twin.observers import observer_of, warn_of_estimates
-from sb3_yann.twin.reidentification import reidentified
-from sb3_yann.twin.replay_buffer import episodes_of
-from sb3_yann.twin.report import report
-from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.log import (
+    Episode,
+    as_episodes,
+    pieces,
+    warn_of_estimates,
+    without_copies,
+    without_short_pieces,
+)
 from sb3_yann.twin.row_layout import RowLayout
-from sb3_yann.twin.sampling import cut_at_gaps
 from sb3_yann.twin.selection import (
     FOLDS,
     KINDS,
     Candidate,
     candidates,
+    fit_ensemble,
     held_out,
     judges,
+    reidentified,
     ridge,
     without_each_fold,
 )
-from sb3_yann.twin.starts import Starts
 from sb3_yann.twin.trust import (
     Trust,
     UntrustedTwinError,
     costs_of_each,
     evidence,
     relative_error,
+    report,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BLOCKS = 40
-"""Pieces of a log of few episodes that its members are fitted to some of."""
-AHEAD = 20
-"""Steps of the windows that networks are fitted to."""
+BLOCKS = 40  # pieces of a log of few episodes that its members are fitted to some of
+AHEAD = 20  # steps of the windows that networks are fitted to
 ROWS, LACKS = 100, 0.01
 """Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
 episodes err by so much of the mean."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PlantTwin:
+class PlantTwin(LearntModel):
     """A simulator learnt from a plant's own episodes, which says what it is worth.
 
     ``x+ = A x + B u + E d + residual(x, d, u)``. The residual is none, a polynomial that is shrunk
@@ -72,7 +70,7 @@ class PlantTwin:
     Where an observer *estimates* d, it is a part of the twin: ``x+ = A x + B u + residual(x, u)``,
     and the observer steps its estimate from that, as it does beside the plant.
 
-    Make one with :meth:`fit` or :meth:`from_buffer`.
+    Make one with :meth:`fit`.
 
     Attributes
     ----------
@@ -103,10 +101,7 @@ class PlantTwin:
     (4,)
     """
 
-    problem: LinearMPC
-    episodes: tuple[Episode, ...]
     kind: str
-    dynamics: Dynamics
     trust: Trust
     notes: tuple[str, ...] = ()
     judges: tuple[Judge, ...] = ()
@@ -128,7 +123,6 @@ class PlantTwin:
         references: Sequence[ArrayLike] | None = None,
         disturbances: Sequence[ArrayLike] | None = None,
         previous: Sequence[ArrayLike] | None = None,
-        time: Sequence[ArrayLike] | None = None,
         observer: StateEstimator | None = None,
         residuals: Sequence[str] = KINDS,
         n_members: int = 5,
@@ -142,16 +136,13 @@ class PlantTwin:
         ----------
         problem : LinearMPC
             The MPC of the plant: its model is where the twin starts from.
-        episodes : sequence of pairs
+        episodes : sequence of pairs, or Log
             States (T + 1, n), or all of theta (T + 1, n_theta), and actions (T, m), in plant units
             where the problem's model has an operating point.
         references, disturbances : sequence of array_like, optional
             What theta holds besides the state, shapes (T + 1, p) and (T + 1, d) for each episode.
         previous : sequence of array_like, shape (m,), optional
             The input before each episode.
-        time : sequence of array_like, shape (T + 1,), optional
-            When each row of an episode's states was measured, in the unit of ``model.dt``. An
-            episode is cut at steps that take less than half or more than one and a half of dt.
         observer : StateEstimator, optional
             The one whose estimates x and d of theta are: that of :class:`EstimateState`. States
             that are not all of theta are what it measured, (T + 1, q), and it is run over them:
@@ -183,17 +174,17 @@ class PlantTwin:
         check_int("updates", updates)
         if isinstance(residuals, str) or not residuals or not {*residuals} <= {*KINDS}:
             raise ValueError(f"residuals = {residuals!r} must be a list of some of {KINDS}.")
+        notes: tuple[str, ...] = ()
         if isinstance(episodes, Log):
             _require_same_sampling(episodes, problem)
             episodes = episodes if observer is not None else episodes.with_all_states()
+            if references is disturbances is previous is None:  # else they are one for each
+                episodes, notes = without_short_pieces(episodes)
         row = RowLayout(problem, observer)
         if observer is not None and row.observer is None:
             episodes, disturbances = row.estimated(episodes, disturbances)
         given, observed = (references, disturbances, previous), row.observer is not None
         log = as_episodes(problem, episodes, *given, observed=observed)
-        notes: tuple[str, ...] = ()
-        if time is not None:
-            log, notes = cut_at_gaps(log, time, problem.model.dt)
         log, copied = without_copies(log)
         notes += copied
         if observer is None:
@@ -231,28 +222,7 @@ class PlantTwin:
         dynamics = Dynamics(problem, coordinates, tuple(members))
         trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
         found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
-        return cls(problem, log, choice.name, dynamics, trust, notes, found)
-
-    @classmethod
-    def from_buffer(cls, model: Any, **options: Any) -> PlantTwin:
-        """Return the twin of the plant whose transitions a model's replay buffer holds.
-
-        An observer among the wrappers of the model's env becomes a part of it.
-
-        Parameters
-        ----------
-        model : DDPG or TD3
-            With a :class:`YannPolicy`.
-        **options
-            As in :meth:`fit`.
-
-        Raises
-        ------
-        ValueError
-            If the buffer holds no episode of some steps.
-        """
-        episodes, found = episodes_of(model), {"observer": observer_of(model.get_env())}
-        return cls.fit(model.policy.problem, episodes, **(found | options))
+        return cls(problem, log, dynamics, choice.name, trust, notes, found)
 
     @property
     def trusted(self) -> bool:
@@ -318,16 +288,6 @@ class PlantTwin:
         loosest = labels_of(self.problem.model)[1][int(np.argmin(share))]
         return forecast(self.judges, self.episodes, self.starts, act, loosest)
 
-    @cached_property
-    def starts(self) -> Starts:
-        """Where episodes begin."""
-        return Starts.of(self.problem, self.episodes, self.dynamics.row.estimator)
-
-    @cached_property
-    def limits(self) -> Limits:
-        """Where the twin holds, and the problem's own bounds of the states."""
-        return Limits.of(self.problem, self.dynamics.coordinates, self.starts)
-
     def env(self, member: int | None = None) -> TwinEnv:
         """Return a Gymnasium env with the twin's dynamics and the plant's spaces.
 
@@ -342,7 +302,7 @@ class PlantTwin:
             If the twin is not to be trusted.
         """
         self.require_trust()
-        return TwinEnv(self.dynamics, self.episodes, self.starts, self.limits, member)
+        return TwinEnv(self, member)
 
 
 def _require_same_sampling(log: Log, problem: LinearMPC) -> None:

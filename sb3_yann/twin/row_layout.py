@@ -13,10 +13,8 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control import DisturbanceObserver, LinearMPC, StateEstimator
 
-ROUNDED = 1e-6
-"""So near to its bound, relative to their distance, an estimate may lie beyond it."""
-SINGULAR = 1e10
-"""Condition number from which on a matrix is not inverted."""
+ROUNDED = 1e-6  # so near to its bound, relative to their distance, an estimate may lie beyond it
+SINGULAR = 1e10  # condition number from which on a matrix is not inverted
 
 
 @dataclass(frozen=True)
@@ -25,23 +23,12 @@ class RowLayout:
 
     Without an observer a row is theta. With one the x and d of theta are *estimates*: behind theta
     stand the plant's own state (n,) and the estimate of d (d,) before it is clipped to its bounds.
-    The plant does not know d. The observer steps its estimate from what it measures:
-    ``z+ = (I - L C) (A z + B u) + L C x+`` with ``z = [x_hat; d_hat]``.
+    The plant does not know d. The observer steps its estimate from what it measures: ``z+ = (I - L
+    C) (A z + B u) + L C x+`` with ``z = [x_hat; d_hat]``.
 
-    Where the measurements do not tell the plant's state, a row is theta, and the estimate itself
-    is what is learnt: ``x_hat+ = A x_hat + B u + E d_hat + residual(x_hat, d_hat, u)``. This
-    residual is ``L_x e``, of the innovations e. So it moves d_hat by ``L_d L_x^+ residual``.
-
-    Attributes
-    ----------
-    problem : LinearMPC
-    estimator : StateEstimator, optional
-        Of all states and all disturbances of the problem. It is not stepped.
-
-    Raises
-    ------
-    TypeError, ValueError
-        For an estimator of another model.
+    Where the measurements do not tell the plant's state, a row is theta, and the estimate itself is
+    what is learnt: ``x_hat+ = A x_hat + B u + E d_hat + residual(x_hat, d_hat, u)``. This residual
+    is ``L_x e``, of the innovations e. So it moves d_hat by ``L_d L_x^+ residual``.
     """
 
     problem: LinearMPC

@@ -1,34 +1,200 @@
-"""Which residual: none, a polynomial, or networks, by free runs over episodes held out."""
+"""Residuals fitted to a log, and which one counts: the one that free runs held out ask for.
+
+There are none, polynomials that are shrunk, and small networks, fitted in torch side by side. A
+linear one makes the re-identified MPC.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch as th
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import linalg
 
 from sb3_yann._validation import Array
+from sb3_yann.control import LinearModel, LinearMPC, Terminal
 from sb3_yann.control.linear_system import labels_of
-from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.control.mpc.coordinates import steady_states
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.forecast import Judge, surely_worse
-from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.log import Episode, pieces
+
+HIDDEN = 48  # units in each of two hidden layers
+BATCH = 256  # rows in a step of Adam
+WINDOWS = 32  # windows of a log in a step of Adam
+RATE = 5e-3  # of Adam at first, for single steps; it falls to zero
+ROUNDING = 1e-6  # of float32 observations, in how far the states move
+RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
+
+
+def fit_ensemble(
+    coordinates: Coordinates,
+    logs: Sequence[Sequence[Episode]],
+    seed: int,
+    *,
+    ahead: int = 1,
+    updates: int = 3000,
+) -> list[Residual]:
+    """Return one network for each log, all fitted at once.
+
+    A linear part is fitted by least squares, the networks to what it leaves of single steps. With
+    ``ahead`` above 1 all of it is then fitted to windows of so many steps, along which the model
+    goes on from its own predictions: a fit to single steps takes noise of the sensors for dynamics.
+    ``updates`` are steps of Adam for single steps; before windows half as many, and for them a
+    fifth.
+    """
+    generator = th.Generator().manual_seed(seed)
+    rows = [[coordinates.regression(each) for each in log] for log in logs]
+    pairs = [[np.concatenate(part) for part in zip(*each, strict=True)] for each in rows]
+    # Single steps of a simulator are known to many digits, those of a log are not.
+    dtype = th.float64 if ahead == 1 else th.float32
+    networks = _Networks(pairs, ROUNDING * coordinates.units, generator, dtype)
+    networks.fit_steps(pairs, updates if ahead == 1 else updates // 2)
+    if ahead > 1:
+        networks.fit_windows(coordinates, logs, ahead, updates // 5)
+    return networks.residuals()
+
+
+class _Networks:
+    """The networks while they are fitted, in standardized coordinates.
+
+    Each member is fitted to a pair z (rows, k), y (rows, n); what is smaller in y than ``least``
+    (n,) is rounding.
+    """
+
+    def __init__(
+        self, pairs: list[list[Array]], least: Array, generator: th.Generator, dtype: th.dtype
+    ) -> None:
+        self.generator, self.dtype, count = generator, dtype, len(pairs)
+        k, n = pairs[0][0].shape[1], pairs[0][1].shape[1]
+        self.center = self.tensor([z.mean(0, keepdims=True) for z, _ in pairs])
+        self.width = self.tensor([np.maximum(z.std(0, keepdims=True), 1e-9) for z, _ in pairs])
+        linear, units = zip(*(_least_squares(*each) for each in pairs), strict=True)
+        self.unit = self.tensor(np.maximum(units, least))
+
+        def drawn(rows: int, columns: int) -> th.Tensor:
+            shape = (count, rows, columns)
+            found: th.Tensor = th.randn(shape, generator=generator, dtype=dtype)
+            return found.div(rows**0.5)
+
+        def zeros(rows: int, columns: int) -> th.Tensor:
+            return th.zeros((count, rows, columns), dtype=dtype)
+
+        self.weights = [drawn(k, HIDDEN), zeros(1, HIDDEN), drawn(HIDDEN, HIDDEN)]
+        mean = self.tensor([y.mean(0, keepdims=True) for _, y in pairs])
+        self.weights += [zeros(1, HIDDEN), zeros(HIDDEN, n), mean / self.unit]
+        # Scaled as all else: a step of Adam is small beside what it changes, whatever its unit.
+        self.weights.append(self.tensor(linear) * self.width.mT / self.unit)
+        for each in self.weights:
+            each.requires_grad_()
+
+    def tensor(self, parts: Any) -> th.Tensor:
+        """Return arrays as one tensor."""
+        return th.as_tensor(np.asarray(parts), dtype=self.dtype)
+
+    def __call__(self, z: th.Tensor) -> th.Tensor:
+        """Return what the networks make of z (members, batch, k)."""
+        W1, b1, W2, b2, W3, b3, L = self.weights
+        z = (z - self.center) / self.width
+        first = th.tanh(z @ W1 + b1)
+        out: th.Tensor = (th.tanh(first @ W2 + b2) @ W3 + b3 + z @ L) * self.unit
+        return out
+
+    def fit_steps(self, pairs: list[list[Array]], updates: int) -> None:
+        """Fit them to single steps."""
+        z, y = (self.tensor(_same_length([each[i] for each in pairs])) for i in (0, 1))
+        for _ in self._steps(RATE, updates):
+            chosen = th.randint(z.shape[1], (BATCH,), generator=self.generator)
+            (((self(z[:, chosen]) - y[:, chosen]) / self.unit) ** 2).mean().backward()  # type: ignore[no-untyped-call]
+
+    def fit_windows(
+        self, coordinates: Coordinates, logs: Sequence[Sequence[Episode]], ahead: int, updates: int
+    ) -> None:
+        """Fit them to windows of the logs, along which they go on from their own predictions."""
+        row = coordinates.row
+        ahead = min(ahead, *(max(map(len, log)) for log in logs))  # each log has such a window
+        n = row.problem.model.n_states
+        windows = []
+        for log in logs:
+            whole = [each for each in log if len(each) >= ahead]
+            parts = [row.features(e.thetas, np.vstack([e.actions, e.actions[-1:]])) for e in whole]
+            windows.append(
+                np.concatenate([sliding_window_view(p, ahead + 1, axis=0) for p in parts])
+            )
+        data = self.tensor(_same_length(windows))  # (members, windows, k, ahead + 1)
+        linear = self.tensor(row.linear[row.state][:, row.inputs].T)
+        low, high, scale, units = (
+            self.tensor(each)
+            for each in (coordinates.low, coordinates.high, coordinates.scale, coordinates.units)
+        )
+        turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
+        per_turn = th.where(turn > 0, 1 / turn, 0.0)
+        for _ in self._steps(RATE / 5, updates):
+            chosen = th.randint(data.shape[1], (WINDOWS,), generator=self.generator)
+            window = data[:, chosen]
+            x, loss = window[..., :n, 0], th.zeros((), dtype=self.dtype)
+            for t in range(ahead):
+                features = th.cat([x, window[..., n:, t]], dim=-1)
+                x = features @ linear + self(features.clamp(low, high) / scale)
+                after = window[..., :n, t + 1]
+                x = x - turn * ((x - after) * per_turn).detach().round()  # an angle may have jumped
+                loss = loss + (((x - after) / units) ** 2).mean()
+            loss.backward()  # type: ignore[no-untyped-call]
+
+    def _steps(self, rate: float, updates: int) -> Iterator[None]:
+        """Yield before each gradient; then step."""
+        adam = th.optim.Adam(self.weights, lr=rate)
+        schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
+        for _ in range(updates):
+            adam.zero_grad()
+            yield
+            th.nn.utils.clip_grad_norm_(self.weights, 10.0)
+            adam.step()
+            schedule.step()
+
+    def residuals(self) -> list[Residual]:
+        """Return them in scaled coordinates, one by one."""
+        with th.no_grad():
+            W1, b1, W2, b2, W3, b3, L = self.weights
+            first, L = W1 / self.width.mT, L * self.unit / self.width.mT
+            b1 = b1 - self.center @ first
+            b3 = b3 * self.unit - self.center @ L
+            parts = [first, b1, W2, b2, W3 * self.unit, b3, L]
+            parts.append(th.zeros((len(L), L.shape[1], L.shape[1] * L.shape[2])))
+            arrays = [each.double().numpy().copy() for each in parts]
+        return [Residual([each[i] for each in arrays]) for i in range(len(arrays[0]))]
+
+
+def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
+    """Return the linear part (k, n) of y, and the deviation (1, n) of what it leaves."""
+    about, y = z - z.mean(axis=0), y - y.mean(axis=0)
+    ridge = RIDGE * (np.trace(about.T @ about) / z.shape[1] + 1e-300)
+    linear = np.linalg.solve(about.T @ about + ridge * np.eye(z.shape[1]), about.T @ y)
+    left = y - about @ linear
+    size = np.sqrt(np.mean(left**2, axis=0, keepdims=True))
+    return linear, size
+
+
+def _same_length(parts: list[Array]) -> Array:
+    """Return arrays (rows, ...) as one (members, rows, ...): short ones are repeated."""
+    longest = max(map(len, parts))
+    return np.array([each[np.arange(longest) % len(each)] for each in parts])
+
 
 DEGREES = {"linear": 1, "quadratic": 2}
 KINDS = ("none", *DEGREES, "network")
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 INPUT_FACTORS = (1.0, 30.0)
 """How many times as strongly inputs are shrunk: the log of a closed loop shows little of them."""
-LONGEST = 100
-"""Steps of a free run, at most."""
-RUNS = 20
-"""Free runs in an episode."""
+LONGEST = 100  # steps of a free run, at most
+RUNS = 20  # free runs in an episode
 FOLDS = 5
-GAINS = (0.6, 1.7)
-"""Times the model's: an input may act so, unless the log refutes it."""
+GAINS = (0.6, 1.7)  # times the model's: an input may act so, unless the log refutes it
 LOOSE, FIRM = 1e-3, 1e3
 """Shrinkage of what fits a log around such a gain, and times as much of its inputs."""
 
@@ -36,15 +202,9 @@ LOOSE, FIRM = 1e-3, 1e3
 class Setting(NamedTuple):
     """How a polynomial is fitted.
 
-    Attributes
-    ----------
-    degree : int
-    shrinkage : float
-        Weight of its squared coefficients, times the number of samples.
-    factor : float
-        How many times as strongly terms with an input are shrunk.
-    gain : tuple of int and float, optional
-        An input, and how many times as the model says it acts where it is shrunk to.
+    ``shrinkage`` is the weight of its squared coefficients, times the number of samples; terms with
+    an input are shrunk ``factor`` times as strongly. ``gain`` is an input, and how many times as
+    the model says it acts where it is shrunk to.
     """
 
     degree: int
@@ -66,16 +226,7 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A kind of residual.
-
-    Attributes
-    ----------
-    name : str
-    by_fold : tuple of Residual
-        Residual k has not seen the episodes whose number is k modulo their count.
-    setting : Setting, optional
-        Of a polynomial.
-    """
+    """A kind of residual: number k has not seen the episodes that are k modulo their count."""
 
     name: str
     by_fold: tuple[Residual, ...]
@@ -143,13 +294,9 @@ def candidates(
 
 @dataclass(frozen=True)
 class FreeRuns:
-    """Errors of free runs over episodes that were held out.
+    """Errors (candidates, episodes, horizons) of free runs over episodes that were held out.
 
-    Attributes
-    ----------
-    horizons : ndarray of int, shape (h,)
-    by_episode : ndarray, shape (candidates, episodes, h)
-        Root mean squares over states, in units of how far each moves in the log.
+    They are root mean squares over states, in units of how far each moves in the log.
     """
 
     horizons: Any
@@ -235,17 +382,7 @@ def judges(
 
     In a closed loop a log may not tell the gain of an input, since the states follow it in many
     ways. The others are shrunk little: what the chosen one owes to its shrinkage shows as well.
-
-    Parameters
-    ----------
-    coordinates : Coordinates
-        What residuals are scaled by.
-    parts : sequence of Episode
-        Each is left out once.
-    chosen : Candidate
-        What the twin is.
-    runs : FreeRuns
-        Those of the chosen one, alone.
+    ``runs`` are those of the chosen one, alone.
     """
     problem = coordinates.row.problem
     degree = 1 if chosen.setting is None else chosen.setting.degree
@@ -262,3 +399,42 @@ def judges(
         says = f"a gain of {names[j]} {times:g} times the model's, which the log allows,"
         found.append(Judge(Dynamics(problem, coordinates, rival.by_fold), says, bool(wrong)))
     return tuple(found)
+
+
+def reidentified(
+    problem: LinearMPC, coordinates: Coordinates, log: tuple[Episode, ...]
+) -> LinearMPC:
+    """Return the MPC of a model shrunk towards the given one: see `PlantTwin.reidentified`."""
+    parts = pieces(log, FOLDS)
+    choices = candidates(coordinates, parts, ["linear"])
+    choice = choices[held_out(coordinates, parts, choices).choose()]
+    if choice.setting is None:
+        return problem
+    (residual,) = ridge(coordinates, log, [choice.setting])
+    middle, model = np.zeros((1, len(coordinates.scale))), problem.model
+    n, m, d = model.n_states, model.n_inputs, len(middle[0]) - model.n_states - model.n_inputs
+    slopes = residual.jacobian(middle)[0] / coordinates.scale
+    A, E, B = np.split(slopes, [n, n + d], axis=1)
+    A, B, E = model.A + A, model.B + B, model.E + (E if d else 0.0)
+    x: Array = np.zeros(n)
+    u: Array = np.zeros(m)
+    if problem.layout.has_constants:  # else the residual has no constant term
+        x, u = _rest(problem, A, B, residual.predict(middle)[0])
+    note = f"Re-identified from {len(log)} episodes: {choice.name}."
+    own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
+    own |= {"notes": [*model.notes, note], "drift": None}
+    found = LinearModel(**{**vars(model), **own})
+    terminal = Terminal(set="invariant" if len(problem.terminal.set[1]) else None)
+    return replace(problem, model=found, terminal=terminal)
+
+
+def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
+    """Return the state (n,) and the input (m,) that rest despite the drift (n,), with ``C x = 0``.
+
+    The drift acts as a constant disturbance does.
+    """
+    drifting = LinearModel(A, B, problem.model.dt, E=drift[:, None])
+    x_unit = problem.theta_half[problem.layout.state]
+    weights = problem.Q, problem.R, x_unit, problem.u_half
+    found = steady_states(drifting, problem.tracking.C, *weights)
+    return found.x[:, -1], found.u[:, -1]

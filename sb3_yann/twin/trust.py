@@ -1,9 +1,10 @@
-"""What a twin is worth: how well it predicts what it has not seen, and what would help."""
+"""What a twin is worth: how well it predicts what it has not seen, what would help, in words."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, Context
 from typing import Any
 
 import numpy as np
@@ -15,29 +16,20 @@ from sb3_yann.control import LinearMPC
 from sb3_yann.control.identification.fit import frozen_rows, words_for
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.alignment import objections
-from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual, law_of
 from sb3_yann.twin.log import Episode, records
-from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.selection import FreeRuns
 
 COST_ERROR = 0.25
 """The largest error of a predicted episode cost, relative to the mean cost, that is trusted."""
-STILL = 1e-4
-"""An input that moves by less, in half-widths, does not move."""
-FOREIGN = 10.0
-"""A model that errs by so many times what moves describes another plant."""
-POOR = 2.0
-"""From so many times on, a report asks whether it is the same plant."""
-OUTSIDE = 0.05
-"""Share of logged rows beyond the box of theta from which on units are doubted."""
-LAW = 1e-3
-"""How far an input may be from the MPC's own, in half-widths."""
-PREVIOUS = 0.01
-"""How far theta's previous input may be from the one before it, in half-widths."""
-ROUNDING = 1e-6
-"""Of a half-width: float32 rounds so much."""
-SPIKE = 1e3
-"""One reading that is so many times as far off as most stands alone."""
+STILL = 1e-4  # an input that moves by less, in half-widths, does not move
+FOREIGN = 10.0  # A model that errs by so many times what moves describes another plant
+POOR = 2.0  # from so many times on, a report asks whether it is the same plant
+OUTSIDE = 0.05  # share of logged rows beyond the box of theta from which on units are doubted
+LAW = 1e-3  # how far an input may be from the MPC's own, in half-widths
+PREVIOUS = 0.01  # how far theta's previous input may be from the one before it, in half-widths
+ROUNDING = 1e-6  # of a half-width: float32 rounds so much
+SPIKE = 1e3  # one reading that is so many times as far off as most stands alone
 ALONE = 0.02
 """An input's gain is known from the data where at least this share of its variance is its own."""
 
@@ -210,22 +202,10 @@ def judge(
 ) -> tuple[list[str], list[str]]:
     """Return what speaks against a twin, and what would help.
 
-    Parameters
-    ----------
-    runs : FreeRuns
-        Errors of all candidates, of which the first is the linear model as it is.
-    standing : ndarray, shape (h,)
-        Errors of standing still.
-    costs : pair of ndarray, shape (episodes,)
-        Predicted and actual.
-    inputs : pair of ndarray, shape (m,)
-        How much of each input is its own, and how much it moves.
-    n_episodes : int
-        In the log, independent of each other.
-    beyond : pair of float and str
-        The largest share of logged rows beyond the box of theta, and of which entry.
-    names : sequence of str, optional
-        Those of the inputs.
+    The first candidate of the ``runs`` is the linear model as it is; ``standing`` (h,) are the
+    errors of standing still, ``costs`` predicted and actual ones (episodes,), ``inputs`` how much
+    of each is its own, and how much it moves (m,). ``beyond`` is the largest share of logged rows
+    beyond the box of theta, and of which entry.
     """
     problems, advice = [], []
     share, moves = inputs
@@ -280,18 +260,10 @@ def evidence(
     found: tuple[FreeRuns, int, tuple[Array, Array]],
     units_confirmed: bool = False,
 ) -> Trust:
-    """Return the evidence for a twin.
+    """Return the evidence for a twin; each episode of the log is left out once.
 
-    Parameters
-    ----------
-    dynamics : Dynamics
-        The twin's.
-    log : tuple of Episode
-        Each is left out once.
-    found : tuple of FreeRuns, int and pair of ndarray
-        Free runs of the candidates, which was chosen, and its predicted costs beside the actual.
-    units_confirmed : bool, default False
-        As in :meth:`PlantTwin.fit`.
+    ``found`` are free runs of the candidates, which was chosen, and its predicted costs beside the
+    actual.
     """
     runs, chosen, costs = found
     problem = dynamics.problem
@@ -316,3 +288,82 @@ def evidence(
     mixing = np.eye(problem.model.n_states) + problem.model.A**2
     noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(left, axis=0)))[0])
     return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))
+
+
+def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:
+    """Return what a twin explains, what it does not know, and whether to trust it, as text."""
+    parts = _data(problem, episodes), _errors(kind, trust), _costs(trust), _inputs(problem, trust)
+    lines = [line for part in (*parts, _noise(problem, trust), _verdict(trust)) for line in part]
+    return "\n".join(lines)
+
+
+def _data(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Iterator[str]:
+    steps = sum(map(len, episodes))
+    yield f"The log: {len(episodes)} episodes, {steps} steps."
+    for pieces in filter(lambda each: len(each) > 1, records(episodes)):
+        yield (
+            f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "
+            f"other one is independent: {len(pieces[::2])} of {len(pieces)}."
+        )
+    constant = problem.layout.constant
+    seen = np.concatenate([each.thetas[:, constant] for each in episodes])
+    names = np.array(problem.layout.names)[constant]
+    if still := [*names[np.ptp(seen, axis=0) == 0]]:
+        yield f"The log shows one value alone of {', '.join(still)}: elsewhere the MPC will act."
+
+
+def _errors(kind: str, trust: Trust) -> Iterator[str]:
+    yield f"Residual beside the linear model: {kind}."
+    if len(trust.actual) == 0:
+        return
+    yield "Error of free runs over held-out episodes, in standard deviations of the states:"
+    yield "  steps ahead      " + "".join(f"{h:>9d}" for h in trust.runs.horizons)
+    rows = (
+        ("twin", trust.runs.errors[trust.chosen]),
+        ("linear model", trust.runs.errors[0]),
+        ("nothing moves", trust.standing),
+    )
+    for name, errors in rows:
+        yield f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in errors)
+
+
+def _costs(trust: Trust) -> Iterator[str]:
+    if len(trust.actual) == 0:
+        return
+    yield "Cost of held-out episodes (or pieces of them), predicted and actual:"
+    for predicted, actual in zip(trust.predicted[:10], trust.actual[:10], strict=True):
+        yield f"  {predicted:>10.4g} {actual:>10.4g}"
+    if (more := len(trust.actual) - 10) > 0:
+        yield f"  ... and {more} more"
+    yield f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost"
+
+
+def _inputs(problem: LinearMPC, trust: Trust) -> Iterator[str]:
+    yield "Inputs: how much they move, and how much of that does not follow the MPC:"
+    for k in range(problem.model.n_inputs):
+        known = "its gain is known from the log"
+        if trust.excitation[k] < ALONE:
+            known = "its gain rests on the given B"
+        moves, share = 100 * trust.moves[k], 100 * trust.excitation[k]
+        name = labels_of(problem.model)[1][k]
+        yield f"  {name}: {moves:.3g} % of half the range, {share:.2f} %: {known}"
+
+
+def _noise(problem: LinearMPC, trust: Trust) -> Iterator[str]:
+    names = labels_of(problem.model)[0]
+    found = ", ".join(f"{n} {_rounded_up(s)}" for n, s in zip(names, trust.noise, strict=True))
+    yield f"Sensor noise, at most (standard deviations): {found}."
+
+
+def _rounded_up(value: float) -> str:
+    """Return a number in two digits that is no less: what holds at most stays true."""
+    digits = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(float(value)))
+    return f"{float(digits):.2g}"
+
+
+def _verdict(trust: Trust) -> Iterator[str]:
+    yield "Verdict: trusted." if trust.trusted else "Verdict: NOT trusted; the MPC stays."
+    yield from (f"  {each}" for each in trust.problems)
+    if trust.advice:
+        yield "What would help:"
+        yield from (f"  {each}" for each in np.unique(trust.advice))

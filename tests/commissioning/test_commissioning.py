@@ -20,7 +20,6 @@ from sb3_yann.commissioning.comparison import (
     is_hopeless,
     is_kept,
     pays_its_own,
-    predicted_costs,
     why_taken_back,
 )
 from sb3_yann.commissioning.plant import Plant
@@ -87,23 +86,6 @@ def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound
     pairs = [run.journal.by_policy[k : k + 2] for k in (5, 7, 9, 11, 13)]
     assert all(sorted(each) == [False, True] for each in pairs) and len({*map(tuple, pairs)}) == 2
     assert second.predicted == pytest.approx(second.cost, rel=0.1)
-
-
-def test_what_noise_costs_is_not_held_against_the_policy() -> None:
-    rng = np.random.default_rng(0)
-
-    class Noisy(Cart):
-        def step(self, action):
-            observation, *rest = super().step(action)
-            return (observation + 0.001 * rng.standard_normal(2).astype(np.float32), *rest)
-
-    run = commission(env=Noisy, updates=1)
-    first = run.run(1)[0]
-    twin = run._fit(run.journal.log, 1)
-    with one_env(Noisy) as env:
-        predicted = predicted_costs(twin, run.episodes, Plant(env, run.model).mpc).mean()
-    assert predicted != pytest.approx(first.cost, rel=1e-6)
-    assert first.mpc == pytest.approx(first.cost, rel=1e-9)  # its own batch has no excess
 
 
 def test_only_accepted_policies_act(tmp_path) -> None:
@@ -430,11 +412,6 @@ def test_another_plant_and_what_is_no_model_are_refused() -> None:
         commission(env="CSTR-v0").run(1)
     with pytest.raises(TypeError, match="must be a DDPG or TD3 model"):
         Commissioning(None, Cart)
-
-
-def test_a_path_without_a_suffix_is_a_folder(tmp_path) -> None:
-    commission(tmp_path / "plant")
-    assert (tmp_path / "plant" / "commissioning.jsonl").exists()
 
 
 def test_a_first_reading_that_is_no_number_is_an_error(tmp_path) -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_yann.commissioning.journal import CommissioningState, Journal
+from sb3_yann.commissioning.journal import CommissioningState, Journal, Record
 from sb3_yann.commissioning.plant import PlantEpisode
-from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Alarm
 
 SETTINGS = {"batch": 5, "problem": "abc"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sb3_yann.improvement.trial import Trial
+from sb3_yann.improvement.confirmation import Trial
 from sb3_yann.twin.dynamics import law_of
 from twin_samples import observed, twin
 

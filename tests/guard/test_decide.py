@@ -177,7 +177,7 @@ def test_a_fall_back_to_the_mpc_is_called_that() -> None:
     assert is_mpc(model)
     said = guard.summary()
     assert "accepted last is the MPC" in said and "raise n_eval_episodes" in said
-    assert said.endswith(f"{guard.steps:,} steps of the guard's simulator.")
+    assert f"  steps        {guard.steps:,} of the guard's simulator" in said
 
 
 def test_the_guard_counts_the_steps_of_its_simulator() -> None:

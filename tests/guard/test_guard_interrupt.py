@@ -122,16 +122,6 @@ def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_learn_again_and_again_and_the_handler_is_the_one_before() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    model, guard = build(), make_guard(eval_freq=100)
-    train(model, 8, guard)
-    assert signal.getsignal(signal.SIGINT) is before
-    interrupted(model, 20, guard, At([7], ctrl_c))
-    train(model, 8, guard)
-    assert signal.getsignal(signal.SIGINT) is before
-
-
 def test_after_another_error_the_handler_only_passes_on() -> None:
     def fail(_) -> None:
         raise OSError("the plant is gone")

@@ -1,8 +1,9 @@
-"""The guard changes the actor and nothing else: neither training env, nor buffer, nor chance."""
+"""The guard changes the actor and nothing else, and goes on after a stop bit for bit."""
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import pytest
 from stable_baselines3 import DDPG, TD3
@@ -25,9 +26,17 @@ from guard_samples import (
     train,
     verdicts,
 )
-from sb3_yann import ImprovementGuard
+from resumed import (
+    Checkpoint,
+    all_bits,
+    envs,
+    go_on,
+    guard_in_simulator,
+    loaded,
+    model_bits,
+)
+from sb3_yann import ImprovementGuard, compare
 from sb3_yann.compare import Verdict
-from sb3_yann.guard import decide
 from weights import is_mpc
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -53,7 +62,7 @@ def after_training(algorithm, *guards: ImprovementGuard, **kwargs):
 def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(
     algorithm, env, monkeypatch
 ) -> None:
-    monkeypatch.setattr(decide, "no_worse", lambda *_, **__: Verdict(is_sure=True))
+    monkeypatch.setattr(compare, "no_worse", lambda *_, **__: Verdict(is_sure=True))
     guard = make_guard(Slide() if env == "an instance" else env)
     free, expected = after_training(algorithm)
     model, state = after_training(algorithm, guard)
@@ -66,7 +75,7 @@ def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(
 def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
     algorithm, monkeypatch
 ) -> None:
-    monkeypatch.setattr(decide, "no_worse", lambda *_, **__: Verdict("no"))
+    monkeypatch.setattr(compare, "no_worse", lambda *_, **__: Verdict("no"))
     free, expected = after_training(algorithm)
     model, state = after_training(algorithm, guard := make_guard(patience=1000, keep_if_worse=True))
     assert set(verdicts(guard)) == {"rejected"}
@@ -79,7 +88,7 @@ def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
 def test_a_guard_that_rejects_everything_leaves_the_mpc_while_the_critic_learns(
     algorithm, monkeypatch
 ) -> None:
-    monkeypatch.setattr(decide, "no_worse", lambda *_, **__: Verdict("no"))
+    monkeypatch.setattr(compare, "no_worse", lambda *_, **__: Verdict("no"))
     fresh = build(algorithm)
     seen: list[bool] = []
     look = At(range(STEPS, 9 * STEPS, STEPS), lambda p: seen.append(is_mpc(p)))
@@ -119,3 +128,42 @@ def test_two_training_envs_side_by_side_count_their_episodes_together() -> None:
     assert [each.episode for each in guard.decisions] == [2]
     assert guard.decisions[0].timestep == 2 * STEPS
     assert guard.state.episodes == 4
+
+
+RARE = {"eval_freq": 3}
+"""A candidate after every third episode."""
+
+
+def whole_and_resumed(
+    folder, guard: Any, n: int, algorithm: Any = DDPG, episodes: int = 16
+) -> list[Any]:
+    """Return what is left of a training that went through, and of one that stopped halfway."""
+    whole = build(algorithm, env=envs(n))
+    steps, at = episodes * STEPS, episodes // 2 * STEPS
+    train(whole, steps, guard(log_path=folder / "whole.csv"), Checkpoint(at, folder))
+    model = loaded(folder, envs(n), algorithm)
+    go_on(model, steps - at, guard(log_path=folder / "cut.csv"))
+    assert len(model.guard_state.decisions) >= 3
+    records = [(folder / name).read_bytes() for name in ("whole.csv", "cut.csv")]
+    return [*zip(map(model_bits, (whole, model)), records, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "algorithm", "options"),
+    [(1, DDPG, {}), (4, DDPG, {}), (4, TD3, {}), (1, DDPG, RARE)],
+    ids=["one env", "four envs", "TD3", "rare trials"],
+)
+def test_with_a_simulator_nothing_is_lost(n_envs, algorithm, options, tmp_path) -> None:
+    guard = partial(guard_in_simulator, **options)
+    whole, resumed = whole_and_resumed(tmp_path, guard, n_envs, algorithm)
+    assert whole == resumed
+
+
+def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -> None:
+    model, guard = build(gradient_steps=0), guard_in_simulator()
+    train(model, STEPS, At([1], better), guard)
+    assert not model.policy.actor.mu.network.is_zero()
+    model.save(tmp_path / "model")
+    again, other = DDPG.load(tmp_path / "model", env=envs(1), device="cpu"), guard_in_simulator()
+    train(again, 1, other, reset_num_timesteps=False)
+    assert all_bits(other.player.mpc) == all_bits(guard.player.mpc)

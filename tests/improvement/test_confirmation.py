@@ -10,8 +10,13 @@ import pytest
 
 from sb3_yann.compare import UNSAFE, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundExcess
-from sb3_yann.improvement.confirmation import ENOUGH, LOOKS, RULE, Pairs, confirm
+from sb3_yann.improvement.confirmation import ENOUGH, LOOKS, RULE, SimulatorTrial, confirm
 from twin_samples import problem
+
+
+def costs_of(seeds: Any) -> np.ndarray:
+    """Return what the MPC costs from each start."""
+    return 1.0 + np.array([np.random.default_rng(int(each)).pareto(3.0) for each in seeds])
 
 
 class Fake:
@@ -39,7 +44,7 @@ class Fake:
         self.turn += 1
         if mpc:
             self.played.append(len(seeds))
-        costs = 1.0 + np.random.default_rng(seeds).pareto(3.0, len(seeds))
+        costs = costs_of(seeds)
         largest = np.zeros(len(seeds))
         if mpc and self.lost is not None:
             costs[self.lost(seeds)] = np.nan
@@ -59,7 +64,7 @@ def act(theta: np.ndarray) -> np.ndarray:
     return np.zeros((len(theta), 1))
 
 
-def looked(simulator: Fake) -> tuple[Any, Pairs]:
+def looked(simulator: Fake) -> tuple[Any, SimulatorTrial]:
     return confirm(act, simulator, 7)
 
 
@@ -71,12 +76,14 @@ def test_a_gain_is_accepted_after_forty_pairs_at_the_earliest() -> None:
     simulator = Fake(gains(0.2, 0.001))
     found, pairs = looked(simulator)
     assert found.accepted and found.final and found.iteration == 7 and found.reason == ""
-    assert len(pairs.seeds) == ENOUGH == 40
+    assert len(pairs.starts.seeds) == ENOUGH == 40
     assert simulator.played == [10, 10, 20]  # each look goes on from the last
-    assert pairs.seeds == [*range(40)]
+    assert pairs.starts.seeds == (*range(40),)
     assert found.logged == pytest.approx(pairs.relative.mean())
     assert found.error == pytest.approx(pairs.relative.std(ddof=1) / np.sqrt(40))
-    assert found.change == pytest.approx((pairs.policy.sum() / pairs.mpc.sum()) - 1)
+    assert found.change == pytest.approx(
+        (pairs.scores.costs.sum() / pairs.starts.mpc.costs.sum()) - 1
+    )
 
 
 def test_what_is_not_sure_after_forty_is_asked_twice_as_many() -> None:
@@ -84,27 +91,27 @@ def test_what_is_not_sure_after_forty_is_asked_twice_as_many() -> None:
         return np.clip(-0.003 + 0.01 * rng.standard_normal(len(seeds)), -0.1, 0.01)
 
     found, pairs = looked(Fake(change, seed=1))
-    assert found.accepted and len(pairs.seeds) == LOOKS[-1] == 80
+    assert found.accepted and len(pairs.starts.seeds) == LOOKS[-1] == 80
     found, pairs = looked(Fake(change, seed=2))
-    assert not found.accepted and len(pairs.seeds) == LOOKS[-1]
-    assert "cost too much" in found.reason
+    assert not found.accepted and len(pairs.starts.seeds) == LOOKS[-1]
+    assert "not sure" in found.reason
 
 
 def test_starts_that_the_mpc_cannot_finish_are_left_out_and_do_not_count() -> None:
     simulator = Fake(gains(0.2, 0.001), lost=lambda seeds: seeds % 8 == 3)
     found, pairs = looked(simulator)
-    assert found.accepted and len(pairs.seeds) >= ENOUGH
-    assert not any(seed % 8 == 3 for seed in pairs.seeds)
-    assert np.isfinite(pairs.mpc).all() and np.isfinite(pairs.policy).all()
-    assert len(pairs.seeds) == len(pairs.mpc) == len(pairs.episodes) == len(pairs.unsafe)
-    with pytest.raises(ValueError, match="The MPC's own cost is finite in none of 10 episodes"):
+    assert found.accepted and len(pairs.starts.seeds) >= ENOUGH
+    assert not any(seed % 8 == 3 for seed in pairs.starts.seeds)
+    assert np.isfinite(pairs.starts.mpc.costs).all() and np.isfinite(pairs.scores.costs).all()
+    assert len(pairs.starts.seeds) == len(pairs.scores.costs) == len(pairs.episodes)
+    with pytest.raises(ValueError, match="cost is a finite number on none of 10 new starts"):
         looked(Fake(gains(0.2, 0.001), lost=lambda seeds: seeds >= 0))
 
 
 @pytest.mark.parametrize("cost", [np.nan, np.inf])
 def test_a_policy_s_cost_that_is_not_finite_is_refused_at_once(cost) -> None:
     found, pairs = looked(Fake(lambda seeds, rng: np.where(seeds == 4, cost, -0.5)))
-    assert not found.accepted and len(pairs.seeds) == 10
+    assert not found.accepted and len(pairs.starts.seeds) == 10
     said = "1 of 10 starts with a cost or an observation that is no finite number"
     assert found.reason == f"{said}, the first is start 4"
     assert not found.safe
@@ -116,7 +123,7 @@ def test_a_bound_that_is_broken_is_refused_at_the_first_look_that_shows_it() -> 
         return np.where(seeds == 15, 0.25, 0.0)
 
     found, pairs = looked(Fake(gains(0.5, 0.001), beyond=beyond))
-    assert not found.accepted and not found.safe and len(pairs.seeds) == 20
+    assert not found.accepted and not found.safe and len(pairs.starts.seeds) == 20
     assert found.reason.startswith(f"1 of 20 starts with {UNSAFE[4]}, the first is start 15: ")
     assert "exceeds its bound by" in found.reason
     assert pairs.lost == [15]
@@ -126,35 +133,36 @@ def test_a_bound_that_is_broken_is_refused_at_the_first_look_that_shows_it() -> 
 def test_where_a_bound_is_in_force_acceptance_takes_all_pairs(excess) -> None:
     beyond = lambda seeds: np.where(seeds == 3, excess, 0.0)  # noqa: E731
     found, pairs = looked(Fake(gains(0.2, 0.001), beyond=beyond))
-    assert found.accepted and len(pairs.seeds) == (80 if excess else 40)
+    assert found.accepted and len(pairs.starts.seeds) == (80 if excess else 40)
 
 
 def test_what_costs_more_is_refused_at_the_first_look() -> None:
     found, pairs = looked(Fake(gains(-0.05, 0.01)))
-    assert not found.accepted and len(pairs.seeds) == 10
+    assert not found.accepted and len(pairs.starts.seeds) == 10
     assert found.safe and found.change > 0
     assert found.reason
 
 
 def test_a_small_gain_is_too_small() -> None:
     found, _ = looked(Fake(gains(0.5 * RULE.least_gain, 1e-6)))
-    assert not found.accepted and "too small a gain, or not sure" in found.reason
+    assert not found.accepted and "too little a gain" in found.reason
 
 
 def test_a_mean_gain_does_not_pay_for_the_worst_starts() -> None:
     found, pairs = looked(Fake(lambda seeds, rng: np.where(seeds % 10 == 3, 0.2, -0.5)))
     assert not found.accepted
     assert "the worst 5 % of the starts cost too much, start" in found.reason
-    assert set(pairs.lost) == {seed for seed in pairs.seeds if seed % 10 == 3}
+    assert set(pairs.lost) == {seed for seed in pairs.starts.seeds if seed % 10 == 3}
 
 
 def test_one_dear_start_that_gains_does_not_hide_that_all_others_lose() -> None:
-    costs = 1.0 + np.random.default_rng(np.arange(40)).pareto(3.0, 40)
-    pairs = Pairs(Fake(lambda seeds, rng: np.where(seeds == np.argmax(costs), -0.32, 0.009)))
-    pairs.play(act, range(40))
-    assert pairs.change < -RULE.least_gain  # all in all it is cheaper
+    dearest = np.argmax(costs_of(range(40)))
+    change = lambda seeds, rng: np.where(seeds == dearest, -0.32, 0.009)  # noqa: E731
+    pairs = SimulatorTrial(Fake(change))
+    assert [*pairs.stages(act, [40])] == [1]
+    found, _ = pairs.check(1, RULE.significance, final=True)
+    assert found.change < -RULE.least_gain  # all in all it is cheaper
     assert pairs.relative.mean() > 0
-    found = pairs.check(1, RULE.significance, final=True)
     assert not found.accepted and "not sure" in found.reason
 
 
@@ -166,26 +174,21 @@ def test_of_a_thousand_policies_that_are_no_better_at_most_a_twentieth_is_accept
         simulator.next_seed = 100 * seed
         found, pairs = looked(simulator)
         accepted += found.accepted
-        least = min(least, len(pairs.seeds)) if found.accepted else least
+        least = min(least, len(pairs.starts.seeds)) if found.accepted else least
     assert accepted <= 50
     assert least >= ENOUGH
 
 
 def test_another_policy_plays_the_same_starts_and_the_mpc_does_not_again() -> None:
     simulator = Fake(gains(0.2, 0.0))
-    pairs = Pairs(simulator)
-    pairs.play(act, range(10))
-    simulator.turn = 1  # whose turn is the policy's
-    simulator.change = gains(0.3, 0.0)
-    other = pairs.replay(act)
-    assert simulator.played == [10] and other.seeds == pairs.seeds
-    np.testing.assert_allclose(pairs.relative, -0.2 * pairs.mpc / np.maximum(
-        pairs.mpc, np.median(pairs.mpc)))  # fmt: skip
-    assert other.change == pytest.approx(-0.3) and pairs.change == pytest.approx(-0.2)
-
-
-def test_without_a_policy_the_mpc_stands_for_it() -> None:
-    pairs = Pairs(Fake(gains(0.5, 0.0)))
-    pairs.play(None, range(10))
-    assert not pairs.relative.any() and pairs.change == 0 and not pairs.lost
-    assert not pairs.check(0, RULE.significance, final=False).accepted
+    pairs = SimulatorTrial(simulator)
+    changes = []
+    for share in (0.2, 0.3):
+        simulator.change = gains(share, 0.0)
+        next(pairs.stages(act, [10]))
+        simulator.turn = 1  # whose turn is the policy's
+        changes.append(pairs.check(1, RULE.significance, final=False)[0].change)
+        mpc = pairs.starts.mpc.costs
+        np.testing.assert_allclose(pairs.relative, -share * mpc / np.maximum(mpc, np.median(mpc)))
+    assert simulator.played == [10] and pairs.starts.seeds == (*range(10),)
+    assert changes == pytest.approx([-0.2, -0.3]) and not pairs.lost

@@ -6,13 +6,11 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 import torch as th
 
-from sb3_yann.twin.dynamics import Coordinates, Dynamics
-from sb3_yann.twin.ensemble import fit_ensemble
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import log, observed, problem
 
 
@@ -50,31 +48,6 @@ def test_it_learns_a_nonlinear_map_that_it_predicts_where_it_has_not_seen_it() -
         error = residual.predict(z) - y
         assert np.mean(error[:, 1] ** 2) < 0.05 * np.mean(linear[:, 1] ** 2)
         assert np.abs(error[:, 0]).max() < 1e-3 * coordinates().units[0]  # the model has it
-
-
-def test_members_are_fitted_to_logs_of_their_own() -> None:
-    one, other = fitted()
-    assert not np.allclose(one.weights[4], other.weights[4])
-
-
-@pytest.mark.parametrize("batch", [1, 30])
-def test_its_slopes_are_those_of_differences(batch) -> None:
-    residual, rng = fitted()[0], np.random.default_rng(0)
-    z = rng.uniform(-1, 1, (batch, 3))
-    found, step = residual.jacobian(z), 1e-6
-    for j, e in enumerate(step * np.eye(3)):
-        slope = (residual.predict(z + e) - residual.predict(z - e)) / (2 * step)
-        np.testing.assert_allclose(found[..., j], slope, rtol=1e-6, atol=1e-9)
-
-
-def test_a_stack_is_the_members_one_by_one() -> None:
-    members, rng = fitted(), np.random.default_rng(1)
-    stack, z = Residual.stack(members), rng.uniform(-1, 1, (2, 7, 3))
-    for at in (z, z[:1]):  # rows of each, or the same for both
-        rows = np.broadcast_to(at, z.shape)
-        for name in ("predict", "jacobian"):
-            single = [getattr(m, name)(r) for m, r in zip(members, rows, strict=True)]
-            np.testing.assert_allclose(getattr(stack, name)(at), single, rtol=1e-12, atol=1e-14)
 
 
 def test_a_seed_repeats_it_and_no_global_random_state_moves() -> None:
@@ -126,15 +99,6 @@ def test_a_plant_that_its_linear_model_describes_leaves_nothing_to_learn() -> No
     z, y = map(np.concatenate, zip(*map(box.regression, exact), strict=True))
     assert np.abs(y).max() < 1e-12
     assert np.abs(found.predict(z)).max() < 1e-8
-
-
-def test_beyond_the_data_it_stays_what_it_is_at_their_edge() -> None:
-    dynamics = Dynamics(problem(), coordinates(), fitted())
-    edge = np.array([[[coordinates().high[0], 0.3]]])
-    u = np.zeros((1, 1, 1))
-    far = edge + np.array([50.0, 0.0])
-    np.testing.assert_allclose(dynamics.residual(far, u), dynamics.residual(edge, u))
-    np.testing.assert_allclose(dynamics.jacobians(far, u)[0][:, 0, 1, 0], 0.0, atol=1e-15)
 
 
 def test_with_an_observer_it_is_fitted_to_what_the_plant_did() -> None:

@@ -8,10 +8,9 @@ from functools import cache, partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import TimeLimit
 
+import unit_samples as units
 from experiments.optimum import clipped_pendulum_optimum, cstr_optimum
-from sample_plants import LinearPlant
 from sb3_yann import (
     Headroom,
     LinearModel,
@@ -23,11 +22,12 @@ from sb3_yann import (
     headroom,
     offset_free,
 )
+from sb3_yann.audit.meaning import in_deviations
 from sb3_yann.evaluation import evaluate
-from sb3_yann.improvement import model
-from sb3_yann.improvement.gains import verdict_of
-from sb3_yann.twin.ensemble import fit_ensemble
-from sb3_yann.wrappers import ObserveDisturbance
+from sb3_yann.improvement import simulator
+from sb3_yann.improvement.measuring import verdict_of
+from sb3_yann.twin.selection import fit_ensemble
+from sb3_yann.wrappers import ObserveDisturbance, SetPoint, StageCost
 from sb3_yann_envs import problems
 
 NO_PLANS = 900
@@ -75,7 +75,7 @@ class Heater(gym.Env):
 @pytest.fixture(autouse=True)
 def quick(monkeypatch) -> None:
     """The plants of these tests are simple: networks know them sooner."""
-    monkeypatch.setattr(model, "fit_ensemble", partial(fit_ensemble, updates=1000))
+    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=1000))
 
 
 @cache
@@ -201,12 +201,6 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
     assert verdict_of(*parts, doubt=doubt) == verdict
 
 
-def test_what_may_be_chance_is_not_called_little() -> None:
-    costs = np.array([1.0, 3.0])
-    found = Headroom(costs, costs, costs, costs / 2, 0.5, 0.0, 0.0, "not known", "a plant")
-    assert "may be chance on so few starts. Take more: n_starts" in str(found)
-
-
 def test_changes_of_a_set_point_are_not_known_before() -> None:
     """With preview the optimum would move before the change; the plan costs what the MPC costs."""
     found = headroom(heater(), Heater(steps=40), n_starts=6, seed=20)
@@ -249,20 +243,6 @@ def test_a_twin_s_members_share_the_starts() -> None:
     found = headroom(problems.cstr(), twin, n_starts=3)
     alone = evaluate(problems.cstr().explicit(), partial(twin.env, 2), [2])
     np.testing.assert_allclose(found.mpc_costs[2], alone.costs[0], rtol=1e-5)
-
-
-def test_bounds_of_a_state_hold_for_plans() -> None:
-    """A bound that the plant may not cross: the plan keeps it where it would pay to break it."""
-    bounds = {"u_min": -1, "u_max": 1, "x_min": [-3, -0.5], "x_max": [3, 0.5]}
-    mpc = LinearMPC(
-        LinearModel([[1, 1], [0, 1]], [[0.5], [1]], 1.0),
-        Q=np.eye(2),
-        R=[[0.1]],
-        horizon=8,
-        **bounds,
-    )
-    env = TimeLimit(LinearPlant(mpc), 30)
-    assert headroom(mpc, env, n_starts=3).total < 0.02
 
 
 def test_in_a_twin() -> None:
@@ -338,12 +318,6 @@ def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:
     assert found.offset == 0 and np.array_equal(found.observer_costs, found.mpc_costs)
 
 
-def test_a_plant_without_a_time_limit_may_be_given_one() -> None:
-    bounds = {"u_min": -1, "u_max": 1, "theta_min": -3, "theta_max": 3}
-    mpc = LinearMPC(LinearModel([[0.9]], [[1.0]], 1.0), Q=[[1]], R=[[1]], horizon=2, **bounds)
-    assert headroom(mpc, TimeLimit(LinearPlant(mpc), 30), n_starts=3).verdict == "keep the MPC"
-
-
 def test_what_an_observer_loses_is_shown_as_a_loss() -> None:
     costs = np.array([10.0, 20.0, 30.0])
     dear = np.array([9.0, 20.0, 43.0])
@@ -377,3 +351,45 @@ def test_nothing_found_with_plans_of_a_poor_model_is_not_called_little() -> None
     text = found.report()
     assert "nothing was found, but plans were made in a model of its episodes that is not" in text
     assert "they cost 3.1 % more than the MPC" in text
+
+
+MPC = units.plant_mpc()
+
+
+def tracking() -> LinearMPC:
+    """Return an MPC of the same plant whose temperature follows a set-point."""
+    design = {"Q": np.diag([1, 0]), "R": [[0.1]], "horizon": 3}
+    return LinearMPC(units.MODEL, **design, **units.LIMITS, tracking=Tracking([0], 349, 351))
+
+
+def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
+    make = in_deviations(lambda: units.plant("plant", "plant"), MPC)
+    plain = headroom(MPC.deviations, make, n_starts=3)
+    shown = StageCost(units.plant("plant", "plant"), MPC)
+    found = headroom(MPC, shown, n_starts=3)
+    np.testing.assert_allclose(found.mpc_costs, plain.mpc_costs, rtol=1e-9)
+    np.testing.assert_allclose(found.best_costs, plain.best_costs, rtol=1e-6)
+    assert found.mpc_costs.max() < 10 and found.verdict == "keep the MPC"
+
+
+@pytest.mark.parametrize(
+    ("shows", "takes", "message"),
+    [
+        ("plant", "normalized", r"normalized inputs, from \[-1.*RescaleAction"),
+        ("deviation", "deviation", r"takes deviations, from \[-2.*plant units"),
+        ("deviation", "plant", "temperature = .* is shown.* this is a deviation"),
+    ],
+)
+def test_other_units_are_refused(shows, takes, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        headroom(MPC, units.plant(shows, takes), n_starts=2)
+
+
+@pytest.mark.parametrize("low", [-1, 353])
+def test_set_points_that_are_not_the_problem_s_are_named(low) -> None:
+    plant = SetPoint(units.plant("plant", "plant"), low, low + 2)
+    with pytest.raises(
+        ValueError,
+        match=r"set-point of temperature (= -.* is a deviation|is 35.*, and the MPC was solved)",
+    ):
+        headroom(tracking(), plant, n_starts=2)

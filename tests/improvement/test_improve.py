@@ -456,9 +456,9 @@ def test_in_plant_units_it_finds_the_same(source) -> None:
 
 
 def test_what_no_check_lets_through_changes_nothing(monkeypatch) -> None:
-    from sb3_yann.improvement import trial
+    from sb3_yann.improvement import confirmation
 
-    monkeypatch.setattr(trial, "MARGIN", -1.0)  # no start can pass
+    monkeypatch.setattr(confirmation, "MARGIN", -1.0)  # no start can pass
     model = model_of()
     before = bits(model)
     found = improve(model, twin_of(), **FEW)
@@ -477,14 +477,14 @@ def test_a_twin_that_is_not_trusted_is_refused() -> None:
 
 
 def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
-    from sb3_yann.improvement import critic
+    from sb3_yann.improvement import imitation
 
-    for name, value in {"SAMPLES": 1000, "STEPS": 60, "UPDATES": 1000}.items():
-        monkeypatch.setattr(critic, name, value)
+    for name, value in {"RETURNS": 1000, "RETURN_STEPS": 60, "CRITIC_UPDATES": 1000}.items():
+        monkeypatch.setattr(imitation, name, value)
     model, rng = model_of(), np.random.default_rng(5)
     at = twin_of().starts.draw_logged(500, rng)
     u = np.clip(problem().explicit()(at) + 0.1 * rng.standard_normal((500, 1)), -1, 1)
-    returns = -critic._costs(model.policy, twin_of(), model.actor.mu, at, u)
+    returns = -imitation._discounted(model.policy, twin_of(), model.actor.mu, at, u)
     known = np.isfinite(returns)
 
     def error() -> float:
@@ -494,7 +494,7 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
             return float(np.abs(off[known]).mean())
 
     before = error()
-    critic.refit_critic(model.policy, twin_of(), seed=0)
+    imitation.refit_critic(model.policy, twin_of(), seed=0)
     assert error() < 0.8 * before
     same = model.critic_target.state_dict()
     assert all(th.equal(each, same[name]) for name, each in model.critic.state_dict().items())

@@ -1,23 +1,31 @@
-"""Episodes in a learnt model are those of its steps, and members that disagree have a price."""
+"""Episodes in a learnt model are those of its steps; members that disagree have a price."""
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
 
+from sb3_yann import PlantTwin, YannPolicy
 from sb3_yann.control.mpc.bound_excess import bound_excess
-from sb3_yann.improvement import model as module
-from sb3_yann.improvement.model import Disagreement, Model, Scenarios, SimulatorModel
-from sb3_yann.improvement.simulator import of_law
+from sb3_yann.improvement import simulator as module
+from sb3_yann.improvement.improving import _Progress, _Work
+from sb3_yann.improvement.simulator import (
+    Disagreement,
+    Scenarios,
+    SimulatorModel,
+    of_law,
+    one_step_error,
+)
 from sb3_yann.plan import TwinPlant
-from sb3_yann.twin.dynamics import Coordinates, Dynamics
-from sb3_yann.twin.ensemble import fit_ensemble
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual
-from twin_samples import log, observed, problem, rated
+from sb3_yann.twin.selection import fit_ensemble
+from twin_samples import POLYNOMIALS, Cart, log, observed, problem, rated
 
 
 @cache
@@ -30,7 +38,7 @@ def learnt() -> SimulatorModel:
         return SimulatorModel.fit(problem(), seen, None, seed=0)
 
 
-def scenarios(found: Model, each: bool = False) -> Scenarios:
+def scenarios(found: SimulatorModel, each: bool = False) -> Scenarios:
     rng = np.random.default_rng(0)
     like = Scenarios.like(found, found.episodes[:4], rng)
     members = np.arange(4) % len(found.dynamics.members) if each else None
@@ -175,3 +183,32 @@ def test_what_a_model_lacks_is_told_from_noise(noise, bend, lacks) -> None:
     none = Residual.zero(len(box.scale), mpc.model.n_states)
     found = SimulatorModel(mpc, tuple(episodes), Dynamics(mpc, box, (none, none)))
     assert found.lacks() == lacks
+
+
+def bounded() -> PlantTwin:
+    """The cart's twin, whose MPC knows a bound on its speed."""
+    mpc = replace(problem(), x_min=[-np.inf, -1.0], x_max=[np.inf, 1.0], terminal=None)
+    return PlantTwin.fit(mpc, log(4), residuals=POLYNOMIALS)
+
+
+def test_the_error_is_what_ninety_five_per_cent_of_the_steps_keep() -> None:
+    twin = bounded()
+    steps = [(x[:-1], u, x[1:]) for x, u in log(4)]
+    model, half = twin.problem.model, np.array([3.0, 3.0])
+    errors = [np.abs(after - x @ model.A.T - u @ model.B.T) / half for x, u, after in steps]
+    expected = np.quantile(np.concatenate(errors).max(axis=1), 0.95)
+    assert one_step_error(twin.dynamics.row, twin.episodes) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("given", [0.0, 0.3])
+def test_an_accepted_policy_has_that_margin_unless_another_was_given(given: float) -> None:
+    twin = bounded()
+    options = {"problem": twin.problem, "bounds_margin": given}
+    model = DDPG(YannPolicy, Cart(), device="cpu", seed=0, policy_kwargs=options)
+    work = _Work(model.policy, 4, 1, 10, 0, _Progress(False, 1))
+    work.keep_margin(twin.dynamics.row, twin.episodes)
+    work.accept(twin)
+    error = one_step_error(twin.dynamics.row, twin.episodes)
+    assert 1e-3 < error < 0.1
+    assert model.policy.bounds_margin == pytest.approx(given or error)
+    assert float(model.policy.actor_target.mu.margin) == model.policy.bounds_margin

@@ -33,8 +33,8 @@ from sb3_yann import (
     reporting,
 )
 from sb3_yann.evaluation import evaluate
+from sb3_yann.improvement.confirmation import Check
 from sb3_yann.improvement.improving import Improvement
-from sb3_yann.improvement.trial import Check
 from sb3_yann.reporting import evidence_parts, problem_parts
 from sb3_yann.wrappers import PlantEnv
 from sb3_yann_envs import problems

@@ -21,9 +21,8 @@ import pytest
 
 from sb3_yann import Controller, LinearModel, LinearMPC, export
 from sb3_yann._archive import digest_of, read_arrays, write_arrays
-from sb3_yann.commissioning.journal import CommissioningState, Journal
+from sb3_yann.commissioning.journal import CommissioningState, Journal, Record
 from sb3_yann.commissioning.plant import PlantEpisode
-from sb3_yann.commissioning.record import Record
 
 SECONDS = 10
 """After which a reader counts as hung."""

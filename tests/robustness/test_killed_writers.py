@@ -21,7 +21,7 @@ import pytest
 from tqdm import tqdm
 
 from sb3_yann import Controller, export
-from sb3_yann.commissioning.record import Record
+from sb3_yann.commissioning.journal import Record
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann_envs import problems
 

@@ -11,8 +11,8 @@ import pytest
 from stable_baselines3 import DDPG
 
 from sb3_yann import LinearModel, LinearMPC, plan
-from sb3_yann.improvement import critic, imitation, model
-from sb3_yann.twin.ensemble import fit_ensemble
+from sb3_yann.improvement import imitation, simulator
+from sb3_yann.twin.selection import fit_ensemble
 from sb3_yann_envs import ProblemBox
 from twin_samples import DT, Cart, problem
 
@@ -21,11 +21,11 @@ FEW = {"n_starts": 6, "rounds": 1, "updates": 200}
 
 def quick(patch: pytest.MonkeyPatch) -> None:
     """Let fits be short."""
-    patch.setattr(model, "fit_ensemble", partial(fit_ensemble, updates=300))
+    patch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=300))
     patch.setattr(imitation, "FITS", 2)
-    patch.setattr(critic, "SAMPLES", 512)
-    patch.setattr(critic, "STEPS", 20)
-    patch.setattr(critic, "UPDATES", 20)
+    patch.setattr(imitation, "RETURNS", 512)
+    patch.setattr(imitation, "RETURN_STEPS", 20)
+    patch.setattr(imitation, "CRITIC_UPDATES", 20)
 
 
 def quickest(patch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
+from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import alignment
+from sb3_yann_envs import cstr, problems
+from twin_samples import log, problem
 
 GAINS = np.array([1.5, 0.7])
 SELECT = ["none", "linear"]
@@ -229,3 +232,84 @@ def test_a_gain_that_depends_on_the_level_is_no_unit() -> None:
     assert of(log).trusted
     other = of([(x, u * [1, 2]) for x, u in log])
     assert "The logged u[1] moves the plant" in other.report() and not other.trusted
+
+
+@cache
+def reactor():
+    played = evaluate(problems.cstr().explicit(), "CSTR-v0", seeds=range(3))
+    return [*zip(played.observations, played.actions, strict=True)]
+
+
+KELVIN = np.array([0.0, 0.0, *cstr.X_SS[2:]])
+PER_CENT = np.array([100.0, 100.0, 1.0, 1.0])
+
+
+def refuse_or_doubt(mpc, episodes) -> None:
+    try:
+        found = PlantTwin.fit(mpc, episodes)
+    except ValueError as refused:
+        assert "A log is in plant units where" in str(refused)
+    else:
+        assert not found.trusted and "Compare units" in " ".join(found.trust.advice)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x, u: (x + cstr.X_SS, u),
+        lambda x, u: (x + KELVIN, u),
+        lambda x, u: (PER_CENT * x, u),
+        lambda x, u: (x, u + cstr.U_SS),
+    ],
+    ids=["absolute", "kelvin", "per cent", "absolute input"],
+)
+def test_a_reactor_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
+    refuse_or_doubt(problems.cstr(), [change(x, u) for x, u in reactor()])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x, u: (x + np.array([20.0, 0.0]), u),
+        lambda x, u: (100 * x, u),
+        lambda x, u: (x, 100 * u),
+    ],
+    ids=["absolute place", "per cent", "input in per cent"],
+)
+def test_the_cart_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
+    refuse_or_doubt(problem(), [change(x, u) for x, u in log(3)])
+
+
+def test_what_is_missing_in_a_poor_log_is_advised() -> None:
+    one, still = reactor()[:1], [(x, 0 * u + 0.1) for x, u in reactor()]
+    for episodes, advice in (
+        (one, "Log at least one episode more"),
+        (still, "Make a small step test on U,"),
+    ):
+        found = PlantTwin.fit(problems.cstr(), episodes, residuals=["none", "linear"])
+        assert not found.trusted and advice in found.report()
+
+
+def test_the_input_of_an_mpc_in_a_closed_loop_is_not_its_own() -> None:
+    law = problems.cstr().explicit()
+    found = PlantTwin.fit(problems.cstr(), [(x, law(x[:-1])) for x, _ in reactor()])
+    assert found.trust.excitation < 1e-9  # though it is no linear function of the state
+    assert "0.00 %: its gain rests on the given B" in found.report()
+    rng = np.random.default_rng(0)
+    dithered = [(x, np.clip(u + rng.normal(0, 10, u.shape), -55, 55)) for x, u in reactor()]
+    assert PlantTwin.fit(problems.cstr(), dithered).trust.excitation > 0.02
+
+
+def test_an_episode_cut_in_two_is_one() -> None:
+    (x, u), *_ = log(1)
+    found = PlantTwin.fit(problem(), [(x[:31], u[:30]), (x[30:], u[30:])])
+    assert not found.trusted and "There is one episode" in found.report()
+    assert PlantTwin.fit(problem(), log(3)).trusted
+
+
+def test_a_spike_is_named_where_a_log_is_not_trusted() -> None:
+    episodes = log(4)
+    episodes[2][0][17, 1] += 50.0
+    found = PlantTwin.fit(problem(), episodes)
+    said = f"Look at where x[1] is about {episodes[2][0][17, 1]:.6g}:"
+    assert not found.trusted and said in found.report()

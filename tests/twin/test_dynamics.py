@@ -1,4 +1,4 @@
-"""What a twin steps with, each number against a loop in plain numpy."""
+"""Dynamics of a twin step as plain loops in numpy do; residuals, and angles that jump."""
 
 from __future__ import annotations
 
@@ -6,11 +6,95 @@ import numpy as np
 import pytest
 
 from general_problems import solved
-from sb3_yann import LinearMPC
-from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, law_of
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, Residual, law_of
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import random_episode as episode
+
+K, N = 3, 2
+
+
+def network(seed: int, hidden: int) -> Residual:
+    rng = np.random.default_rng(seed)
+    Q = rng.normal(size=(K, K, N))
+    Q = (Q + np.swapaxes(Q, 0, 1)).reshape(K, K * N)
+    shapes = (K, hidden), (1, hidden), (hidden, hidden), (1, hidden), (hidden, N), (1, N), (K, N)
+    return Residual([*(rng.normal(size=each) for each in shapes), Q])
+
+
+@pytest.mark.parametrize("hidden", [0, 4])
+def test_it_is_the_sum_of_a_network_and_a_polynomial(hidden: int) -> None:
+    found, z = network(1, hidden), np.random.default_rng(0).uniform(-1, 1, (9, K))
+    W1, b1, W2, b2, W3, b3, L, Q = found.weights
+    expected = np.tanh(np.tanh(z @ W1 + b1) @ W2 + b2) @ W3 + b3 + z @ L
+    expected += np.einsum("bi,ijn,bj->bn", z, Q.reshape(K, K, N), z)
+    np.testing.assert_allclose(found.predict(z), expected, rtol=1e-12)
+    moves = 1e-6 * np.eye(K)
+    slopes = [(found.predict(z + e) - found.predict(z - e)) / 2e-6 for e in moves]
+    np.testing.assert_allclose(found.jacobian(z), np.stack(slopes, -1), atol=1e-8)
+
+
+@pytest.mark.parametrize("hidden", [0, 4])
+def test_a_stack_says_what_each_of_them_says(hidden: int) -> None:
+    members, z = [network(seed, hidden) for seed in range(2)], np.ones((2, 5, K))
+    z[1] *= 0.3
+    for method in ("predict", "jacobian"):
+        expected = [getattr(each, method)(rows) for each, rows in zip(members, z, strict=True)]
+        np.testing.assert_allclose(getattr(Residual.stack(members), method)(z), expected)
+
+
+def test_none_is_zero_and_a_polynomial_without_a_constant_is_so_at_rest() -> None:
+    nothing, z = Residual.zero(K, N), np.ones((2, 4, K))
+    assert not nothing.predict(z).any() and not nothing.jacobian(z).any()
+    assert nothing.jacobian(z).shape == (2, 4, N, K)
+    straight = Residual.polynomial(np.ones((K, N)))
+    assert not straight.predict(0 * z).any() and straight.is_polynomial
+
+
+DT = 0.1
+
+
+def rotor() -> LinearMPC:
+    model = LinearModel([[1.0, DT], [0.0, 1.0]], [[0.0], [DT]], DT)
+    return LinearMPC(model, Q=np.eye(2), R=[[1.0]], horizon=2, u_min=-1, u_max=1)
+
+
+def episodes(turn: float, low: float) -> list[Episode]:
+    """Return episodes of a rotor with a little friction, its angle shown from ``low`` on."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(6):
+        x = np.array([turn * rng.uniform(), rng.uniform(-1, 1) * turn / 4])
+        thetas, inputs = [], rng.uniform(-1, 1, (60, 1))
+        for u in [*inputs, [0.0]]:
+            thetas.append([low + (x[0] - low) % turn, x[1]])
+            x = x + DT * np.array([x[1], u[0] - 0.1 * x[1]])
+        found.append(Episode(np.array(thetas), inputs))
+    return found
+
+
+@pytest.mark.parametrize(("turn", "low"), [(2 * np.pi, -np.pi), (2 * np.pi, 0.0), (360.0, -180.0)])
+def test_a_wrapped_angle_is_found_and_its_jumps_are_not_learnt(turn, low) -> None:
+    mpc, log = rotor(), episodes(turn, low)
+    coordinates = Coordinates.of(mpc, log)
+    np.testing.assert_allclose(coordinates.turn, [turn, 0.0])
+    (network,) = fit_ensemble(coordinates, [log], 0, updates=500)
+    model = Dynamics(mpc, coordinates, (network,))
+    for each in log:
+        after = model.step(each.thetas[None, :-1], each.actions[None])[0]
+        error = coordinates.nearest(after, each.thetas[1:]) - each.thetas[1:]
+        assert np.abs(error).max() < 2e-3 * turn
+        assert np.ptp(after[:, 0]) <= 1.001 * turn
+
+
+def test_a_state_that_does_not_jump_is_no_angle() -> None:
+    log = episodes(2 * np.pi, -np.pi)
+    calm = [Episode(np.unwrap(e.thetas, axis=0), e.actions) for e in log]
+    assert Coordinates.of(rotor(), calm).turn is None
+    # A sensor that falls to zero now and then is none either.
+    for each in calm:
+        each.thetas[::7, 0] = 0.0
+    assert Coordinates.of(rotor(), calm).turn is None
 
 
 def bent(mpc: LinearMPC, members: int = 2) -> tuple[Dynamics, Episode]:
@@ -146,13 +230,3 @@ def test_in_a_closed_loop_the_logged_inputs_are_corrected_by_the_law() -> None:
             theta = stepped(dynamics, member, theta, u)
     assert corrected  # on a bound, at times
     np.testing.assert_allclose(dynamics.replay_in_closed_loop(log), expected, rtol=1e-9)
-
-
-def test_the_linear_model_repeats_its_own_log_at_its_own_cost() -> None:
-    mpc = solved("servo")
-    thetas, inputs = mpc.simulate([2.0, -1.0, 0.5], 15)
-    log = Episode(thetas, inputs)
-    alone = Dynamics(mpc, Coordinates.of(mpc, [log]), (Residual.zero(3, 2),))
-    np.testing.assert_allclose(alone.replay(log, np.array([0]), 15)[0, 0], thetas[:, :2])
-    cost = mpc.stage_cost(thetas[:-1], inputs).sum()
-    np.testing.assert_allclose(alone.replay_in_closed_loop(log), [cost])

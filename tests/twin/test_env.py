@@ -47,14 +47,6 @@ def test_seeds_name_the_members_and_repeat_an_episode() -> None:
     np.testing.assert_allclose(given, [0.3, -0.2], rtol=1e-6)
 
 
-def test_leaving_what_the_log_shows_is_a_violation() -> None:
-    env = twin().env()
-    env.reset(seed=0, options={"state": [2.9, 2.9]})
-    assert env.step(np.zeros(1))[-1]["violation"]
-    env.reset(seed=0, options={"state": [0.1, 0.0]})
-    assert not env.step(np.zeros(1))[-1]["violation"]
-
-
 @pytest.mark.parametrize("action", [[np.nan], [0.0, 0.0]])
 def test_an_action_that_is_none_is_refused(action) -> None:
     env = twin().env()

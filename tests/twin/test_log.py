@@ -7,7 +7,7 @@ import pytest
 
 from sb3_yann import DisturbanceBounds, LinearModel, LinearMPC, RateLimits, Tracking
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
-from twin_samples import log, problem
+from twin_samples import problem
 
 X, U = np.zeros((11, 2)), np.full((10, 1), 0.1)
 HOLED = np.where(np.arange(11)[:, None] == 4, np.nan, X)
@@ -85,26 +85,6 @@ def test_a_log_is_in_plant_units(previous) -> None:
         np.testing.assert_allclose(each.actions, expected.actions, atol=1e-12)
     with pytest.raises(ValueError, match=r"action 0 is -0.3 .* 39 and 41 .* is in plant units"):
         as_episodes(mpc, [(x, u)], [r], [d])
-
-
-def test_inputs_that_round_beyond_their_bounds_are_clipped() -> None:
-    (episode,) = as_episodes(problem(), [(X, 10.000001 * U)])
-    assert np.all(episode.actions == 1) and len(log(1)[0][1]) == 60
-
-
-def test_few_episodes_are_cut_into_pieces_that_follow_each_other() -> None:
-    whole = as_episodes(problem(), log(2))
-    parts = pieces(whole, 5)
-    assert len(parts) == 6 and sum(map(len, parts)) == 120
-    np.testing.assert_array_equal(parts[0].thetas[-1], parts[1].thetas[0])
-    assert pieces(whole, 2) == whole and pieces(whole[:1], 5) == whole[:1]
-
-
-def test_five_steps_are_an_episode_and_four_are_none() -> None:
-    (episode,) = as_episodes(problem(), [(X[:6], U[:5])])
-    assert len(episode) == 5
-    with pytest.raises(ValueError, match="episode 0 has 4 steps; 5 are the least"):
-        as_episodes(problem(), [(X[:5], U[:4])])
 
 
 def test_an_input_a_thousandth_beyond_its_bound_is_rounding_and_more_is_not() -> None:

@@ -21,7 +21,7 @@ from sb3_yann import (
     YannPolicy,
 )
 from sb3_yann.twin.selection import candidates, ridge
-from twin_samples import POLYNOMIALS, Cart, log, problem, twin
+from twin_samples import DT, POLYNOMIALS, Cart, log, problem, twin
 
 
 def test_it_predicts_episodes_that_it_has_not_seen() -> None:
@@ -43,25 +43,6 @@ def test_an_input_that_rests_is_called_by_its_name() -> None:
     text = PlantTwin.fit(mpc, log(3, act=lambda x: [0.5])).report()
     assert "force never moves" in text and "a small step test on force" in text
     assert "  force: " in text and "deviations): place " in text
-
-
-def test_the_jacobians_are_those_of_differences_inside_the_data_and_outside() -> None:
-    dynamics, rng = twin().dynamics, np.random.default_rng(0)
-    theta, u = rng.uniform(-4, 4, (5, 20, 2)), rng.uniform(-1, 1, (5, 20, 1))
-    A, B = dynamics.jacobians(theta, u)
-    for j in range(2):
-        e = 1e-6 * np.eye(2)[j]
-        slope = (dynamics.step(theta + e, u) - dynamics.step(theta - e, u)) / 2e-6
-        np.testing.assert_allclose(A[..., j], slope, atol=1e-6)
-    slope = (dynamics.step(theta, u + 1e-6) - dynamics.step(theta, u - 1e-6)) / 2e-6
-    np.testing.assert_allclose(B[..., 0], slope, atol=1e-6)
-
-
-def test_far_outside_the_data_the_residual_stays_what_it_is_at_their_edge() -> None:
-    dynamics = twin().dynamics
-    u = np.zeros((5, 1, 1))
-    far, further = (dynamics.residual(np.full((5, 1, 2), each), u) for each in (1e3, 1e6))
-    np.testing.assert_array_equal(far, further)
 
 
 def test_the_same_log_gives_the_same_twin() -> None:
@@ -107,30 +88,6 @@ def test_residuals_are_chosen_from_what_is_asked_for() -> None:
     assert np.all(found.dynamics.residual(np.ones((5, 1, 2)), np.ones((5, 1, 1))) == 0)
     with pytest.raises(ValueError, match="must be a list of some of"):
         PlantTwin.fit(problem(), log(3), residuals=["quartic"])
-
-
-@pytest.mark.parametrize("n_envs", [1, 2])
-def test_a_replay_buffer_gives_the_episodes_that_were_played(n_envs) -> None:
-    model = DDPG(
-        YannPolicy, Cart(), seed=0, gradient_steps=0, learning_starts=0, buffer_size=1000 * n_envs
-    )
-    if n_envs == 2:
-        from stable_baselines3.common.vec_env import DummyVecEnv
-
-        model = DDPG(YannPolicy, DummyVecEnv([Cart] * 2), seed=0, gradient_steps=0, train_freq=1)
-    model.learn(150 * n_envs, callback=NoActionNoise())
-    found = PlantTwin.from_buffer(model)
-    assert [len(each) for each in found.episodes] == [60, 60, 30] * n_envs
-    law = problem().explicit()
-    for episode in found.episodes:
-        np.testing.assert_allclose(episode.actions, law(episode.thetas[:-1]), atol=1e-5)
-    assert found.kind.startswith("quadratic")
-
-
-def test_an_empty_buffer_is_refused() -> None:
-    model = DDPG(YannPolicy, Cart(), buffer_size=10)
-    with pytest.raises(ValueError, match="no episode of 5 steps"):
-        PlantTwin.from_buffer(model)
 
 
 def test_a_guard_refuses_a_twin_of_another_problem_or_of_other_observations() -> None:
@@ -182,15 +139,6 @@ def test_the_model_as_it_is_is_looked_at_even_where_it_may_not_be_chosen() -> No
         PlantTwin.fit(problem(), log(3), residuals=[])
 
 
-def test_a_buffer_that_keeps_no_last_states_is_refused() -> None:
-    options = {"replay_buffer_kwargs": {"handle_timeout_termination": False}}
-    model = DDPG(YannPolicy, Cart(), optimize_memory_usage=True, **options)
-    with pytest.raises(ValueError, match="optimize_memory_usage=True keeps no last states"):
-        PlantTwin.from_buffer(model)
-    with pytest.raises(TypeError, match="must have a YannPolicy"):
-        PlantTwin.from_buffer(DDPG("MlpPolicy", Cart()))
-
-
 def test_a_copy_of_an_episode_is_no_second_one() -> None:
     (episode,) = log(1)
     found = PlantTwin.fit(problem(), [episode] * 5)
@@ -219,8 +167,6 @@ def test_what_is_no_list_of_a_log_is_named() -> None:
         PlantTwin.fit(problem(), huge)
     with pytest.raises(ValueError, match="seed = -1"):
         PlantTwin.fit(problem(), log(2), seed=-1)
-    with pytest.raises(TypeError, match="must have a YannPolicy, its policy is NoneType"):
-        PlantTwin.from_buffer(None)
 
 
 def test_the_members_other_than_the_first_know_episodes_drawn_with_replacement() -> None:
@@ -236,15 +182,6 @@ def test_the_members_other_than_the_first_know_episodes_drawn_with_replacement()
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_of_a_buffer_what_is_asked_for_reaches_the_fit() -> None:
-    model = DDPG(YannPolicy, Cart(), seed=0, gradient_steps=0, learning_starts=0, buffer_size=500)
-    model.learn(180, callback=NoActionNoise())
-    found = PlantTwin.from_buffer(model, residuals=["linear"], n_members=2)
-    assert found.kind.startswith("linear") and len(found.dynamics.members) == 2
-    assert repr(found).startswith("PlantTwin(linear, shrinkage") and "3 episodes" in repr(found)
-    assert "2 members" in repr(found)
-
-
 @pytest.mark.parametrize(
     ("dt", "unit", "own_unit"), [(2.0, "", ""), (1.0, "s", "min"), (59.0, "s", "min")]
 )
@@ -255,3 +192,14 @@ def test_a_log_of_another_sampling_time_is_refused(dt: float, unit: str, own_uni
     log = Log.from_arrays(rng.normal(size=(31, 1)), rng.normal(size=(30, 1)), dt, time_unit=unit)
     with pytest.raises(ValueError, match=f"sampled every {dt:g}.*, the model of the MPC every 1"):
         PlantTwin.fit(mpc, log)
+
+
+def test_of_a_log_with_gaps_pieces_of_five_steps_are_kept_and_the_rest_is_said() -> None:
+    states, inputs = (np.array(each) for each in zip(*log(3), strict=True))
+    times = [DT * np.arange(61)] * 3
+    times[1] = times[1] + 0.6 * DT * (np.arange(61) > 20) + 100.0 * (np.arange(61) > 23)
+    given = Log.from_arrays(states, inputs, DT, time=times)
+    found = PlantTwin.fit(problem(), given, residuals=["none"])
+    assert [len(each) for each in found.episodes] == [60, 20, 36, 60]
+    np.testing.assert_array_equal(found.episodes[2].thetas, states[1, 24:])
+    assert "Left out 1 pieces of less than 5 steps; 2 steps were gaps." in found.report()

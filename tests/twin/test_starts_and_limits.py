@@ -8,10 +8,9 @@ import pytest
 from general_problems import servo, solved
 from sb3_yann import LinearMPC, PlantTwin, SoftBounds
 from sb3_yann.twin.dynamics import Coordinates
-from sb3_yann.twin.limits import Limits
+from sb3_yann.twin.env import Limits, Starts
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
-from sb3_yann.twin.starts import Starts
 from twin_samples import log, problem, twin
 
 
@@ -32,7 +31,6 @@ def test_draws_lie_where_they_should_and_have_the_log_s_rest() -> None:
     assert np.all((around >= problem().theta_min) & (around <= problem().theta_max))
     logged = {row.tobytes() for each in twin().episodes for row in each.thetas}
     assert all(row.tobytes() in logged for row in starts.draw_logged(50, rng))
-    assert starts.draw_anywhere(50, rng).shape == (50, 2)
 
 
 def test_the_log_and_the_starts_lie_within_the_limits_and_nan_does_not() -> None:
@@ -73,16 +71,6 @@ def test_what_a_log_shows_are_its_rows_and_where_it_may_begin() -> None:
     np.testing.assert_allclose(high, np.maximum(starts.rows.max(0), middle + further))
 
 
-def test_a_log_of_many_episodes_shows_no_more_than_its_rows() -> None:
-    """Of fifty starts fewer than one in twenty lie beyond their range."""
-    rng = np.random.default_rng(0)
-    first = rng.uniform(-1, 1, (50, 2))
-    starts = Starts(problem(), first.min(0), first.max(0), first, first)
-    low, high = starts.shown
-    np.testing.assert_array_equal(low, first.min(0))
-    np.testing.assert_array_equal(high, first.max(0))
-
-
 def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
     mpc, rng = solved("servo with rates"), np.random.default_rng(0)
     held = mpc.layout.reference
@@ -97,7 +85,6 @@ def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
         assert np.all((drawn >= low[held]) & (drawn <= high[held]))
         logged = np.isin(drawn, thetas[:, held]).all(axis=1)
         assert 0.4 < logged.mean() < 0.7
-    assert not np.isin(starts.draw_anywhere(200, rng)[:, held], thetas[:, held]).all()
     assert np.isin(starts.draw(200, rng)[:, held], thetas[:, held]).all()
     never_moved = Starts(mpc, starts.low, starts.high, thetas[:1], thetas[:1])
     assert np.isin(never_moved.draw_between(50, rng)[:, held], thetas[0, held]).all()
@@ -133,18 +120,6 @@ def test_a_draw_has_the_rest_of_the_episode_that_is_named() -> None:
     np.testing.assert_array_equal(drawn[:, 2:], thetas[which, 2:])
     assert np.ptp(drawn[:, 0]) > 0 and np.all(drawn[:, :2] <= starts.high)
     np.testing.assert_array_equal(starts.first, before)  # drawn from, and not written to
-    counts = [len(starts.draw_anywhere(n, rng)) for n in (0, 1, 2, 3, 50)]
-    assert counts == [0, 1, 2, 3, 50]
-
-
-def test_draws_from_anywhere_are_a_third_each_of_beginnings_of_rows_and_of_around() -> None:
-    starts, rng = twin().starts, np.random.default_rng(0)
-    drawn = starts.draw_anywhere(100, rng)
-    rows = {row.tobytes() for row in starts.rows}
-    logged = [row.tobytes() in rows for row in drawn]
-    assert not any(logged[:34]) and all(logged[34:67])
-    assert np.all((drawn[:34] >= starts.low) & (drawn[:34] <= starts.high))
-    assert not np.all((drawn[67:] >= starts.low) & (drawn[67:] <= starts.high))
 
 
 @pytest.mark.parametrize("k", [2, 4, 12])
