@@ -241,7 +241,7 @@ class Dynamics:
         begin = np.repeat(episode.thetas[starts][None], len(self.members), axis=0)
         given = episode.thetas[times][..., self.row.given]
         rows, _ = self._run(lambda t, _: episode.actions[times[t]], begin, steps, given)
-        return np.moveaxis(rows[..., self.row.state], 0, 2)
+        return np.asarray(np.moveaxis(rows[..., self.row.state], 0, 2))
 
     def roll_out(
         self,
