@@ -273,7 +273,8 @@ class Dynamics:
 
         def inputs(t: int, rows: Array) -> Array:
             correction = law(row.shown(rows[:, 0])) - logged[t]
-            return np.clip(episode.actions[t] + correction, own.u_min, own.u_max)[:, None]
+            u: Array = np.clip(episode.actions[t] + correction, own.u_min, own.u_max)
+            return u[:, None]
 
         begin = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
         given = episode.thetas[:-1, None, row.given]
