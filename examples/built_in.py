@@ -13,7 +13,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from sb3_yann import CostAudit, ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
-from sb3_yann.evaluation import evaluate, plots, summary_table
+from sb3_yann.evaluation import comparison_table, evaluate, plots
 
 TEST_SEEDS = range(2000, 2050)  # starts that training never sees
 
@@ -63,7 +63,7 @@ def main() -> None:
     model.learn(200 * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, make_env, TEST_SEEDS)
 
-    console.print(summary_table("Cost of 50 unseen starts, Pendulum-v1", before, after))
+    console.print(comparison_table("Cost of 50 unseen starts, Pendulum-v1", before, after))
     runs = {"before (linear MPC)": before, "after training": after}
     Path("out").mkdir(exist_ok=True)
     plots.loops_figure(mpc, runs).savefig("out/built_in.png")

@@ -16,7 +16,7 @@ from stable_baselines3 import DDPG
 from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
 from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
-from sb3_yann.evaluation import evaluate, plots, summary_table
+from sb3_yann.evaluation import comparison_table, evaluate, plots
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
@@ -67,7 +67,7 @@ def main() -> None:
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)
 
-    console.print(summary_table("Cost of 50 unseen set-point sequences", before, after))
+    console.print(comparison_table("Cost of 50 unseen set-point sequences", before, after))
     both = {"before (linear MPC)": mpc.explicit(), "after training": model}
     runs = {name: evaluate(policy, make, TEST_SEEDS[:1]) for name, policy in both.items()}
     figure = plots.loops_figure(mpc, runs, quantities=[0, 1, 6, 7, 8])

@@ -8,7 +8,7 @@ from rich import print
 from stable_baselines3 import DDPG
 
 from sb3_yann import ImprovementGuard, LinearMPC, NoActionNoise, SimulatedEpisodes, offset_free
-from sb3_yann.evaluation import evaluate, summary_table
+from sb3_yann.evaluation import comparison_table, evaluate
 from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs.pcgym import PCGymEnv
 
@@ -34,7 +34,7 @@ def main() -> None:
     explores = SimulatedEpisodes(make_env)
     model.learn(3570, callback=[NoActionNoise(), explores, guard], progress_bar=True)  # 30 episodes
     after = evaluate(model, make_env, range(2000, 2030))
-    print(summary_table("Cost of 30 unseen set-point sequences", before, after))
+    print(comparison_table("Cost of 30 unseen set-point sequences", before, after))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from stable_baselines3 import DDPG
 from quadrotor_plant import DT, MAX_THRUST, STARTS, Quadrotor, derivative
 from sb3_yann import ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import LinearModel, LinearMPC, SoftBounds
-from sb3_yann.evaluation import evaluate, plots, summary_table
+from sb3_yann.evaluation import comparison_table, evaluate, plots
 from sb3_yann.wrappers import StageCost
 
 STEPS = 100  # of one episode: 5 s
@@ -65,7 +65,7 @@ def main() -> None:
     model.learn(STEPS * arguments.episodes, callback=[NoActionNoise(), guard], progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)
 
-    console.print(summary_table("Cost of 100 unseen starts", before, after))
+    console.print(comparison_table("Cost of 100 unseen starts", before, after))
     taken = sum(each.verdict != "rejected" for each in guard.decisions)
     console.print(f"The guard accepted {taken} of {len(guard.decisions)} candidates.")
     both = {"before (linear MPC)": mpc.online(), "after training": model}

@@ -132,8 +132,6 @@ def _solve(options: Namespace) -> None:
 
 def _evaluate(options: Namespace) -> None:
     """Play the same episodes with a model's MPC and with the model, and print how they compare."""
-    from rich.console import Console
-
     from sb3_yann import evaluation
 
     seeds = _seeds(options.episodes, options.seed)
@@ -142,7 +140,7 @@ def _evaluate(options: Namespace) -> None:
     model.policy.limit_correction(0.0)  # what is left is the MPC
     mpc = evaluation.evaluate(model, env, seeds)
     title = f"{options.episodes} episodes from seed {options.seed}: the MPC, and {options.model}"
-    Console().print(evaluation.summary_table(title, mpc, policy))
+    print(evaluation.comparison_table(title, mpc, policy))
 
 
 def _plot(options: Namespace) -> None:

@@ -31,7 +31,7 @@ from sb3_yann import (
 from sb3_yann.commissioning.journal import Record, _with_digest
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.control import PiecewiseAffine
-from sb3_yann.evaluation import comparison_table, evaluate, summary_table
+from sb3_yann.evaluation import comparison_table, evaluate
 from sb3_yann.evaluation.plots import loops_figure
 from sb3_yann.wrappers import (
     ObserveDisturbance,
@@ -73,7 +73,7 @@ WRONG_KINDS = {
         lambda: comparison_table("", None, played(0)),
         f"before = None {PLAYED}",
     ),
-    "no episodes after": (lambda: summary_table("", played(0), 3), f"after = 3 {PLAYED}"),
+    "no episodes after": (lambda: comparison_table("", played(0), 3), f"after = 3 {PLAYED}"),
     "runs without names": (lambda: drawn([played(0)]), "runs = .* must be a mapping"),
     "a number for a run": (lambda: drawn({"a": 1}), rf"runs\['a'\] = 1 {PLAYED}"),
 }
@@ -96,16 +96,8 @@ WRONG_VALUES = {
         lambda: comparison_table("", played(), played()),
         "before has 0 episodes and after 0; .* one at least",
     ),
-    "no episodes to sum up": (
-        lambda: summary_table("", played(), played()),
-        "before has 0 episodes and after 0; .* one at least",
-    ),
     "a comparison of other seeds": (
         lambda: comparison_table("", played(0, 1), played(0)),
-        "before has 2 episodes and after 1; they must be those of the same seeds",
-    ),
-    "one episode beside many": (
-        lambda: summary_table("", played(0, 1), played(0)),
         "before has 2 episodes and after 1; they must be those of the same seeds",
     ),
 }
