@@ -395,7 +395,7 @@ def improve_part(subject: Subject) -> Part:
     for k, each in enumerate(found, start=1):
         checks = str(len(each.checks))
         place = f"{each.where}: {each.source}"
-        rows.append([str(k), place, str(each.episodes), checks, each.report()])
+        rows.append([str(k), place, str(each.episodes), checks])
     settings = [[name.replace("_", " "), str(value)] for name, value in found[-1].settings.items()]
     how = (
         "Episodes are those of the log that the twin was fitted to, or those that were played in "
@@ -405,7 +405,8 @@ def improve_part(subject: Subject) -> Part:
     content = [
         paragraph(finding.text),
         paragraph(how),
-        table(["", "in", "episodes", "candidates", "what came of it"], rows),
+        table(["", "in", "episodes", "candidates"], rows),
+        *(lines(f"{k}. {each.report()}") for k, each in enumerate(found, start=1)),
         tag("h3", "Settings of the last improvement"),
         table(["setting", "value"], settings),
     ]
