@@ -202,7 +202,13 @@ class Log:
     def with_gaps(
         cls, outputs: Arrays, inputs: Arrays, dt: float, disturbances: Arrays | None = None
     ) -> Log:
-        """Return the log of arrays, cut where an entry is NaN that is read in most samples."""
+        """Return the log of arrays, cut where an entry is NaN that is read in most samples.
+
+        Parameters
+        ----------
+        outputs, inputs, dt, disturbances
+            As of :meth:`from_arrays`, NaN where nothing was read.
+        """
         given = {"outputs": outputs, "inputs": inputs, "disturbances": disturbances}
         return cls._of(_records(given, gaps=True), dt)
 
