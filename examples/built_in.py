@@ -63,7 +63,7 @@ def main() -> None:
     model.learn(200 * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, make_env, TEST_SEEDS)
 
-    console.print(comparison_table("Cost of 50 unseen starts, Pendulum-v1", before, after))
+    print(comparison_table("Cost of 50 unseen starts, Pendulum-v1", before, after))
     runs = {"before (linear MPC)": before, "after training": after}
     Path("out").mkdir(exist_ok=True)
     plots.loops_figure(mpc, runs).savefig("out/built_in.png")

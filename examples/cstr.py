@@ -39,7 +39,7 @@ def main() -> None:
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, "CSTR-v0", TEST_SEEDS)
 
-    console.print(comparison_table("Cost of ten test episodes, CSTR-v0", before, after))
+    print(comparison_table("Cost of ten test episodes, CSTR-v0", before, after))
     console.print(f"Violations of {TEMPERATURE_LIMIT:g} K in training: {diagnostics.violations}")
     taken = sum(each.verdict != "rejected" for each in guard.decisions)
     console.print(

@@ -67,7 +67,7 @@ def main() -> None:
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)
 
-    console.print(comparison_table("Cost of 50 unseen set-point sequences", before, after))
+    print(comparison_table("Cost of 50 unseen set-point sequences", before, after))
     both = {"before (linear MPC)": mpc.explicit(), "after training": model}
     runs = {name: evaluate(policy, make, TEST_SEEDS[:1]) for name, policy in both.items()}
     figure = plots.loops_figure(mpc, runs, quantities=[0, 1, 6, 7, 8])

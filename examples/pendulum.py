@@ -45,7 +45,7 @@ def main() -> None:
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, "ClippedPendulum-v0", TEST_SEEDS)
 
-    console.print(comparison_table("Cost of ten test episodes, ClippedPendulum-v0", before, after))
+    print(comparison_table("Cost of ten test episodes, ClippedPendulum-v0", before, after))
     runs = {"before (linear MPC)": before, "after training": after}
     plots.loops_figure(model.policy.problem, runs).savefig("out/pendulum.png")
     console.print("Trajectories: out/pendulum.png")

@@ -65,7 +65,7 @@ def main() -> None:
     model.learn(STEPS * arguments.episodes, callback=[NoActionNoise(), guard], progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)
 
-    console.print(comparison_table("Cost of 100 unseen starts", before, after))
+    print(comparison_table("Cost of 100 unseen starts", before, after))
     taken = sum(each.verdict != "rejected" for each in guard.decisions)
     console.print(f"The guard accepted {taken} of {len(guard.decisions)} candidates.")
     both = {"before (linear MPC)": mpc.online(), "after training": model}

@@ -540,7 +540,7 @@ def paired_rows(
     costs: Array, mpc: Array, *, level: float = 0.05, in_turns: bool = False
 ) -> dict[str, str]:
     """Return the rows `change` and `worst_start` of costs from the same starts as the MPC's."""
-    change = f"mean cost {costs.mean():.5g} over {len(costs)} episodes, MPC {mpc.mean():.5g}"
+    change = f"{costs.mean():.5g} instead of {mpc.mean():.5g} over {len(costs)} episodes"
     size = float(np.abs(mpc).mean())
     if not (size and np.isfinite(size)):
         return {"change": change}

@@ -53,7 +53,7 @@ from sb3_yann.reporting.subject import (
 )
 
 NO_ENV = "No env was given: closed loops are left out. Pass report(model, env=...) to play them."
-FAR = 100.0  # % of half the range of an input: as far from the MPC as its middle from a bound
+FAR = 50.0  # % of the range of an input: as far from the MPC as its middle from a bound
 ROUNDING = 1e-6  # a relative difference of costs, or one in half-widths of inputs, that is none
 
 
@@ -196,7 +196,7 @@ def distance_part(subject: Subject) -> Part:
     for where, of in points.items():
         apart = _distance(subject, of)
         for k, name in enumerate(with_units(problem.model)[1]):
-            own, share = apart[:, k], 100 * apart[:, k].max() / problem.u_half[k]
+            own, share = apart[:, k], 50 * apart[:, k].max() / problem.u_half[k]
             values = own.mean(), np.percentile(own, 95), own.max()
             rows.append([name, where, *map(number, values), f"{share:.2f}"])
     bound, networks = policy.max_correction, policy.actor.mu.n_networks
@@ -217,7 +217,7 @@ def distance_part(subject: Subject) -> Part:
             f"bounds, or the set in which inputs can keep them {lasting} "
             f"({len(kept.g)} half-spaces, margin {margin:g} % of a half-width)."
         )
-    head = ["input", "at", "mean", "95 % are below", "largest", "largest, % of half the range"]
+    head = ["input", "at", "mean", "95 % are below", "largest", "largest, % of the range"]
     content = [
         paragraph(
             f"The policy is the MPC's law plus what {networks} {adds}, clipped to the bounds of "
@@ -240,7 +240,7 @@ def distance_part(subject: Subject) -> Part:
     if inside:
         text = f"Inputs keep their bounds at {len(theta)} random points of the box of parameters."
     name, where, *_, share = max(rows, key=lambda row: float(row[-1]))
-    largest = f"The policy is at most {share} % of half the range of {name} from the MPC, at"
+    largest = f"The policy is at most {share} % of the range of {name} from the MPC, at"
     kind = "look" if float(share) > FAR else "note"
     findings = make_finding(inside, text), Finding(kind, f"{largest} {where}.")
     return Part("Where and how far the policy leaves the MPC", join(content), findings)
@@ -525,7 +525,7 @@ def again_part(subject: Subject) -> Part:
     ]
     parts = [
         tag("h3", "Versions"), table(["library", "version"], versions),
-        tag("h3", f"Settings of the {type(model).__name__}"), table(["setting", "value"], settings),
+        tag("h3", "Settings of the learner"), table(["setting", "value"], settings),
         tag("h3", "Fingerprints (SHA-256)"), table(["what", "fingerprint"], prints),
     ]  # fmt: skip
     return Part("To do it again", join(parts))

@@ -295,7 +295,7 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
     decisions = [*refused, *others, decision("accepted in part", 30.0, "half")]
     assert said_of(decisions, 12) == [
         "The policy accepted last is better than the MPC.",
-        "  change       -25.00 % (-25.00 to -25.00 %, 90 %); mean cost 30 over 12 episodes, MPC 40",
+        "  change       -25.00 % (-25.00 to -25.00 %, 90 %); 30 instead of 40 over 12 episodes",
         "  worst start  -25.00 % of the MPC's mean cost",
         "  violations   more than the MPC's from 0 of 12 starts",
         "  candidates   1 accepted, 1 in part, 3 refused, in 7 episodes",
@@ -307,10 +307,10 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
 @pytest.mark.parametrize(
     ("last", "words"),
     [
-        (decision("accepted", 41.0), ("gains nothing", "+2.50 %", "mean cost 41", "MPC 40")),
+        (decision("accepted", 41.0), ("gains nothing", "+2.50 %", "41 instead of 40")),
         (decision("rejected", 40.0, "x"), ("is not the MPC, and gains nothing", "+0.00 %")),
-        (decision("accepted", -2.0, mpc=0.0), ("is better", "  mean cost -2 over 5 episodes")),
-        (decision("accepted", -50.0, mpc=-40.0), ("is better", "-25.00 %", "MPC -40")),
+        (decision("accepted", -2.0, mpc=0.0), ("is better", "  -2 instead of 0 over 5 episodes")),
+        (decision("accepted", -50.0, mpc=-40.0), ("is better", "-25.00 %", "of -40 over")),
     ],
     ids=["more", "as much", "an MPC that costs nothing", "negative costs"],
 )
