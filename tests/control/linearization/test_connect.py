@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization.simulator import sample_time
+from sb3_yann.control.linearization.simulator import sample_time, to_vector
 
 
 def box(low: Any, high: Any) -> gym.spaces.Box:
@@ -130,3 +130,7 @@ def test_the_time_of_a_step_is_given_or_the_plant_s_own() -> None:
     plant.dt = np.inf
     with pytest.raises(ValueError, match="Plant has no dt, tau or DT to take it from"):
         sample_time(plant, None)
+
+
+def test_a_vector_of_numbers_is_a_state_and_words_are_none() -> None:
+    assert to_vector([1, 2]).tolist() == [1.0, 2.0] and to_vector(["a"]) is None

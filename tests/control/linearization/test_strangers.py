@@ -214,6 +214,13 @@ def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
         LinearModel.from_env(Careless(limit=30))
     LinearModel.from_env(TruncateAtTimeLimit(Careless(limit=30), 30))  # nothing warns
 
+    class Earlier(Careless):
+        def step(self, action):
+            self.limit = 30 if action[0] < 0.1 else 20
+            return super().step(action)
+
+    LinearModel.from_env(Earlier(limit=30))  # nor of an end that inputs bring about
+
 
 class Cone(gym.Env):
     """A conical tank: the higher its level, the slower, so that a search may run away upwards."""

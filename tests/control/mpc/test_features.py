@@ -224,7 +224,9 @@ def _arguments(mpc: LinearMPC) -> dict[str, Any]:
 
 def test_problems_are_copied_pickled_and_changed_with_all_their_parts() -> None:
     mpc = problem(draw(np.random.default_rng(4), FEATURES))
-    assert pickle.loads(pickle.dumps(mpc)) == mpc == replace(mpc)
+    copied = pickle.loads(pickle.dumps(mpc))
+    assert copied == mpc == replace(mpc) and hash(copied) == hash(mpc)
+    assert cart(control_horizon=3).blocks == (1, 1, 4)
     other = replace(mpc, Q=2 * mpc.Q)
     assert (other.control_horizon, other.layout) == (mpc.control_horizon, mpc.layout)
 
