@@ -35,6 +35,7 @@ PATIENCE = 4  # orders without a better criterion after which none is tried any 
 SURE = 10.0
 """By so much, over all steps, dead time must lower the criterion."""
 ROUNDING = 1e-12
+SETTLING = 30  # samples in which a filter finds the first state
 FOLLOWS = 0.1  # share of an input that its feedback law leaves, below which the notes say so
 WORSE = 1.1
 """Mean square of free runs, relative to those without dead time, from which it is not taken."""
@@ -196,8 +197,12 @@ class Search:
 
         The chunks' own first states would count as parameters.
         """
-        shown = np.concatenate([each.states[1:] for each in self.fitted])
-        guess = np.concatenate([predicted(model, each, start, 1) for each in self.fitted])
+        # A record's first samples say where it began, not how the plant moves.
+        first = [min(SETTLING, len(each) // 5) for each in self.fitted]
+        shown = np.concatenate([x.states[1 + k :] for x, k in zip(self.fitted, first, strict=True)])
+        guess = np.concatenate(
+            [predicted(model, x, start, 1)[k:] for x, k in zip(self.fitted, first, strict=True)]
+        )
         read = np.isfinite(shown)
         steps, q = shown.shape
         price = 2 * np.log(np.log(max(steps, 16)))
