@@ -250,6 +250,13 @@ def linearize_env(
         x = None if x_ss is None else partly_known("x_ss", x_ss)
         u = None if u_ss is None else partly_known("u_ss", u_ss)
         found = _linearize(simulator, x, u, step_time, scale)
+        moves = np.linalg.svd(found.A - np.eye(len(found.A)), compute_uv=False)
+        if x is None and moves[-1] <= 1e-6 * moves[0]:
+            warnings.warn(
+                f"The plant rests at other states too: x_ss = {found.x_ss.tolist()} is where a "
+                "reset led. Pass the state to hold, x_ss=[...].",
+                stacklevel=3,
+            )
         fault = time_limit_fault(borrowed.env, found.u_ss) if borrowed.private else ""
         if not fault:
             return found

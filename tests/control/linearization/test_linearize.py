@@ -51,6 +51,13 @@ def test_steady_state_of_the_reactor_is_found() -> None:
     assert model.u_ss == [0]
 
 
+def test_a_plant_that_rests_anywhere_asks_for_the_state_to_hold() -> None:
+    tank = Plant(lambda x, u: x + u)
+    with pytest.warns(UserWarning, match=r"rests at other states too: x_ss = \[0.0\]"):
+        LinearModel.from_env(tank)
+    assert LinearModel.from_env(tank, x_ss=[2.0]).x_ss == [2]
+
+
 def test_entries_that_are_nan_are_solved_for() -> None:
     nan = np.nan
     model = LinearModel.from_env("CSTR-v0", [nan, nan, nan, 2.0])
