@@ -38,14 +38,7 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
     What lies on a bound is shown inside it, where float32 would round it beyond: some laws are zero
-    outside their box.
-
-    Parameters
-    ----------
-    env : gymnasium.Env, with one-dimensional Box spaces
-    low, high : array_like, shape (p,)
-        The box of what is appended.
-    n_replaced, n_new : int
+    outside their box. ``low`` and ``high`` are (p,), the spaces of the env boxes of one dimension.
     """
 
     def __init__(
