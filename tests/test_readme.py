@@ -104,7 +104,7 @@ def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> Non
 @pytest.mark.slow
 def test_the_code_in_the_page_on_improve_runs(tmp_path, monkeypatch, quick_fits) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(gym.registry["CSTR-v0"], "max_episode_steps", 50)
+    monkeypatch.setattr(gym.registry["CSTR-v0"], "max_episode_steps", 100)
     run("docs/improve.md")
     assert (tmp_path / "improved.zip").exists() and (tmp_path / "commissioning.jsonl").exists()
 

@@ -181,12 +181,12 @@ def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_ne
 ) -> None:
     monkeypatch.setattr(plant_twin, "ROWS", 100)
     mpc = motor()
-    logged, (_, before) = episodes(mpc, None, range(100, 120))[0], episodes(mpc, None, TESTS)
+    logged, (_, before) = episodes(mpc, None, range(100, 130))[0], episodes(mpc, None, TESTS)
     for kinds in (("none", "linear", "quadratic"), ("none", "network")):
         twin = PlantTwin.fit(mpc, logged, residuals=kinds)
         assert twin.trusted
         model = DDPG("YannPolicy", Motor(mpc), device="cpu", seed=0)
-        found = improve(model, twin, rounds=1, n_starts=16, updates=2000)
+        found = improve(model, twin)
         assert found.accepted == ("network" in kinds)
     costs = episodes(mpc, lambda x: model.predict(x)[0], TESTS)[1]
     assert costs.mean() < 0.99 * before.mean() and np.all(costs < before)
