@@ -275,9 +275,7 @@ def test_a_simulator_may_fail_where_the_mpc_does_not_go(fails) -> None:
                 self.theta[0] = np.nan
             return super().step(action)
 
-    healthy, found = (
-        headroom(heater(), make(bend=0.1, steps=30), n_starts=3) for make in (Heater, Fragile)
-    )
+    healthy, found = (headroom(heater(), make(bend=0.1), n_starts=3) for make in (Heater, Fragile))
     assert Fragile.failed
     np.testing.assert_allclose(found.best_costs, healthy.best_costs, rtol=2e-3)
 
