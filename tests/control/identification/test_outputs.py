@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments.outputs import inputs, random_plant
 from sb3_yann import IdentifiedOutputs, LinearModel, Log, identify_outputs
 from sb3_yann._validation import Array
 
@@ -104,6 +105,15 @@ def test_dead_time_is_told_from_order() -> None:
     best = best_possible({"A": a, "B": b, "C": c, "delay": 5}, y, fresh, 0.05, 20)
     late = slice(40, None)  # the plant began at rest, which no record tells
     assert rms((found.predict(y, fresh) - y[20:])[late]) < 1.1 * rms((best - y[20:])[late])
+
+
+def test_a_record_that_begins_at_rest_hides_no_dead_time() -> None:
+    rng = np.random.default_rng(4006)
+    plant, _ = random_plant(rng)
+    u = inputs(2000, 2, rng)
+    found = identify_outputs(plant.record(u, rng), u, dt=1)
+    assert (found.order, found.delays) == (len(plant.A), (7, 4))
+    assert plant.delays.tolist() == [7, 4]
 
 
 def test_an_integrator_keeps_its_pole() -> None:
