@@ -37,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     watch = Stopwatch(clock=time.process_time if options.cpu else time.perf_counter)
     if options.quick:
-        watch.repeats, watch.seconds = 5, 0.5
+        watch.repeats = 5
+        watch.seconds = 0.5
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=180)

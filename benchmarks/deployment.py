@@ -20,8 +20,10 @@ from benchmarks.timing import Array, Task
 from sb3_yann import Controller, LinearModel, LinearMPC, PlantEnv, export
 from sb3_yann_envs import problems
 
-SECTION, SMALL = "export", "export, microcontroller"
-OURS, SINGLE = "ours, C code in double", "C code in float"
+SECTION = "export"
+SMALL = "export, microcontroller"
+OURS = "ours, C code in double"
+SINGLE = "C code in float"
 FREE = "the same without keep_bounds"
 READER = "Controller in numpy"
 BATCH = 256
@@ -111,10 +113,12 @@ def compiled(folder: Path, kind: str) -> Callable[[Array], object]:
     sources = [str(folder / each) for each in ("plant.c", "many.c")]
     command = ["gcc", "-std=c99", "-O2", "-shared", "-fPIC", *sources, "-lm", "-o", str(library)]
     subprocess.run(command, check=True)
-    code, real = ctypes.CDLL(str(library)), np.float64 if kind == "double" else np.float32
+    code = ctypes.CDLL(str(library))
+    real = np.float64 if kind == "double" else np.float32
 
     def many(obs: Array) -> Any:
-        seen, actions = np.ascontiguousarray(obs, real), np.empty((len(obs), 1), real)
+        seen = np.ascontiguousarray(obs, real)
+        actions = np.empty((len(obs), 1), real)
         code.many(seen.ctypes.data_as(ctypes.c_void_p), len(obs),
                   actions.ctypes.data_as(ctypes.c_void_p))  # fmt: skip
         return actions

@@ -14,8 +14,10 @@ from benchmarks.records import Bench, timed
 from benchmarks.timing import Task
 from sb3_yann.networks.paper_yann import PaperYann
 
-ONE, MANY = "law, one point", "law, batch of 256"
-OURS, LOCATE = "ours", "ours, location alone"
+ONE = "law, one point"
+MANY = "law, batch of 256"
+OURS = "ours"
+LOCATE = "ours, location alone"
 LARGEST_LITERAL = 1e9
 """Bytes beyond which the literal network is not built."""
 LITERAL_WIDTH = 2
@@ -35,11 +37,13 @@ def law(bench: Bench, problem: Problem) -> None:
 
 def _one_point(bench: Bench, problem: Problem, literal: Network | None) -> None:
     points = problem.points(512)
-    rows, columns = [*points], [point[:, None] for point in points]
+    rows = [*points]
+    columns = [point[:, None] for point in points]
     tasks = {OURS: Task(problem.law, rows), LOCATE: Task(problem.law.locate, rows)}
     for name, function in _ppopt(problem):
         tasks[name] = Task(function, columns)
-    program, m = problem.mpc.condensed(), problem.law.n_inputs
+    program = problem.mpc.condensed()
+    m = problem.law.n_inputs
     tasks[peers.DAQP] = Task(peers.daqp_online(program, m), rows)
     if (osqp := peers.osqp_online(program, m)) is not None:
         tasks[peers.OSQP] = Task(osqp, rows)

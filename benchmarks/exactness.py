@@ -49,12 +49,15 @@ def sample(law: PiecewiseAffine, count: int, seed: int = 0) -> Array:
     From inside a region a ray goes to one of its facets; along that to the next, and so on: after
     n facets it is at a vertex. The points on the way lie on faces of every dimension.
     """
-    rng, n = np.random.default_rng(seed), law.n_theta
-    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
+    rng = np.random.default_rng(seed)
+    n = law.n_theta
+    middle = (law.theta_max + law.theta_min) / 2
+    half = (law.theta_max - law.theta_min) / 2
     each = count // (n + 1)
     region = np.arange(each) % law.n_regions
     points = [rng.uniform(law.theta_min, law.theta_max, (count - n * each, n))]
-    A, b = law.A * half, law.b - law.A @ middle
+    A = law.A * half
+    b = law.b - law.A @ middle
     at = ((centers(law) - middle) / half)[region]
     basis = np.zeros((each, n, n))  # orthonormal normals of the facets that each is on
     for k in range(n):
@@ -81,19 +84,22 @@ def shoot(
     starts: NDArray[np.int64],
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return where rays from points within regions leave them, and through which half-space."""
-    end, rows = at.copy(), np.zeros(len(at), dtype=np.int64)
+    end = at.copy()
+    rows = np.zeros(len(at), dtype=np.int64)
     for i in range(len(at)):
         first = starts[region[i]]
         last = starts[region[i] + 1] if region[i] + 1 < len(starts) else len(b)
         nearest = np.inf
         for j in range(first, last):
-            speed, slack = 0.0, b[j]
+            speed = 0.0
+            slack = b[j]
             for k in range(at.shape[1]):
                 speed += A[j, k] * direction[i, k]
                 slack -= A[j, k] * at[i, k]
             # Facets that the point is on already are parallel to the direction, to rounding.
             if speed > 1e-9 and max(slack, 0.0) / speed < nearest:
-                nearest, rows[i] = max(slack, 0.0) / speed, j
+                nearest = max(slack, 0.0) / speed
+                rows[i] = j
         if nearest < np.inf:
             for k in range(at.shape[1]):
                 end[i, k] += nearest * direction[i, k]
@@ -120,9 +126,11 @@ def _scan(
     points: Array, A: Array, b: Array, starts: NDArray[np.int64], tolerance: float
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     n, count = points.shape
-    inside, covered = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.bool_)
+    inside = np.zeros(count, dtype=np.int64)
+    covered = np.zeros(count, dtype=np.bool_)
     block = 1024
-    slack, left = np.empty(block), np.empty(block, dtype=np.int64)
+    slack = np.empty(block)
+    left = np.empty(block, dtype=np.int64)
     for first in range(0, count, block):
         x = points[:, first : first + block]
         size = x.shape[1]
@@ -170,7 +178,9 @@ def _feasible(problem: Problem, points: Array) -> int:
 
 def largest_error(problem: Problem, points: Array, count: int) -> float:
     """Return the largest distance from an online QP at a sample of the points, of the range."""
-    law, program, m = problem.law, problem.mpc.condensed(), problem.law.n_inputs
+    law = problem.law
+    program = problem.mpc.condensed()
+    m = problem.law.n_inputs
     chosen = np.random.default_rng(1).choice(points, count, replace=False)
     chosen = chosen[law.in_domain(chosen)] if law.n_regions < 500 else chosen
     U = [program.solve(point) for point in chosen]

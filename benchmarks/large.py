@@ -9,9 +9,11 @@ from benchmarks.records import Bench, timed
 from benchmarks.timing import Task
 from sb3_yann.control import LinearModel, LinearMPC
 
-SECTION, COLUMN = "large law", "6 states, 2 inputs, N = 5"
+SECTION = "large law"
+COLUMN = "6 states, 2 inputs, N = 5"
 SOLVED = "ours, solved, checked and ready"
-EACH, ONLINE = "ours, each of 256 points", "ours, solved online, each of 256 new points"
+EACH = "ours, each of 256 points"
+ONLINE = "ours, solved online, each of 256 new points"
 
 
 def three_free_masses() -> LinearMPC:
@@ -31,7 +33,8 @@ def large(bench: Bench) -> None:
         return
     mpc = three_free_masses()
     found = {SOLVED: bench.watch.once(lambda: mpc.explicit(progress=True))}
-    law, online = mpc.explicit(), mpc.online()
+    law = mpc.explicit()
+    online = mpc.online()
     theta = np.random.default_rng(0).uniform(-4, 4, (16, 256, 6))
     tasks = {EACH: Task(law, [*theta]), ONLINE: Task(online.known.function, [*theta])}
     times = bench.watch.compare(tasks)

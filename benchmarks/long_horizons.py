@@ -14,14 +14,16 @@ SECTION = "long horizons"
 ONLINE = "largest error of the online law, of half the input range"
 EXPLICIT = "largest error of the explicit law, where it has at most 2,000 regions"
 POINTS = "points compared"
-POLES, HORIZONS = (1.02, 1.2, 1.5, 2.0, 3.0), (20, 50, 100)
+POLES = (1.02, 1.2, 1.5, 2.0, 3.0)
+HORIZONS = (20, 50, 100)
 KINDS = ("one input", "two inputs", "soft bounds", "references", "rates", "all of them")
 """What the problems of a pole and a horizon have."""
 
 
 def problem(pole: float, horizon: int, kind: str = KINDS[0], seed: int = 1) -> LinearMPC:
     """Return a problem of random states, bounded, one of whose modes has the pole."""
-    rng, every = np.random.default_rng(seed), kind == KINDS[-1]
+    rng = np.random.default_rng(seed)
+    every = kind == KINDS[-1]
     n, m = (3, 2) if every or kind == "two inputs" else (2, 1)
     basis = rng.normal(size=(n, n))
     while np.linalg.cond(basis) > 20:
@@ -52,8 +54,10 @@ def errors(mpc: LinearMPC, count: int, explicit: bool) -> tuple[float, float, in
     laws = [mpc.online()]
     if explicit:
         laws.append(mpc.explicit(region_limit=2000))
-    reference, rng = ReferenceQP(mpc), np.random.default_rng(0)
-    worst, compared = np.zeros(2), 0
+    reference = ReferenceQP(mpc)
+    rng = np.random.default_rng(0)
+    worst = np.zeros(2)
+    compared = 0
     for _ in range(count):
         theta = rng.uniform(mpc.theta_min, mpc.theta_max) * rng.uniform() ** 2
         exact = reference(theta) if laws[0].in_domain(theta) else None

@@ -87,7 +87,8 @@ def disturb(module: nn.Module) -> None:
 
 def fill(model: DDPG, problem: Problem | OnlineProblem) -> None:
     """Fill the replay buffer with transitions of the linear model from anywhere in the domain."""
-    mpc, rng = problem.mpc, np.random.default_rng(1)
+    mpc = problem.mpc
+    rng = np.random.default_rng(1)
     theta = problem.points(STORED, seed=1)
     u = rng.uniform(mpc.u_min, mpc.u_max, (STORED, len(mpc.u_min)))
     following = np.clip(mpc.predict(theta, u), mpc.theta_min, mpc.theta_max)

@@ -21,7 +21,8 @@ SMALL = 300
 
 def offline(bench: Bench, problem: Problem) -> None:
     """Measure the solution from the problem to the checked law."""
-    regions, slow = problem.regions, problem.regions > SMALL
+    regions = problem.regions
+    slow = problem.regions > SMALL
     algorithms = peers.SERIAL if bench.slow or not slow else ()
     program = peers.ppopt_program(unit_box(problem.mpc.condensed(), problem))
     calls = {OURS: lambda: solve(problem)}
@@ -45,7 +46,8 @@ def solve(problem: Problem) -> int:
 def unit_box(program: ParametricQP, problem: Problem) -> ParametricQP:
     """Return the program in units of the box and the input range, which suits ppopt best."""
     law = problem.law
-    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
+    middle = (law.theta_max + law.theta_min) / 2
+    half = (law.theta_max - law.theta_min) / 2
     width: Array = (law.u_max - law.u_min) / 2
     return program.scaled(middle, half, np.tile(width, len(program.c) // len(width)))
 

@@ -13,11 +13,16 @@ from benchmarks.records import Bench, Figure, timed
 from benchmarks.timing import Task
 from sb3_yann import YannPolicy
 
-LAW, PREDICT = "online law", "online law, predict"
+LAW = "online law"
+PREDICT = "online law, predict"
 TRAIN = "online law, training step"
 EXACT = "online law, exactness"
-OURS, KNOWN, BATCH = "ours, a new point", "ours, a known point", "ours, each of 256 new points"
-POINTS, CONDITIONS, ERROR = "points", "largest violation of optimality", "largest error of an input"
+OURS = "ours, a new point"
+KNOWN = "ours, a known point"
+BATCH = "ours, each of 256 new points"
+POINTS = "points"
+CONDITIONS = "largest violation of optimality"
+ERROR = "largest error of an input"
 CHECKED = 10_000
 
 
@@ -30,7 +35,8 @@ def online(bench: Bench) -> None:
 
 
 def _law(bench: Bench, problem: OnlineProblem) -> None:
-    law, theta = problem.law, problem.points(1024)
+    law = problem.law
+    theta = problem.points(1024)
     solve = law.known.function
     law(theta)
     tasks = {

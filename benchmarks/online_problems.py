@@ -28,7 +28,8 @@ def chain(masses: int, pushed: Sequence[int], horizon: int) -> LinearMPC:
     Positions and speeds are bounded by 4, over the whole horizon. A sample takes 0.5.
     """
     springs = linalg.toeplitz([-2.0, 1.0] + [0.0] * (masses - 2))
-    nothing, eye = np.zeros((masses, masses)), np.eye(masses)
+    nothing = np.zeros((masses, masses))
+    eye = np.eye(masses)
     A = np.block([[nothing, eye], [springs, nothing]])
     B = np.vstack([np.zeros((masses, len(pushed))), eye[:, list(pushed)]])
     return LinearMPC(
@@ -54,9 +55,14 @@ def wide_plant() -> LinearMPC:
     125 slow states, of which each is moved by two inputs, 10 references, 20 disturbances and the
     inputs of the step before, whose change has a bound and a weight.
     """
-    rng, n, m, p = np.random.default_rng(0), 125, 10, 20
+    rng = np.random.default_rng(0)
+    n = 125
+    m = 10
+    p = 20
     A = np.diag(rng.uniform(0.6, 0.95, n)) + np.diag(rng.uniform(0, 0.04, n - 1), 1)
-    B, C, E = np.zeros((n, m)), np.zeros((p, n)), np.zeros((n, p))
+    B = np.zeros((n, m))
+    C = np.zeros((p, n))
+    E = np.zeros((n, p))
     for i in range(n):
         B[i, rng.choice(m, 2, replace=False)] = rng.uniform(-0.1, 0.1, 2)
         B[i, i % m] += 0.1
@@ -104,7 +110,8 @@ class OnlineProblem:
 
 def points(mpc: LinearMPC, count: int, seed: int = 0) -> Array:
     """Return feasible points drawn uniformly from the middle of the box, half as wide."""
-    rng, law = np.random.default_rng(seed), mpc.online()
+    rng = np.random.default_rng(seed)
+    law = mpc.online()
     found: Array = np.empty((0, mpc.n_theta))
     while len(found) < count:
         drawn = rng.uniform(mpc.theta_min, mpc.theta_max, (256, mpc.n_theta)) / 2
@@ -120,15 +127,20 @@ def worst_condition(law: OnlineLaw, theta: Array) -> tuple[float, float]:
     multipliers are positive; negative ones count by their size.
     """
     units = np.tile((law.u_max - law.u_min) / 2, (len(law.c) - law.n_slacks) // law.n_inputs)
-    units, worst, error = np.concatenate([units, np.ones(law.n_slacks)]), 0.0, 0.0
-    H, G = law.H * np.outer(units, units), law.G * units
-    found, inputs = law.dual.solve(theta), law(theta)
+    units = np.concatenate([units, np.ones(law.n_slacks)])
+    worst = 0.0
+    error = 0.0
+    H = law.H * np.outer(units, units)
+    G = law.G * units
+    found = law.dual.solve(theta)
+    inputs = law(theta)
     for k, at in enumerate(theta):
         active = law.dual.rows[found.active[k, : found.sizes[k]]]
         left = np.block([[H, G[active].T], [G[active], np.zeros((len(active), len(active)))]])
         right = [-(law.F @ at + law.c) * units, law.w[active] + law.S[active] @ at]
         solution = np.linalg.solve(left, np.concatenate(right))
-        plan, multipliers = solution[: len(H)], solution[len(H) :]
+        plan = solution[: len(H)]
+        multipliers = solution[len(H) :]
         slack = law.w + law.S @ at - G @ plan
         size = max(1.0, float(np.abs(multipliers).max(initial=0.0)))
         worst = max(worst, -slack.min(), -multipliers.min(initial=0.0) / size)

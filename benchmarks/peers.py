@@ -61,11 +61,13 @@ def ppopt_solution(program: ParametricQP, law: PiecewiseAffine, overlap: bool) -
     from ppopt.critical_region import CriticalRegion
     from ppopt.solution import Solution
 
-    regions, ends = [], [*law.starts[1:], law.n_halfspaces]
+    regions = []
+    ends = [*law.starts[1:], law.n_halfspaces]
     nothing = np.zeros((0, law.n_theta)), np.zeros((0, 1))
     for start, end, center in zip(law.starts, ends, centers(law), strict=True):
         gain, offset = affine_law(program, center)
-        E, f = np.ascontiguousarray(law.A[start:end]), law.b[start:end, None]
+        E = np.ascontiguousarray(law.A[start:end])
+        f = law.b[start:end, None]
         regions.append(CriticalRegion(gain, offset[:, None], *nothing, E, f, []))
     return Solution(ppopt_program(program), regions, is_overlapping=overlap)
 
@@ -90,8 +92,11 @@ def affine_law(program: ParametricQP, theta: Array) -> tuple[Array, Array]:
 @functools.cache
 def centers(law: PiecewiseAffine) -> Array:
     """Return the point of each region that lies farthest inside, shape (p, n)."""
-    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
-    A, b = law.A * half, law.b - law.A @ middle  # rows of unit length
+    middle = (law.theta_max + law.theta_min) / 2
+    half = (law.theta_max - law.theta_min) / 2
+    # rows of unit length
+    A = law.A * half
+    b = law.b - law.A @ middle
     ends = [*law.starts[1:], law.n_halfspaces]
     found = [
         largest_ball(A[start:end], b[start:end])[0]
@@ -105,7 +110,10 @@ def daqp_online(program: ParametricQP, inputs: int) -> Callable[[Array], Array |
     import daqp
 
     G, bound = _moving(program)
-    F, c, S, w = program.F, program.c, program.S[bound], program.w[bound]
+    F = program.F
+    c = program.c
+    S = program.S[bound]
+    w = program.w[bound]
     model = daqp.Model()
     model.setup(np.ascontiguousarray(program.H), c.copy(), G, w + 1.0, np.full(len(w), -1e30))
 
@@ -124,7 +132,10 @@ def osqp_online(program: ParametricQP, inputs: int) -> Callable[[Array], Array |
     except ModuleNotFoundError:
         return None
     G, bound = _moving(program)
-    F, c, S, w = program.F, program.c, program.S[bound], program.w[bound]
+    F = program.F
+    c = program.c
+    S = program.S[bound]
+    w = program.w[bound]
     solver = osqp.OSQP()
     solver.setup(
         sparse.csc_matrix(np.triu(program.H)), c, sparse.csc_matrix(G), np.full(len(w), -np.inf),
@@ -147,7 +158,10 @@ def _moving(program: ParametricQP) -> tuple[Array, NDArray[np.bool_]]:
 
 def literal_bytes(law: PiecewiseAffine, width: int) -> int:
     """Return the memory that the literal network of a law takes, single precision."""
-    p, q, m, n = law.n_regions, law.n_halfspaces, law.n_inputs, law.n_theta
+    p = law.n_regions
+    q = law.n_halfspaces
+    m = law.n_inputs
+    n = law.n_theta
     suppress = 2 * p * m * (p + 2 * p * m + p * width + 1)
     entries = q * (n + 1) + p * (q + 1) + p * p + 2 * p * m * (n + 1) + suppress
     return 4 * (entries + 2 * p * m * m + p * width * (n + 1) + (p * width) ** 2)

@@ -14,9 +14,13 @@ from sb3_yann.improvement.simulator import Simulator, of_law
 from sb3_yann_envs import problems
 from sb3_yann_envs.cstr import CSTREnv
 
-SECTION, COLUMN = "processes", "8 episodes of 100 steps"
-ONE, TWO, VECTOR = "ours, one process", "two workers of joblib", "a SubprocVecEnv of two"
-EPISODES, STEPS = 8, 100
+SECTION = "processes"
+COLUMN = "8 episodes of 100 steps"
+ONE = "ours, one process"
+TWO = "two workers of joblib"
+VECTOR = "a SubprocVecEnv of two"
+EPISODES = 8
+STEPS = 100
 
 
 class Slow(CSTREnv):

@@ -13,7 +13,8 @@ from benchmarks.problems import Array
 from sb3_yann.control import LinearMPC, ParametricQP
 
 Indices = NDArray[np.intp]
-FEASIBLE, POSITIVE = 1e-12, 1e-9
+FEASIBLE = 1e-12
+POSITIVE = 1e-9
 """How far a constraint of unit length may be off, and a multiplier, relative to the largest."""
 
 
@@ -51,8 +52,10 @@ class ReferenceQP:
         All of it is in half-widths of the boxes. The constraints come in the order of the condensed
         program's.
         """
-        mpc, slacks = self.mpc, self.program.n_slacks
-        N, m = mpc.horizon, mpc.model.n_inputs
+        mpc = self.mpc
+        slacks = self.program.n_slacks
+        N = mpc.horizon
+        m = mpc.model.n_inputs
         self.size = N * (mpc.n_theta + m) + slacks
         self.units = np.concatenate([
             np.tile(self.half, N), np.tile(self.unit, N), np.ones(slacks)
@@ -65,7 +68,8 @@ class ReferenceQP:
         self.H = H * np.outer(self.units, self.units) / size
         self.linear = linear * self.units / size
         self.cost = cost * self.units[:, None] / size
-        rows, S = np.vstack(equal) * self.units, np.vstack(start)
+        rows = np.vstack(equal) * self.units
+        S = np.vstack(start)
         self.equal, self.start, _ = self._unit(rows, S, np.zeros(len(rows)))
         rows, w, S = (np.concatenate(each) for each in zip(*self._rows(), strict=True))
         bounded = np.isfinite(w)
@@ -81,23 +85,28 @@ class ReferenceQP:
         return rows, np.zeros((n, n))
 
     def _u(self, k: int) -> Array:
-        m, first = self.mpc.model.n_inputs, self.mpc.horizon * self.mpc.n_theta
+        m = self.mpc.model.n_inputs
+        first = self.mpc.horizon * self.mpc.n_theta
         rows = np.zeros((m, self.size))
         rows[:, first + k * m : first + (k + 1) * m] = np.eye(m)
         return rows
 
     def _cost(self) -> tuple[Array, Array, Array]:
         """Return the Hessian, what theta_0 and what nothing multiplies."""
-        mpc, N = self.mpc, self.mpc.horizon
-        errors, slacks = mpc.error_system, self.program.n_slacks
-        H, cost = np.zeros((self.size, self.size)), np.zeros((self.size, mpc.n_theta))
+        mpc = self.mpc
+        N = self.mpc.horizon
+        errors = mpc.error_system
+        slacks = self.program.n_slacks
+        H = np.zeros((self.size, self.size))
+        cost = np.zeros((self.size, mpc.n_theta))
         weight = errors.stage_matrix
         for k in range(N):
             at, free = self._theta(k)
             both = np.vstack([at, self._u(k)])
             both_free = np.vstack([free, np.zeros((len(self.unit), mpc.n_theta))])
             weighted = 2 * mpc.gamma**k * both.T @ weight
-            H, cost = H + weighted @ both, cost + weighted @ both_free
+            H = H + weighted @ both
+            cost = cost + weighted @ both_free
         z = errors.to_error @ self._theta(N)[0]
         H = H + 2 * mpc.gamma**N * z.T @ mpc.terminal.cost @ z
         linear = np.zeros(self.size)
@@ -109,7 +118,9 @@ class ReferenceQP:
 
     def _rows(self) -> Iterator[tuple[Array, Array, Array]]:
         """Yield constraints ``rows variables <= w + S theta_0``."""
-        mpc, N, n = self.mpc, self.mpc.horizon, self.mpc.n_theta
+        mpc = self.mpc
+        N = self.mpc.horizon
+        n = self.mpc.n_theta
         kinds = [kind for kind in "xy" if np.any(getattr(mpc.soft, kind))]
 
         def slack(kind: str, softness: Array) -> Array:
@@ -128,7 +139,8 @@ class ReferenceQP:
         yield from between(
             inputs, np.zeros((len(inputs), n)), np.tile(mpc.u_min, N), np.tile(mpc.u_max, N)
         )
-        state, C = mpc.layout.state, mpc.outputs.C
+        state = mpc.layout.state
+        C = mpc.outputs.C
         for k in range(1, N + 1):
             rows = self._theta(k)[0][state]
             yield from between(
@@ -155,7 +167,8 @@ class ReferenceQP:
 
     def __call__(self, theta: Array) -> Array | None:
         """Return u_0 (m,) at theta (n,), None where no active set is proved to be optimal."""
-        m, first = len(self.unit), self.mpc.horizon * self.mpc.n_theta
+        m = len(self.unit)
+        first = self.mpc.horizon * self.mpc.n_theta
         for active in self._proposals((theta - self.center) / self.half):
             found = self._proved(theta, active)
             if found is not None:
@@ -195,7 +208,8 @@ class ReferenceQP:
             if not np.all(np.isfinite(found)):
                 return None
             found = found + linalg.lu_solve(factor, right - K @ found)
-        values, multipliers = found[: self.size], found[self.size + len(self.equal) :]
+        values = found[: self.size]
+        multipliers = found[self.size + len(self.equal) :]
         off = self.G @ values - limit
         off[active] = 0.0
         least = -POSITIVE * max(1.0, np.abs(multipliers).max(initial=0.0))

@@ -92,7 +92,8 @@ def _quoted(figures: Figures) -> Iterator[tuple[str, list[str]]]:
     for section, peer, name in lines:
         cells = []
         for size in sizes:
-            ours, theirs = figures.get(section, "ours", size), figures.get(section, peer, size)
+            ours = figures.get(section, "ours", size)
+            theirs = figures.get(section, peer, size)
             cells.append(_ratio(theirs, ours))
         if any(cells):
             yield name, cells

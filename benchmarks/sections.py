@@ -65,7 +65,8 @@ def run(bench: Bench, names: Sequence[str]) -> None:
     """Run some of the sections, and print the tables as they come."""
     problems = [SMALLEST] if bench.quick else PROBLEMS
     for name in names:
-        before, began = set(bench.figures.sections()), time.perf_counter()
+        before = set(bench.figures.sections())
+        began = time.perf_counter()
         if name in WHOLE:
             WHOLE[name](bench)
         else:

@@ -16,7 +16,9 @@ from benchmarks.suite_problems import SUITE, quietly
 from sb3_yann.control import ExplicitSolutionError, LinearMPC, PiecewiseAffine
 
 SECTION = "suite of problems"
-PROBLEMS, FAILURES, WRONG_LAWS = "problems", "failures", "wrong laws"
+PROBLEMS = "problems"
+FAILURES = "failures"
+WRONG_LAWS = "wrong laws"
 ERROR = "largest error, of the input range"
 AS_EVALUATED = "largest error with rounding and ties of the evaluation"
 EACH = "time a region, with its check"
@@ -99,7 +101,8 @@ def examine(name: str, count: int = 60) -> Outcome:
 
 def compare(mpc: LinearMPC, law: PiecewiseAffine, count: int) -> tuple[int, float, float, int]:
     """Return the number of points, the largest error without and with rounding, and the holes."""
-    reference, width = ReferenceQP(mpc), law.u_max - law.u_min
+    reference = ReferenceQP(mpc)
+    width = law.u_max - law.u_min
     width = np.where(np.isfinite(width), width, 1.0)
     points = trials(law, count)
     found = [reference(point) for point in points]
@@ -109,9 +112,12 @@ def compare(mpc: LinearMPC, law: PiecewiseAffine, count: int) -> tuple[int, floa
     kept = solved & domain
     if not np.any(kept):
         return 0, 0.0, 0.0, holes
-    points, exact = points[kept], np.array([found[i] for i in np.flatnonzero(kept)])
-    off, region = np.abs(law(points) - exact), law.locate(points)
-    half, slopes = (law.theta_max - law.theta_min) / 2, np.abs(law.gains[region])
+    points = points[kept]
+    exact = np.array([found[i] for i in np.flatnonzero(kept)])
+    off = np.abs(law(points) - exact)
+    region = law.locate(points)
+    half = (law.theta_max - law.theta_min) / 2
+    slopes = np.abs(law.gains[region])
     terms = np.einsum("kmi,ki->km", slopes, np.abs(points)) + np.abs(law.offsets[region])
     rounding = ROUNDING * terms + law.tie_tolerance * np.max(np.abs(law.gains) @ half)
     beyond = np.maximum(off - rounding, 0.0)

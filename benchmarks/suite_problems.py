@@ -41,9 +41,14 @@ def chain(dt: float, horizon: int, bound: float) -> LinearMPC:
 
 def cart_pole(horizon: int, bounds: tuple[float, ...], u_max: float, dt: float = 0.04) -> LinearMPC:
     """Return a cart of 10.5 kg with a pole of 5 kg and 0.6 m, upright, like MuJoCo's."""
-    cart, pole, arm, g, gear = 10.5, 5.0, 0.3, 9.81, 100.0
+    cart = 10.5
+    pole = 5.0
+    arm = 0.3
+    g = 9.81
+    gear = 100.0
     mass = np.array([[cart + pole, pole * arm], [pole * arm, 4 / 3 * pole * arm**2]])
-    A, B = np.zeros((4, 4)), np.zeros((4, 1))
+    A = np.zeros((4, 4))
+    B = np.zeros((4, 1))
     A[:2, 2:] = np.eye(2)
     A[2:, 1], B[2:, 0] = np.linalg.solve(mass, np.array([[0, gear], [pole * g * arm, 0]])).T
     return LinearMPC(
@@ -83,13 +88,18 @@ def aircraft(horizon: int, **changes: Any) -> LinearMPC:
 
 def quadruple_tank(horizon: int, dt: float = 3.0, **changes: Any) -> LinearMPC:
     """Return Johansson's quadruple tank (2000), minimum phase, about its operating point."""
-    T, a = np.array([62.0, 90.0, 23.0, 30.0]), np.array([28.0, 32.0, 28.0, 32.0])
+    T = np.array([62.0, 90.0, 23.0, 30.0])
+    a = np.array([28.0, 32.0, 28.0, 32.0])
     A = np.diag(-1 / T)
-    A[0, 2], A[1, 3] = a[2] / (a[0] * T[2]), a[3] / (a[1] * T[3])
-    k, share = (3.33, 3.35), (0.70, 0.60)
+    A[0, 2] = a[2] / (a[0] * T[2])
+    A[1, 3] = a[3] / (a[1] * T[3])
+    k = (3.33, 3.35)
+    share = (0.70, 0.60)
     B = np.zeros((4, 2))
-    B[0, 0], B[1, 1] = share[0] * k[0] / a[0], share[1] * k[1] / a[1]
-    B[2, 1], B[3, 0] = (1 - share[1]) * k[1] / a[2], (1 - share[0]) * k[0] / a[3]
+    B[0, 0] = share[0] * k[0] / a[0]
+    B[1, 1] = share[1] * k[1] / a[1]
+    B[2, 1] = (1 - share[1]) * k[1] / a[2]
+    B[3, 0] = (1 - share[0]) * k[0] / a[3]
     values: dict[str, Any] = {"Q": np.eye(4), "R": 0.1 * np.eye(2), "u_min": -3, "u_max": 3}
     values |= {"theta_min": -8, "theta_max": 8}
     return LinearMPC(
@@ -117,7 +127,9 @@ def _random_values(rng: np.random.Generator, n: int, m: int) -> dict[str, Any]:
 
 
 def _random_model(rng: np.random.Generator, n: int, m: int, unstable: bool) -> LinearModel:
-    A, B, E = rng.normal(size=(n, n)), rng.normal(size=(n, m)), 0.2 * rng.normal(size=(n, 1))
+    A = rng.normal(size=(n, n))
+    B = rng.normal(size=(n, m))
+    E = 0.2 * rng.normal(size=(n, 1))
     A *= (rng.uniform(1.02, 1.3) if unstable else rng.uniform(0.4, 0.98)) / np.max(
         np.abs(np.linalg.eigvals(A))
     )
@@ -134,7 +146,8 @@ def random_regulator(seed: int, kind: str) -> LinearMPC:
         values = _random_values(rng, n, m)
         values["horizon"] = int(rng.integers(1, 4 if n * m > 4 else 5))
         if kind != "inputs":
-            values["x_min"], values["x_max"] = values["theta_min"], values["theta_max"]
+            values["x_min"] = values["theta_min"]
+            values["x_max"] = values["theta_max"]
         values |= _random_parts(rng, n) if kind == "parts" else {}
         values |= {"terminal": INVARIANT} if kind == "invariant" else {}
         if kind == "soft":

@@ -52,7 +52,8 @@ class Stopwatch:
         """
         sizes = {name: self._block(task) for name, task in tasks.items()}
         found: dict[str, list[float]] = {name: [] for name in tasks}
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
+        cpu = time.process_time()
         for turn in range(self.repeats):
             for name, task in tasks.items():
                 found[name].append(self._measure(task, sizes[name], turn * 7))
@@ -63,7 +64,9 @@ class Stopwatch:
 
     def once(self, function: Callable[[], object]) -> Array:
         """Return the seconds of one call, shape (1,), for what takes long."""
-        wall, cpu, start = time.perf_counter(), time.process_time(), self.clock()
+        wall = time.perf_counter()
+        cpu = time.process_time()
+        start = self.clock()
         function()
         seconds = self.clock() - start
         self.spent.append((time.perf_counter() - wall, time.process_time() - cpu))

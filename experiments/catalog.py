@@ -280,7 +280,10 @@ def _runs() -> list[Run]:
     and those from 100 on, were seen while the defaults were chosen.
     """
     reactor, true_model, pendulum, printed = PLANTS
-    ten, five, three, long = range(40, 50), range(40, 45), range(40, 43), range(50, 53)
+    ten = range(40, 50)
+    five = range(40, 45)
+    three = range(40, 43)
+    long = range(50, 53)
     runs = [Run(plant, name, 0, 0) for plant in PLANTS for name in FIXED]
     runs.extend(
         Run(p, name, 0, 0) for p in (reactor, pendulum) for name in (OBSERVER, REIDENTIFIED)
@@ -355,7 +358,9 @@ class Checkpoints(BaseCallback):
         self, test: Callable[[Any], Trajectories], policy: Any, recorder: Recorder
     ) -> None:
         super().__init__()
-        self.test, self.tested_policy, self.recorder = test, policy, recorder
+        self.test = test
+        self.tested_policy = policy
+        self.recorder = recorder
         self.tests: dict[int, Trajectories] = {}
 
     def _on_training_start(self) -> None:
@@ -410,7 +415,8 @@ def execute(run: Run) -> Outcome:
 class _StopAfter(BaseCallback):
     def __init__(self, episodes: int, recorder: Recorder) -> None:
         super().__init__()
-        self.episodes, self.recorder = episodes, recorder
+        self.episodes = episodes
+        self.recorder = recorder
 
     def _on_step(self) -> bool:
         # The vectorized env has begun the next episode already where one is over.
@@ -450,7 +456,8 @@ def _fixed(name: str, plant: Plant, test: Callable[..., Trajectories]) -> Outcom
     else:
         problem = reidentified(plant) if name == REIDENTIFIED else plant.problem()
         episodes = test(yardsticks.lqr(problem) if name == "LQR" else problem.explicit())
-        costs, violations = episodes.costs, episodes.violations
+        costs = episodes.costs
+        violations = episodes.violations
         extra = _changes_of_input(episodes)
     none = np.zeros(0)
     return Outcome(np.zeros(1), costs[None], violations[None], none, none, none, extra)

@@ -53,21 +53,24 @@ class Plant(gym.Env[Array, Array]):
 def linear(A: Any, B: Any, gain: Any, spread: Any, **options: Any) -> tuple[LinearMPC, Any]:
     """Return the MPC of a linear model, and what makes the plant with inputs of another gain."""
     mpc = LinearMPC(LinearModel(A, B, 1.0), **options)
-    A, B = mpc.model.A, mpc.model.B * gain
+    A = mpc.model.A
+    B = mpc.model.B * gain
     return mpc, lambda: Plant(mpc, lambda x, u: A @ x + B @ u, spread)
 
 
 def two_lags() -> tuple[LinearMPC, Any]:
     """Return the plant of tests/twin/test_alignment.py."""
     options = {"Q": np.diag([2.0, 1.0]), "R": 0.2 * np.eye(2), "horizon": 3, "u_min": -1}
-    A, B = [[0.9, 0.15], [0, 0.7]], [[0.1, 0], [0.05, 0.3]]
+    A = [[0.9, 0.15], [0, 0.7]]
+    B = [[0.1, 0], [0.05, 0.3]]
     return linear(A, B, [1.5, 0.7], [1.5, 1.5], **options, u_max=1, x_min=-4, x_max=4)
 
 
 def twice_the_gain() -> tuple[LinearMPC, Any]:
     """Return two coupled lags whose gains are twice the model's."""
     options = {"Q": np.diag([1, 2]), "R": 0.1 * np.eye(2), "horizon": 2, "u_min": -1, "u_max": 1}
-    A, B = [[0.85, 0.1], [0.05, 0.8]], [[0.2, 0.05], [0.02, 0.25]]
+    A = [[0.85, 0.1], [0.05, 0.8]]
+    B = [[0.2, 0.05], [0.02, 0.25]]
     return linear(A, B, [2, 2], [1.2, 1.2], **options, x_min=-2, x_max=2)
 
 
@@ -79,7 +82,8 @@ def reactor() -> tuple[LinearMPC, Any]:
 
 def heater() -> tuple[LinearMPC, Any]:
     """Return a heater with two samples of dead time: its past inputs are states."""
-    A, B = [[0.92, 0.4, 0], [0, 0, 1], [0, 0, 0]], [[0], [0], [1]]
+    A = [[0.92, 0.4, 0], [0, 0, 1], [0, 0, 0]]
+    B = [[0], [0], [1]]
     options = {"Q": np.diag([1, 0, 0]), "R": [[0.1]], "horizon": 4, "u_min": -3, "u_max": 3}
     mpc, _ = linear(A, B, 1, [6, 0, 0], **options, theta_min=[-15, -3, -3], theta_max=[15, 3, 3])
     A = mpc.model.A * [[1, 1.3, 1], [1, 1, 1], [1, 1, 1]]
@@ -89,7 +93,8 @@ def heater() -> tuple[LinearMPC, Any]:
 
 def motor() -> tuple[LinearMPC, Any]:
     """Return angle and speed of a motor with .5 of the model's torque, and friction."""
-    A, B = [[1, 0.1], [0, 0.9]], [[0.01], [0.2]]
+    A = [[1, 0.1], [0, 0.9]]
+    B = [[0.01], [0.2]]
     options = {"Q": np.diag([1, 0.1]), "R": [[0.05]], "horizon": 5, "u_min": -2, "u_max": 2}
     mpc, _ = linear(A, B, 1, [1, 1], **options, theta_min=[-3, -4], theta_max=[3, 4])
     drag = lambda x: np.array([0, 0.01 * x[1] ** 3])  # noqa: E731
@@ -99,7 +104,8 @@ def motor() -> tuple[LinearMPC, Any]:
 
 def worn_tank() -> tuple[LinearMPC, Any]:
     """Return four tanks whose pumps have lost a quarter, with set-points of the lower levels."""
-    rest, u = np.array([12.4, 12.7, 1.8, 1.4]), np.array(tank.VOLTAGES_SS)
+    rest = np.array([12.4, 12.7, 1.8, 1.4])
+    u = np.array(tank.VOLTAGES_SS)
     slope = lambda x, v: np.array(tank.derivative(x, v))  # noqa: E731
     model = LinearModel.from_dynamics(slope, [np.nan] * 4, u, tank.DT)
     rest = model.x_ss
@@ -134,7 +140,8 @@ PLANTS: dict[str, Callable[[], tuple[LinearMPC, Any]]] = {
 
 def stuck(x: Array) -> Array:
     """Return states of which the first reads the same for a quarter of the rows."""
-    x, first = x.copy(), len(x) // 3
+    x = x.copy()
+    first = len(x) // 3
     x[first : first + len(x) // 4 + 1, 0] = x[first, 0]
     return x
 
@@ -181,12 +188,14 @@ def play(
     act: Callable[[Array], Array], mpc: LinearMPC, env: Any, seed: int, noise: float = 0.0
 ) -> tuple[Array, Array]:
     """Return theta (41, p) and inputs (40, m) of an episode; the sensors may be noisy."""
-    theta, rng = env.reset(seed=seed)[0], np.random.default_rng(seed)
+    theta = env.reset(seed=seed)[0]
+    rng = np.random.default_rng(seed)
     measured = np.count_nonzero(np.hstack([mpc.model.A, mpc.model.B]), axis=1) > 1
     scale = noise * mpc.theta_half
     scale[mpc.layout.state] *= measured
     scale[mpc.model.n_states :] = 0
-    thetas, inputs = [theta + scale * rng.normal(size=len(theta))], []
+    thetas = [theta + scale * rng.normal(size=len(theta))]
+    inputs = []
     for _ in range(40):
         inputs.append(np.clip(act(thetas[-1]), mpc.u_min, mpc.u_max))
         theta = env.step(inputs[-1])[0]
@@ -196,7 +205,9 @@ def play(
 
 def log(mpc: LinearMPC, make: Callable[[], Any], how: str, seed: int) -> Log:
     """Return a log."""
-    rng, law, env = np.random.default_rng(seed), mpc.law(), make()
+    rng = np.random.default_rng(seed)
+    law = mpc.law()
+    env = make()
     size = 0.25 * np.minimum(mpc.u_max, -mpc.u_min)
     held = [size]
 
@@ -261,7 +272,8 @@ def main() -> None:
                     for (a, b), (c, d) in zip(episodes, bad, strict=True)
                 ):
                     continue  # one input or state
-                twin, change = fitted(mpc, bad), None
+                twin = fitted(mpc, bad)
+                change = None
                 if twin and twin.trusted:
                     if options.improve:
                         change = improved(mpc, make, fitted(mpc, bad, 3))

@@ -39,7 +39,9 @@ SEEDS = range(1000, 1030)
 LOGS = "ordinary", "dither"
 STEPS = 25
 TESTS = range(900_000, 900_060)
-DITHER, HOLD = 0.15, 4  # of half the range, samples
+# of half the range, samples
+DITHER = 0.15
+HOLD = 4
 KINDS = "none", "linear", "quadratic"  # a fit of networks takes half a minute
 HIDDEN = "lag", "backlash", "load", "gain"
 
@@ -88,7 +90,10 @@ class Plant(gym.Env[Array, Array]):
     """A chain of lags, measured with noise."""
 
     def __init__(self, mpc: LinearMPC, hidden: Hidden, unit: Array, noise: float) -> None:
-        self.mpc, self.hidden, self.unit, self.noise = mpc, hidden, unit, noise
+        self.mpc = mpc
+        self.hidden = hidden
+        self.unit = unit
+        self.noise = noise
         self.action_space = gym.spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, unit.shape, np.float64)
 
@@ -106,7 +111,9 @@ class Plant(gym.Env[Array, Array]):
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict]:
         """Hold the inputs for a sample."""
-        hidden, model, half = self.hidden, self.mpc.model, self.mpc.u_half
+        hidden = self.hidden
+        model = self.mpc.model
+        half = self.mpc.u_half
         u = np.clip(np.asarray(action, np.float64), self.mpc.u_min, self.mpc.u_max)
         play = hidden.backlash * half
         self.held = np.clip(self.held, u - play, u + play)
@@ -121,13 +128,16 @@ class Plant(gym.Env[Array, Array]):
 def draw(seed: int) -> tuple[LinearMPC, Any]:
     """Return an MPC, and what makes its plant."""
     rng = np.random.default_rng([seed, 0])
-    n, m = int(rng.integers(1, 4)), int(rng.integers(1, 3))
-    unit, half = 10 ** rng.uniform(-2, 2, n), 10 ** rng.uniform(-1, 1, m)
+    n = int(rng.integers(1, 4))
+    m = int(rng.integers(1, 3))
+    unit = 10 ** rng.uniform(-2, 2, n)
+    half = 10 ** rng.uniform(-1, 1, m)
     A = np.diag(rng.uniform(0.7, 0.95, n)) + np.diag(rng.uniform(0.1, 0.3, n - 1), 1)
     B = np.zeros((n, m))
     B[-1] = rng.uniform(0.1, 0.3, m)
     B[0] += rng.uniform(0.02, 0.1, m)
-    A, B = unit[:, None] * A / unit, unit[:, None] * B / half
+    A = unit[:, None] * A / unit
+    B = unit[:, None] * B / half
     tracks = seed % 2 == 1
     mpc = LinearMPC(
         LinearModel(A, B, 1.0),
@@ -141,7 +151,8 @@ def draw(seed: int) -> tuple[LinearMPC, Any]:
         theta_max=6 * unit,
         **({"tracking": Tracking([0], -0.6 * unit[0], 0.6 * unit[0])} if tracks else {}),
     )
-    hidden, noise = Hidden.draw(seed), float(rng.choice([0.001, 0.004, 0.01]))
+    hidden = Hidden.draw(seed)
+    noise = float(rng.choice([0.001, 0.004, 0.01]))
 
     def make() -> Any:
         env: Any = Plant(mpc, hidden, unit, noise)
@@ -156,7 +167,8 @@ def logged(seed: int, how: str) -> tuple[LinearMPC, Any, list[tuple[Array, Array
     """Return an MPC, what makes its plant, and a log of ten to twenty episodes."""
     mpc, make = draw(seed)
     rng = np.random.default_rng([seed, 2, LOGS.index(how)])
-    law, moved = mpc.law(), {"t": 0, "by": np.zeros(len(mpc.u_max))}
+    law = mpc.law()
+    moved = {"t": 0, "by": np.zeros(len(mpc.u_max))}
 
     def act(theta: Array) -> Array:
         if moved["t"] % HOLD == 0:
@@ -198,7 +210,8 @@ def true_change(policy: Any, mpc: LinearMPC, make: Any) -> float:
 def execute(seed: int, how: str) -> Row:
     """Return what came of a log."""
     mpc, make, log = logged(seed, how)
-    began, hidden = time.perf_counter(), asdict(Hidden.draw(seed))
+    began = time.perf_counter()
+    hidden = asdict(Hidden.draw(seed))
     twin = PlantTwin.fit(mpc, log, residuals=KINDS)
     if not twin.trusted:
         said = " ".join(twin.trust.problems)

@@ -79,7 +79,8 @@ class _Plant:
 
     def rollout(self, starts: Tensor, policy: Policy, steps: int) -> tuple[Tensor, Tensor]:
         """Return trajectories (..., steps + 1, n) and inputs (..., steps) from starts (..., n)."""
-        states, inputs = [starts], []
+        states = [starts]
+        inputs = []
         for t in range(steps):
             inputs.append(self.clip(policy(t, states[-1])))
             states.append(self.step(states[-1], inputs[-1]))
@@ -88,7 +89,8 @@ class _Plant:
 
 def _pendulum_step(x: Tensor, u: Tensor) -> Tensor:
     """Return the state 0.05 s later, semi-implicit Euler as in `ClippedPendulumEnv.step`."""
-    gravity, gain = 1.5 * pendulum.GRAVITY / pendulum.LENGTH, 3 / pendulum.LENGTH**2 / pendulum.MASS
+    gravity = 1.5 * pendulum.GRAVITY / pendulum.LENGTH
+    gain = 3 / pendulum.LENGTH**2 / pendulum.MASS
     speed = x[..., 1] + (gravity * x[..., 0].sin() + gain * u) * pendulum.DT
     speed = speed.clamp(-pendulum.MAX_SPEED, pendulum.MAX_SPEED)
     return torch.stack([x[..., 0] + speed * pendulum.DT, speed], -1)
@@ -116,7 +118,9 @@ def _reactor_rates(x: Tensor, transfer: Tensor) -> Tensor:
 def _reactor_step(deviation: Tensor, u: Tensor) -> Tensor:
     """Return the deviation 1/60 h later, classical Runge-Kutta as in `CSTREnv.step`."""
     steady = torch.tensor(reactor.X_SS)
-    x, transfer, h = deviation + steady, u + float(reactor.U_SS[0]), reactor.DT / reactor.SUBSTEPS
+    x = deviation + steady
+    transfer = u + float(reactor.U_SS[0])
+    h = reactor.DT / reactor.SUBSTEPS
     for _ in range(reactor.SUBSTEPS):
         p = _reactor_rates(x, transfer)
         q = _reactor_rates(x + h / 2 * p, transfer)
@@ -149,17 +153,23 @@ def _backward(plant: _Plant, x: Tensor, u: Tensor, barrier: float) -> tuple[Tens
     """Return corrections (k, steps), gains (k, steps, n), gradients (k, steps): Tassa et al."""
     jacobians = torch.func.vmap(torch.func.vmap(torch.func.jacrev(plant.step, (0, 1))))
     A, B = jacobians(x[:, :-1], u)
-    lx, lxx = 2 * plant.Q * plant.error(x), torch.diag(2 * plant.Q).repeat(*x.shape[:2], 1, 1)
+    lx = 2 * plant.Q * plant.error(x)
+    lxx = torch.diag(2 * plant.Q).repeat(*x.shape[:2], 1, 1)
     lx[:, -1] = lxx[:, -1] = 0  # an episode is charged for the states before its steps
     if barrier:
         slack = plant.limit - x[:, 1:, -1]
         lx[:, 1:, -1] += barrier / slack
         lxx[:, 1:, -1, -1] += barrier / slack**2
-    v, V = lx[:, -1], lxx[:, -1]
-    corrections, gains, gradients = torch.zeros_like(u), torch.zeros_like(B), torch.zeros_like(u)
+    v = lx[:, -1]
+    V = lxx[:, -1]
+    corrections = torch.zeros_like(u)
+    gains = torch.zeros_like(B)
+    gradients = torch.zeros_like(u)
     for t in reversed(range(u.shape[1])):
-        a, b = A[:, t], B[:, t]
-        Va, Vb = V @ a, (V @ b[..., None])[..., 0]
+        a = A[:, t]
+        b = B[:, t]
+        Va = V @ a
+        Vb = (V @ b[..., None])[..., 0]
         qx = lx[:, t] + (v[:, None] @ a)[:, 0]
         qu = 2 * plant.R * u[:, t] + (b * v).sum(-1)
         qux = (b[:, None] @ Va)[:, 0]
@@ -171,24 +181,33 @@ def _backward(plant: _Plant, x: Tensor, u: Tensor, barrier: float) -> tuple[Tens
         cross = gain[..., None] * (qux + quu[:, None] * gain / 2)[:, None]
         v = qx + gain * (qu + quu * move)[:, None] + qux * move[:, None]
         V = lxx[:, t] + a.mT @ Va + cross + cross.mT
-        corrections[:, t], gains[:, t], gradients[:, t] = move, gain, qu
+        corrections[:, t] = move
+        gains[:, t] = gain
+        gradients[:, t] = qu
     return corrections, gains, gradients
 
 
 def _improved(plant: _Plant, x: Tensor, u: Tensor, barrier: float) -> tuple[Tensor, Tensor]:
     """Return trajectories (k, steps + 1, n) and inputs (k, steps) that no correction improves."""
-    x, u, steps = x.clone(), u.clone(), u.shape[1]
-    costs, active = plant.cost(x, u, barrier), torch.arange(len(u))
+    x = x.clone()
+    u = u.clone()
+    steps = u.shape[1]
+    costs = plant.cost(x, u, barrier)
+    active = torch.arange(len(u))
     for _ in range(200):
-        old_x, old_u, old_costs = x[active], u[active], costs[active]
+        old_x = x[active]
+        old_u = u[active]
+        old_costs = costs[active]
         corrections, gains, _ = _backward(plant, old_x, old_u, barrier)
         tried = old_u + STEP_SIZES * corrections
         begin = old_x[:, 0].expand(len(STEP_SIZES), -1, -1)
         new_x, new_u = plant.rollout(begin, partial(_following, old_x, tried, gains), steps)
         new_costs, best = plant.cost(new_x, new_u, barrier).min(0)
-        better, rows = new_costs < old_costs, torch.arange(len(active))
+        better = new_costs < old_costs
+        rows = torch.arange(len(active))
         changed = active[better]
-        x[changed], u[changed] = new_x[best, rows][better], new_u[best, rows][better]
+        x[changed] = new_x[best, rows][better]
+        u[changed] = new_u[best, rows][better]
         costs[changed] = new_costs[better]
         active = active[old_costs - new_costs > 1e-12 + 1e-9 * old_costs.abs()]
         if len(active) == 0:
@@ -207,7 +226,8 @@ def _played(plant: _Plant, path: Tensor, u: Tensor, gains: Tensor) -> tuple[Arra
     The feedback only undoes the differences of rounding between torch and the environment.
     """
     env = gymnasium.make(plant.env_id).unwrapped
-    costs, inputs = np.zeros(len(u)), u.numpy().copy()
+    costs = np.zeros(len(u))
+    inputs = u.numpy().copy()
     for i, u_i in enumerate(inputs):
         _, info = env.reset(options={"state": path[i, 0].numpy()})
         for t in range(len(u_i)):
@@ -228,7 +248,8 @@ def _planned(plant: _Plant, searches: list[tuple[Tensor, Tensor]]) -> Plan:
     for barrier in BARRIERS if math.isfinite(plant.limit) else (0.0,):
         x, u = _improved(plant, x, u, barrier)
     best = plant.cost(x, u, 0.0).reshape(-1, k).argmin(0) * k + torch.arange(k)
-    x, u = x[best], u[best]
+    x = x[best]
+    u = u[best]
     _, gains, gradients = _backward(plant, x, u, 0.0)
     residual = (plant.clip(u - gradients) - u).abs().amax(1).numpy()
     return Plan(*_played(plant, x, u, gains), residual)
@@ -236,7 +257,8 @@ def _planned(plant: _Plant, searches: list[tuple[Tensor, Tensor]]) -> Plan:
 
 def _checked(plant: _Plant, starts: ArrayLike, steps: int) -> Tensor:
     """Return the starts as float64 (k, n), or raise a ValueError."""
-    values, n = np.array(starts, dtype=np.float64), len(plant.Q)
+    values = np.array(starts, dtype=np.float64)
+    n = len(plant.Q)
     if values.ndim != 2 or values.shape[1] != n or len(values) == 0:
         raise ValueError(f"starts must have shape (k, {n}) with k > 0, got shape {values.shape}.")
     if steps < 1:
@@ -320,7 +342,8 @@ def clipped_pendulum_plan(starts: ArrayLike, steps: int = 200) -> Plan:
     Plan
         Inputs are torques in N m.
     """
-    begin, values = _checked(PENDULUM, starts, steps), pendulum_values(steps)
+    begin = _checked(PENDULUM, starts, steps)
+    values = pendulum_values(steps)
 
     def greedy(t: int, x: Tensor) -> Tensor:
         return torch.from_numpy(TORQUES[_lookahead(values[steps - 1 - t], x.numpy()).argmin(1)])

@@ -88,7 +88,9 @@ class Plant:
 
     def predict(self, y: Array, u: Array) -> Array:
         """Return what the plant's Kalman filter predicts, (T + 1 - AHEAD, q)."""
-        A, C, noise = self.A, self.C, np.diag(self.sensor**2)
+        A = self.A
+        C = self.C
+        noise = np.diag(self.sensor**2)
         P = linalg.solve_discrete_are(A.T, C.T, (self.process**2 + 1e-14) * np.eye(len(A)), noise)
         gain = np.linalg.solve(C @ P @ C.T + noise, C @ P @ A.T).T
         moved = self.late(u) @ self.B.T
@@ -110,20 +112,27 @@ def states(A: Array, moved: Array) -> Array:
 
 def random_plant(rng: np.random.Generator) -> tuple[Plant, str]:
     """Return a plant and what it is."""
-    n, m, q = int(rng.integers(1, 9)), int(rng.integers(1, 4)), int(rng.integers(1, 4))
+    n = int(rng.integers(1, 9))
+    m = int(rng.integers(1, 4))
+    q = int(rng.integers(1, 4))
     integrates = bool(rng.random() < 0.2)
     blocks = [np.ones((1, 1))] if integrates else []
     while (left := n - sum(map(len, blocks))) > 0:
         if left > 1 and rng.random() < 0.5:
-            size, angle = rng.uniform(0.7, 0.97), rng.uniform(0.1, 1.5)
-            cos, sin = np.cos(angle), np.sin(angle)
+            size = rng.uniform(0.7, 0.97)
+            angle = rng.uniform(0.1, 1.5)
+            cos = np.cos(angle)
+            sin = np.sin(angle)
             blocks.append(size * np.array([[cos, sin], [-sin, cos]]))
         else:
             blocks.append(np.array([[rng.uniform(0.3, 0.97)]]))
-    A, B, C = linalg.block_diag(*blocks), rng.normal(size=(n, m)), rng.normal(size=(q, n))
+    A = linalg.block_diag(*blocks)
+    B = rng.normal(size=(n, m))
+    C = rng.normal(size=(q, n))
     B[0] *= 0.2 if integrates else 1.0
     delays = rng.integers(0, 11, m) if rng.random() < 0.5 else np.zeros(m, int)
-    decibels, share = rng.uniform(10, 40), rng.random()
+    decibels = rng.uniform(10, 40)
+    share = rng.random()
     quiet = Plant(A, B, C, delays, 0.0, np.zeros(q))
     size = np.std(quiet.record(inputs(2000, m, rng), rng), axis=0) * 10 ** (-decibels / 20)
     loud = np.std(states(A, rng.normal(size=(2000, n))) @ C.T, axis=0)
@@ -137,7 +146,8 @@ def inputs(count: int, m: int, rng: np.random.Generator) -> Array:
     """Return inputs (count, m) that are held, each for its own number of samples."""
     found = np.zeros((count, m))
     for j in range(m):
-        hold, k = int(rng.integers(2, 15)), 0
+        hold = int(rng.integers(2, 15))
+        k = 0
         while k < count:
             length = int(rng.integers(1, 2 * hold))
             found[k : k + length, j] = rng.uniform(-1, 1)
@@ -152,7 +162,8 @@ def judge_plants(seeds: range) -> None:
         rng = np.random.default_rng(seed)
         plant, words = random_plant(rng)
         u, fresh = (inputs(count, plant.B.shape[1], rng) for count in (2000, 1000))
-        y, z = plant.record(u, rng), plant.record(fresh, rng)
+        y = plant.record(u, rng)
+        z = plant.record(fresh, rng)
         began = time.process_time()
         found = identify_outputs(y, u, dt=1.0)
         took = time.process_time() - began
@@ -178,7 +189,8 @@ def judge_sets(folder: Path) -> None:
         if not path.exists():
             continue
         table = np.loadtxt(path)
-        y, u = table[:, of_outputs], table[:-1, of_inputs]
+        y = table[:, of_outputs]
+        u = table[:-1, of_inputs]
         border = int(0.7 * len(y))
         found = identify_outputs(y[:border], u[: border - 1], dt=1.0)
         start = border + 5
@@ -221,7 +233,8 @@ class Hidden(TextbookEnv):
         self, plant: TextbookPlant, C: Array, last: tuple[float, float] | None = None
     ) -> None:
         super().__init__(plant)
-        self.C, self.last = C, last
+        self.C = C
+        self.last = last
         free = np.full(len(C), np.inf)
         self.observation_space = spaces.Box(-free, free, dtype=np.float64)
 
@@ -311,9 +324,16 @@ class Learner:
 
         ``push`` moves the inputs, every fifth sample anew, by half-widths of their range.
         """
-        mpc, env, rng = self.mpc, self.make(), np.random.default_rng(seed)
-        theta, over, cost, C = env.reset(seed=seed)[0], False, 0.0, env.unwrapped.C
-        outputs, inputs, thetas = [env.unwrapped.outputs], [], [theta]
+        mpc = self.mpc
+        env = self.make()
+        rng = np.random.default_rng(seed)
+        theta = env.reset(seed=seed)[0]
+        over = False
+        cost = 0.0
+        C = env.unwrapped.C
+        outputs = [env.unwrapped.outputs]
+        inputs = []
+        thetas = [theta]
         while not over:
             if len(inputs) % 5 == 0:
                 moved = push * mpc.u_half * rng.uniform(-1, 1, len(mpc.R))
@@ -344,7 +364,8 @@ def of_outputs(
 
 def of_feed(extra: bool) -> Learner:
     """Return the reactor whose food in the feed is 3.2 to 4.8, with a policy that may see it."""
-    plant, last = bioreactor(), (3.2, 4.8)
+    plant = bioreactor()
+    last = (3.2, 4.8)
     mpc = plant.mpc()
     return Learner(
         with_extra(mpc, *last) if extra else mpc,
@@ -354,7 +375,8 @@ def of_feed(extra: bool) -> Learner:
 
 def of_column() -> Learner:
     """Return the offset-free MPC of the column, by its outputs in 1,500 minutes of steps."""
-    plant, rng = Column(np.eye(2), sensor=0.05), np.random.default_rng(0)
+    plant = Column(np.eye(2), sensor=0.05)
+    rng = np.random.default_rng(0)
     u = Column.u_rest + 0.15 * inputs(1500, 2, rng)
     y = np.array([plant.reset(seed=0)[0], *(plant.step(each)[0] for each in u)])
     model = identify_outputs(y, u, dt=1.0).model
@@ -398,10 +420,12 @@ LEARNERS: dict[str, Callable[[], Learner]] = {
 def judge_learning(name: str, seed: int) -> None:
     """Print what is gained on one plant."""
     case = LEARNERS[name]()
-    mpc, law = case.mpc, case.mpc.law()
+    mpc = case.mpc
+    law = case.mpc.law()
     base = case.costs(law.plant_input)
     settled = case.play(law.plant_input, TESTS[0])[3][-2]  # the last one has another set-point
-    track, layout = mpc.tracking.C, mpc.layout
+    track = mpc.tracking.C
+    layout = mpc.layout
     offset = np.abs(track @ settled[layout.state] - settled[layout.reference]).max()
     print(f"{name} | MPC {base.mean():.4g}, offset in the end {offset:.2g}", flush=True)
 

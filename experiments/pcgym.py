@@ -42,8 +42,10 @@ from sb3_yann_envs.pcgym import PCGymEnv
 HORIZONS = {"cstr": 5, "four_tank": 3, "multistage_extraction": 1}
 """Of the MPCs, chosen on episodes 100 to 109."""
 PLANTS = {f"PC-Gym, {name}": name for name in HORIZONS}
-OFFSET_FREE, NMPC = "offset-free MPC", "NMPC"
-IN_SIMULATOR, FROM_A_LOG = f"{OURS}, `improve` in a simulator", f"{OURS}, from a log"
+OFFSET_FREE = "offset-free MPC"
+NMPC = "NMPC"
+IN_SIMULATOR = f"{OURS}, `improve` in a simulator"
+FROM_A_LOG = f"{OURS}, from a log"
 FIXED = MPC, OFFSET_FREE, REIDENTIFIED, NMPC
 RIVALS: dict[str, type[Any]] = {"DDPG": DDPG, "TD3": TD3, "SAC": SAC, "PPO": PPO}
 TESTS = range(3000, 3030)
@@ -81,7 +83,8 @@ class Case:
         self.observer: DisturbanceObserver | None = None
         more: dict[str, Any] = {}
         if offset_free:
-            moves, more = np.diag(model.E), {"disturbances": DisturbanceBounds(-1, 1)}
+            moves = np.diag(model.E)
+            more = {"disturbances": DisturbanceBounds(-1, 1)}
             noise = {"state_noise": moves, "measurement_noise": 0.01 * moves}
             self.observer = DisturbanceObserver(model, **noise, disturbance_noise=10)
         self.mpc = LinearMPC(
@@ -113,11 +116,13 @@ class Rival:
     """What a model of `scaled` does to theta."""
 
     def __init__(self, model: Any, case: Case) -> None:
-        self.model, self.plant = model, case.plant
+        self.model = model
+        self.plant = case.plant
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
         """Return inputs (batch, m)."""
-        box, plant = self.plant.observation_space, self.plant
+        box = self.plant.observation_space
+        plant = self.plant
         shown = 2 * (theta - box.low) / (box.high - box.low) - 1
         action = self.model.predict(shown.astype(np.float32), deterministic=True)[0]
         return np.asarray(
@@ -164,12 +169,14 @@ def runs() -> list[Run]:
 
 def execute(run: Run) -> Outcome:
     """Return the outcome of a run: PC-Gym's costs as those of its tests."""
-    began, name = time.perf_counter(), PLANTS[run.plant]
+    began = time.perf_counter()
+    name = PLANTS[run.plant]
     case = Case(name, offset_free=run.learner in (OFFSET_FREE, OURS, IN_SIMULATOR, FROM_A_LOG))
     tested: dict[int, tuple[Trajectories, float]] = {}
 
     def test(steps: int, act: Callable[[Any], Any]) -> None:
-        played, one = evaluate(Batched(act), case.env, TESTS), Timed(act)
+        played = evaluate(Batched(act), case.env, TESTS)
+        one = Timed(act)
         evaluate(one, case.env(), TESTS[:1])  # a row at a time, as a plant asks
         tested[steps] = played, 1e3 * float(np.median(one.times))
 
@@ -209,7 +216,8 @@ def outcome(
     case: Case, tested: Mapping[int, tuple[Trajectories, float]], seconds: float
 ) -> Outcome:
     """Return tests after so many steps as an outcome: their costs by both metrics."""
-    plain, size = Case(case.name).mpc, case.plant.observation_space.shape[0]
+    plain = Case(case.name).mpc
+    size = case.plant.observation_space.shape[0]
     stage = [
         [
             float(plain.stage_cost(seen[:-1, :size], taken).sum())
@@ -233,7 +241,8 @@ class TestAt(BaseCallback):
 
     def __init__(self, steps: int, test: Callable[[], None]) -> None:
         super().__init__()
-        self.steps, self.test = steps, test
+        self.steps = steps
+        self.test = test
 
     def _on_step(self) -> bool:
         if self.num_timesteps == self.steps:
@@ -304,7 +313,8 @@ def _row(
 
 def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
     """Quote the table in ``environments.md`` if it is there; return the paths that were written."""
-    found, page = rows(outcomes), folder / "environments.md"
+    found = rows(outcomes)
+    page = folder / "environments.md"
     return [page] if found and quote(table(HEADER, found, texts=2), page, BEGIN, END) else []
 
 

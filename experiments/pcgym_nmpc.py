@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from sb3_yann_envs.pcgym import PCGymEnv
 
 HORIZON = 15  # samples
-ELEMENTS, DEGREE = 4, 3
+ELEMENTS = 4
+DEGREE = 3
 """Of the polynomials in a sample, at Radau's points."""
 OPTIONS = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 60,
            "ipopt.tol": 1e-6}  # fmt: skip
@@ -28,15 +29,26 @@ class NonlinearMPC:
     def __init__(self, case: Case) -> None:
         import casadi
 
-        self.plant, self.mpc = case.plant, case.mpc
-        n, m, p = len(self.plant.x0), len(self.plant.u_min), len(self.plant.outputs)
-        self.n, self.m, self.inner = n, m, n * DEGREE * ELEMENTS
+        self.plant = case.plant
+        self.mpc = case.mpc
+        n = len(self.plant.x0)
+        m = len(self.plant.u_min)
+        p = len(self.plant.outputs)
+        self.n = n
+        self.m = m
+        self.inner = n * DEGREE * ELEMENTS
         low, width = self.plant._box()
-        self.low, self.width = low, width
-        V, Z = casadi.MX.sym("V", m, HORIZON), casadi.MX.sym("Z", self.inner, HORIZON)
-        first, wanted = casadi.MX.sym("first", n), casadi.MX.sym("wanted", p)
-        sample, outputs = collocated(self.plant), self.plant.outputs
-        s, cost, gaps = (first - low[:n]) / width[:n], 0, []
+        self.low = low
+        self.width = width
+        V = casadi.MX.sym("V", m, HORIZON)
+        Z = casadi.MX.sym("Z", self.inner, HORIZON)
+        first = casadi.MX.sym("first", n)
+        wanted = casadi.MX.sym("wanted", p)
+        sample = collocated(self.plant)
+        outputs = self.plant.outputs
+        s = (first - low[:n]) / width[:n]
+        cost = 0
+        gaps = []
         for k in range(HORIZON):
             s, gap = sample(s, V[:, k], Z[:, k])
             error = low[outputs] + width[outputs] * s[outputs] - wanted
@@ -49,7 +61,8 @@ class NonlinearMPC:
         }  # fmt: skip
         self.solve = casadi.nlpsol("plan", "ipopt", program, OPTIONS)
         free = np.full(self.inner * HORIZON, 5.0)  # states, far beyond their ranges
-        lowest, highest = np.zeros(m * HORIZON), np.ones(m * HORIZON)
+        lowest = np.zeros(m * HORIZON)
+        highest = np.ones(m * HORIZON)
         self.limits = {
             "lbx": np.append(lowest, -free), "ubx": np.append(highest, free), "lbg": 0, "ubg": 0,
         }  # fmt: skip
@@ -83,15 +96,20 @@ def collocated(plant: PCGymEnv) -> Any:
     """
     import casadi
 
-    n, m = len(plant.x0), len(plant.u_min)
+    n = len(plant.x0)
+    m = len(plant.u_min)
     low, width = plant._box()
     C, D, _ = casadi.collocation_coeff(casadi.collocation_points(DEGREE, "radau"))
-    x, v = casadi.SX.sym("x", n), casadi.SX.sym("v", m)
+    x = casadi.SX.sym("x", n)
+    v = casadi.SX.sym("v", m)
     z = casadi.SX.sym("z", n, DEGREE * ELEMENTS)
-    u, end, gaps = low[n:] + width[n:] * v, x, []
+    u = low[n:] + width[n:] * v
+    end = x
+    gaps = []
     for e in range(ELEMENTS):
         points = casadi.horzcat(end, z[:, e * DEGREE : (e + 1) * DEGREE])
-        slopes, end = points @ C, points @ D
+        slopes = points @ C
+        end = points @ D
         for i in range(DEGREE):
             rate = plant._rate(low[:n] + width[:n] * points[:, i + 1], u) / width[:n]
             gaps.append(slopes[:, i] - plant.dt / ELEMENTS * rate)

@@ -154,7 +154,8 @@ def _excess(runs: list[Outcome], base: float) -> tuple[Array, Array]:
 def _band(axes: Axes, x: Array, y: Array, k: int, label: str) -> None:
     """Draw the median over the seeds, and the band from the first to the third quartile."""
     low, middle, high = np.quantile(y, [0.25, 0.5, 0.75], axis=0)
-    color, style = COLORS[k % len(COLORS)], STYLES[k % len(STYLES)]
+    color = COLORS[k % len(COLORS)]
+    style = STYLES[k % len(STYLES)]
     marker = {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "markevery": 0.12}
     axes.plot(x, middle, label=label, color=color, linestyle=style, zorder=9 - k, **marker)
     axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)

@@ -105,7 +105,8 @@ class TextbookEnv(gym.Env[Array, Array]):
     ) -> tuple[Array, dict[str, Any]]:
         """Begin near where the plant rests."""
         super().reset(seed=seed)
-        x, spread = self.plant.model.x_ss, np.array(self.plant.spread)
+        x = self.plant.model.x_ss
+        spread = np.array(self.plant.spread)
         self.state = x + spread * self.np_random.uniform(-1, 1, len(x))
         return self.state.copy(), {}
 
@@ -132,7 +133,9 @@ def _integrated(slope: Step, dt: float, substeps: int) -> Step:
 
 
 CARBONATE = 5e-5  # mol/L
-FEED, BASE = 3.0e-3, -3.05e-3  # mol/L, charge of what flows in
+# mol/L, charge of what flows in
+FEED = 3.0e-3
+BASE = -3.05e-3
 
 
 def _charge(ph: float, carbonate: float = CARBONATE) -> float:
@@ -148,7 +151,9 @@ def ph() -> TextbookPlant:
 
     A second state, if there is one, is how much of the buffer there is.
     """
-    dt, feed = 10.0, 0.01  # s, L/s
+    # s, L/s
+    dt = 10.0
+    feed = 0.01
 
     def advance(x: Array, u: Array) -> Array:
         rate = feed + float(u[0])
@@ -161,7 +166,8 @@ def ph() -> TextbookPlant:
 
     rest = np.array([7.0])
     u = np.array([feed * (FEED - _charge(7.0)) / (_charge(7.0) - BASE)])
-    e_x, e_u = np.array([1e-3]), np.array([1e-6])
+    e_x = np.array([1e-3])
+    e_u = np.array([1e-6])
     A = (advance(rest + e_x, u) - advance(rest - e_x, u)) / (2 * e_x)
     B = (advance(rest, u + e_u) - advance(rest, u - e_u)) / (2 * e_u)
     model = LinearModel([A], [B], dt, x_ss=rest, u_ss=u, state_names=["pH"])
@@ -189,11 +195,13 @@ def van_de_vusse() -> TextbookPlant:
         )
 
     dt = 1 / 60  # h
-    x, u = [2.1402, 1.0903, 387.34, 386.06], [14.19, -1113.5]
+    x = [2.1402, 1.0903, 387.34, 386.06]
+    u = [14.19, -1113.5]
     model = LinearModel.from_dynamics(slope, x, u, dt)
     weights = {"Q": np.diag([0, 100, 0, 0]), "R": np.diag([1e-3, 1e-7]), "horizon": 2}
     boxes = (0.5, 0.3, 370.0, 365.0), (4.5, 1.5, 405.0, 405.0), (3.0, -9000.0), (35.0, 0.0)
-    spread, wanted = (0.2, 0.05, 1.0, 1.0), ((0.85,), (1.095,))
+    spread = (0.2, 0.05, 1.0, 1.0)
+    wanted = ((0.85,), (1.095,))
     return TextbookPlant(_integrated(slope, dt, 4), model, *boxes, spread, weights, (1,), wanted)
 
 
@@ -212,7 +220,8 @@ def bioreactor() -> TextbookPlant:
     model = LinearModel.from_dynamics(slope, [1.52, 0.2], [np.nan], 0.5)
     weights = {"Q": np.diag([1, 0]), "R": [[0.1]], "horizon": 5}
     boxes = (0.3, 0.0), (2.0, 4.0), (0.0,), (0.6,)
-    spread, wanted = (0.2, 0.1), ((1.0,), (1.55,))
+    spread = (0.2, 0.1)
+    wanted = ((1.0,), (1.55,))
     return TextbookPlant(
         _integrated(slope, 0.5, 2), model, *boxes, spread, weights, (0,), wanted, 40, 80
     )

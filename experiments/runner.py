@@ -110,7 +110,8 @@ class Outcome:
             return self
         if episodes not in self.checkpoints:
             raise ValueError(f"The run was not tested after {episodes} training episodes.")
-        k, e = int(np.searchsorted(self.checkpoints, episodes)) + 1, episodes
+        k = int(np.searchsorted(self.checkpoints, episodes)) + 1
+        e = episodes
         tested = {name: getattr(self, name)[:k] for name in _ARRAYS[:3]}
         return replace(self, **tested, **{name: getattr(self, name)[:e] for name in _ARRAYS[3:]})
 

@@ -157,7 +157,8 @@ class KeepBest(BaseCallback):
 
     def __init__(self, model: TD3, features: Law, seeds: range) -> None:
         super().__init__()
-        self.features, self.seeds = features, seeds
+        self.features = features
+        self.seeds = seeds
         self.env_id = model.get_env().envs[0].unwrapped.spec.id
         self.kept = copy.deepcopy(model.policy)
         self.cost = np.inf
@@ -275,7 +276,8 @@ def cloned(make_env: MakeEnv, seed: int) -> Learner:
     """
     learner = _plain(DDPG, make_env, seed, learning_starts=0)
     env = learner.model.get_env().envs[0].unwrapped
-    law, space = env.observation_space.problem.explicit(), env.action_space
+    law = env.observation_space.problem.explicit()
+    space = env.action_space
     rng = np.random.default_rng(seed)
     # On an environment of its own: the caller's may record.
     states = np.concatenate(evaluate(law, env.spec.id, CLONING_SEEDS).observations)

@@ -71,7 +71,8 @@ def check_bounds(
     A scalar is for all entries; None and infinity are no bound. A finite one has at most 1e100.
     """
     below, above = sides_of(name)
-    low, high = _bound(below, lower, size, -np.inf), _bound(above, upper, size, np.inf)
+    low = _bound(below, lower, size, -np.inf)
+    high = _bound(above, upper, size, np.inf)
     if np.any(low >= high):
         i = int(np.argmax(low >= high))
         given = f"{below} = {low[i]:g} and {above} = {high[i]:g}"

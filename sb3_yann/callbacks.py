@@ -110,7 +110,8 @@ class ControlDiagnostics(BaseCallback):
         known = np.isfinite(distances)  # the law knows none where an observation is not finite
         self._regions.extend(regions[known].tolist())
         self._distances.extend(distances[known])
-        dones, infos = self.locals["dones"], self.locals["infos"]
+        dones = self.locals["dones"]
+        infos = self.locals["infos"]
         self.violations += sum(bool(info.get("violation", False)) for info in infos)
         for i, episode in enumerate(self._episodes):
             episode.append((observations[i], actions[i], self.locals["rewards"][i]))

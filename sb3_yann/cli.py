@@ -135,7 +135,8 @@ def _evaluate(options: Namespace) -> None:
     from sb3_yann import evaluation
 
     seeds = _seeds(options.episodes, options.seed)
-    model, env = _model(options.model), _env(options.env)
+    model = _model(options.model)
+    env = _env(options.env)
     policy = evaluation.evaluate(model, env, seeds)
     model.policy.limit_correction(0.0)  # what is left is the MPC
     mpc = evaluation.evaluate(model, env, seeds)
@@ -156,7 +157,8 @@ def _report(options: Namespace) -> None:
     """Write the report on a model."""
     from sb3_yann import report as write
 
-    seeds, env = _seeds(options.episodes), _env(options.env) if options.env else None
+    seeds = _seeds(options.episodes)
+    env = _env(options.env) if options.env else None
     written = write(_model(options.model), options.page, env=env, seeds=seeds)
     print(f"Written: {written}")
 

@@ -26,7 +26,12 @@ UNSAFE = (
     "a larger summed excess over the problem's bounds",
 )
 """What the first columns of ``unsafe`` are; the others are what it takes to compare them."""
-ENDED, INPUT_STEP, LARGEST, ANY_BOUND, MISSING, WORST = 1, 3, 4, 6, 7, 8
+ENDED = 1
+INPUT_STEP = 3
+LARGEST = 4
+ANY_BOUND = 6
+MISSING = 7
+WORST = 8
 """Columns: how an episode ends; steps in which an input moves too far; the excess over hard bounds,
 and over soft ones too; minus the number of steps; which bound is exceeded most."""
 SUCCESS_HINT = 'where an end is a success, the env says so by info["is_success"]'
@@ -434,7 +439,10 @@ class PairedTrial:
         new_seeds: Callable[[int], Sequence[int]],
         tolerance: Callable[[Array], Tolerance] | None = None,
     ) -> None:
-        self.play, self.mpc, self.starts, self.new_seeds = play, mpc, starts, new_seeds
+        self.play = play
+        self.mpc = mpc
+        self.starts = starts
+        self.new_seeds = new_seeds
         self.tolerance = tolerance
         self.scores = starts.mpc.at(slice(0))
 
@@ -484,7 +492,8 @@ class PairedTrial:
         With ``must_gain`` a gain must be sure at the ``level`` and ``least_gain`` at least, else
         "no worse" is enough. See :func:`no_worse`.
         """
-        mpc, scores = self.mpc_scores, self.scores
+        mpc = self.mpc_scores
+        scores = self.scores
         found = no_worse(
             scores,
             mpc if accepted is None else accepted,

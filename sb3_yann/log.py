@@ -298,7 +298,8 @@ class Log:
         )
         if not len(table):
             raise ValueError(f"{path} has no rows below its header.")
-        n, m = len(states), len(inputs)
+        n = len(states)
+        m = len(inputs)
         ends = np.zeros(len(table) + 1, dtype=bool)
         ends[[0, -1]] = True
         if episode is not None:

@@ -29,11 +29,15 @@ Policy = Callable[[int, Array], Array]  # step and thetas (k, n_theta) -> inputs
 
 SIZES = (1.0, 0.5, 0.2, 0.05)  # parts of a correction that are tried, the first first
 SETTLED = 1e-5  # A start is done when a correction saves less than this part of its cost
-ROUNDS, RACE = 40, 4  # corrections at most; after how many the best of several guesses goes on
+# corrections at most; after how many the best of several guesses goes on
+ROUNDS = 40
+RACE = 4
 SOFT = 1e-2  # bounds count so much less at first: stiff ones would end a search where it meets them
-DAMPED, PATIENCE = 10.0, 5
+DAMPED = 10.0
+PATIENCE = 5
 """Factor of the damping where no correction helps; how often in a row, at most."""
-INSIDE, WEIGHT = 1e-3, 1e4
+INSIDE = 1e-3
+WEIGHT = 1e4
 """How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
 a step, in mean costs of a step."""
 BURSTS = 25  # some searches begin with all inputs on a bound, for this part of the episode
@@ -58,7 +62,8 @@ class TwinPlant:
     """The members of a twin, one for each start, or by default the mean of all."""
 
     def __init__(self, dynamics: Dynamics, members: Iterable[int] | None = None) -> None:
-        self.dynamics, self.members = dynamics, None if members is None else [*members]
+        self.dynamics = dynamics
+        self.members = None if members is None else [*members]
         self._known: dict[bytes, Dynamics] = {}
 
     @property
@@ -72,7 +77,8 @@ class TwinPlant:
     def _acting(self, rows: Rows) -> Dynamics:
         if self.members is None:
             return self.dynamics
-        key, every = rows.tobytes(), self.dynamics
+        key = rows.tobytes()
+        every = self.dynamics
         if key not in self._known:
             chosen = tuple(every.members[self.members[row]] for row in rows)
             self._known[key] = Dynamics(every.problem, every.coordinates, chosen)
@@ -91,7 +97,8 @@ class TwinPlant:
         """Return the next theta (k, n_theta); an estimated d stays, as in an env's plan."""
         row = self.dynamics.row
         after = self.advance(row.begin(theta), u, rows)
-        found, parts = row.shown(after).copy(), self.dynamics.problem.layout
+        found = row.shown(after).copy()
+        parts = self.dynamics.problem.layout
         if row.observer is not None:
             found[:, parts.state] = after[:, row.state]
             found[:, parts.disturbance] = theta[:, parts.disturbance]
@@ -99,7 +106,8 @@ class TwinPlant:
 
     def slopes(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives of rows at theta (T, k, size) and u (T, k, m)."""
-        acting, (steps, k) = self._acting(rows), theta.shape[:2]
+        acting = self._acting(rows)
+        (steps, k) = theta.shape[:2]
         if self.members is not None:
             swapped = np.swapaxes(theta, 0, 1), np.swapaxes(u, 0, 1)
             A, B = (np.swapaxes(each, 0, 1) for each in acting.jacobians(*swapped))
@@ -111,13 +119,16 @@ class TwinPlant:
 
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
-        row, parts = self.dynamics.row, self.dynamics.problem.layout
+        row = self.dynamics.row
+        parts = self.dynamics.problem.layout
         A, B = self.slopes(row.begin(theta), u, rows)
         if row.observer is None:
             return A, B
-        number, n = np.arange(parts.size), parts.size
+        number = np.arange(parts.size)
+        n = parts.size
         to = np.where(number < parts.n_states, number + row.state.start, number)
-        of_x, B = A[..., to, :], B[..., to, :]
+        of_x = A[..., to, :]
+        B = B[..., to, :]
         found = of_x[..., :n].copy()
         found[..., parts.state] += of_x[..., row.state]
         found[..., parts.disturbance, :] = np.eye(n)[parts.disturbance]
@@ -196,7 +207,8 @@ class Task:
 
     def _squares(self, over: Array, rows: Array) -> tuple[Array, Array]:
         """Return gradient and curvature of the price of what is over (..., k), of rows (k, n)."""
-        weight, active = 2 * self.weight, (over != 0).astype(float)
+        weight = 2 * self.weight
+        active = (over != 0).astype(float)
         curvature = np.einsum("ki,...k,kj->...ij", rows, active, rows)
         return weight * over @ rows, weight * curvature
 
@@ -257,7 +269,8 @@ def planned(
 
     ``starts`` (k, n_theta), whose numbers are ``rows`` (k,), as the plant knows them.
     """
-    found, every = [], np.arange(len(starts))
+    found = []
+    every = np.arange(len(starts))
     turn = getattr(plant, "turn", None)
     soft = dataclasses.replace(task, weight=SOFT * task.weight)
     for policy in policies:
@@ -296,13 +309,15 @@ def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) ->
         waiting: Rows = np.arange(len(active))
         for size in SIZES:
             moved = dataclasses.replace(old, inputs=old.inputs + size * corrections, gains=gains)
-            now, some = active[waiting], moved.of(waiting)
+            now = active[waiting]
+            some = moved.of(waiting)
             given = partial(follow, some), some.thetas[0], len(some.inputs), rows[now]
             thetas, inputs = roll_out(plant, task, *given)
             costs = task.costs(thetas, inputs)
             better = costs < some.costs
             won = now[better]
-            plans.thetas[:, won], plans.inputs[:, won] = thetas[:, better], inputs[:, better]
+            plans.thetas[:, won] = thetas[:, better]
+            plans.inputs[:, won] = inputs[:, better]
             plans.costs[won] = costs[better]
             waiting = waiting[~better]
             if not len(waiting):
@@ -323,8 +338,11 @@ def _backward(
     plant: Plant, task: Task, plans: Plans, rows: Rows, damping: Array
 ) -> tuple[Array, Array]:
     """Return corrections (T, k, m) and gains (T, k, m, n_theta)."""
-    problem, thetas, inputs = task.problem, plans.thetas, plans.inputs
-    size, states = problem.n_theta, problem.layout.state
+    problem = task.problem
+    thetas = plans.thetas
+    inputs = plans.inputs
+    size = problem.n_theta
+    states = problem.layout.state
     A, B = plant.jacobians(thetas[:-1], inputs, rows)
     F = np.concatenate([A, B], axis=-1)
     W = 2 * problem.stage_matrix
@@ -342,8 +360,10 @@ def _backward(
     # A bound of the rate moves with the previous input.
     still = problem.deviations.limits_at("u", thetas[:-1])
     moving = np.stack([a != b for a, b in zip(limits, still, strict=True)], axis=1)
-    v, V = 2 * thetas[-1] @ task.end + task.end_slope, np.tile(2 * task.end, (len(rows), 1, 1))
-    corrections, gains = np.empty_like(inputs), np.empty_like(plans.gains)
+    v = 2 * thetas[-1] @ task.end + task.end_slope
+    V = np.tile(2 * task.end, (len(rows), 1, 1))
+    corrections = np.empty_like(inputs)
+    gains = np.empty_like(plans.gains)
     damped = damping[:, None, None] * W[size:, size:]
     for t in reversed(range(len(inputs))):
         v[:, states] += gradient[t]
@@ -351,8 +371,11 @@ def _backward(
         Ft = F[t].swapaxes(1, 2)
         q = slopes[t] + (Ft @ v[..., None])[..., 0]
         H = curved[t] + Ft @ V @ F[t]
-        qx, qu = q[:, :size], q[:, size:]
-        Hxx, Hux, Huu = H[:, :size, :size], H[:, size:, :size], H[:, size:, size:]
+        qx = q[:, :size]
+        qu = q[:, size:]
+        Hxx = H[:, :size, :size]
+        Hux = H[:, size:, :size]
+        Huu = H[:, size:, size:]
         move = _bounded_step(Huu + damped, qu, low[t], high[t])
         K = _feedback(Huu + damped, Hux, move <= low[t], move >= high[t], moving[t])
         Kt = K.swapaxes(1, 2)
@@ -360,7 +383,8 @@ def _backward(
         v += (Hux.swapaxes(1, 2) @ move[..., None])[..., 0]
         V = Hxx + Kt @ Huu @ K + Kt @ Hux + Hux.swapaxes(1, 2) @ K
         V = (V + V.swapaxes(1, 2)) / 2
-        corrections[t], gains[t] = move, K
+        corrections[t] = move
+        gains[t] = K
     return corrections, gains
 
 
@@ -374,7 +398,8 @@ def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:
         slope = g + (H @ move[..., None])[..., 0]
         held = ((move <= low) & (slope > 0)) | ((move >= high) & (slope < 0))
         step = np.linalg.solve(_reduced(H, held), np.where(held, 0.0, slope)[..., None])[..., 0]
-        before, move = move, np.clip(move - step, low, high)
+        before = move
+        move = np.clip(move - step, low, high)
         if np.array_equal(before, move):
             break
     return move
@@ -387,7 +412,8 @@ def _feedback(H: Array, G: Array, at_low: Mask, at_high: Mask, moving: Mask) -> 
     ``moving`` (2, k, m) says whether the lower and the upper bound move with the previous input,
     theta's last entries.
     """
-    held, m = at_low | at_high, H.shape[1]
+    held = at_low | at_high
+    m = H.shape[1]
     fixed: Array = np.zeros_like(G)
     row, j = np.nonzero((at_low & moving[0]) | (at_high & moving[1]))
     fixed[row, j, G.shape[2] - m + j] = 1.0
@@ -411,7 +437,8 @@ def initial_guesses(
     MPC that leaves a pendulum hanging shows no plan that it can swing. There is none where the MPC
     is as cheap. ``starts`` (k, n_theta) have the numbers ``rows`` (k,).
     """
-    problem, until = task.problem, steps // BURSTS
+    problem = task.problem
+    until = steps // BURSTS
     none = partial(_pushed, problem.deviations.u_min, 0)
     pushes = [
         none,
@@ -429,7 +456,9 @@ def initial_guesses(
     for policy in (*first[1:], *others):
         costs, inputs = played(policy)
         won = costs < least
-        best[:, won], least, cheaper = inputs[:, won], np.minimum(costs, least), cheaper | won
+        best[:, won] = inputs[:, won]
+        least = np.minimum(costs, least)
+        cheaper = cheaper | won
     return [*first, lambda t, theta: best[t]] if cheaper.any() else first
 
 
@@ -444,7 +473,8 @@ def _linear(K: Array, theta: Array) -> Array:
 
 def _gains(problem: LinearMPC) -> Iterator[Array]:
     """Yield gains (m, n_theta) of unconstrained laws: with another weight of one error, or all."""
-    errors, size = problem.error_system, len(problem.error_system.Q)
+    errors = problem.error_system
+    size = len(problem.error_system.Q)
     for chosen in (*np.eye(size, dtype=bool), np.ones(size, dtype=bool)):
         for factor in WEIGHTS:
             scale = np.where(chosen, np.sqrt(factor), 1.0)
@@ -481,14 +511,21 @@ class Planning:
         room: float = np.inf,
         law: Law | None = None,
     ) -> None:
-        self.plant, self.task, self.steps, self.pause, self.room = plant, task, steps, pause, room
+        self.plant = plant
+        self.task = task
+        self.steps = steps
+        self.pause = pause
+        self.room = room
         self.plans: dict[int, tuple[int, Plans, Array]] = {}
-        self.law, self.lost = law or law_of(task.problem), set[int]()  # who has left its plan
+        # who has left its plan
+        self.law = law or law_of(task.problem)
+        self.lost = set[int]()
         self._kept: dict[int, float] = {}  # what plans that are over have promised
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
-        problem, constant = self.task.problem, self.task.problem.layout.constant
+        problem = self.task.problem
+        constant = self.task.problem.layout.constant
         states = problem.layout.state
         known = np.isin(rows, [*self.plans])
         changed = np.zeros(len(rows), dtype=bool)
@@ -538,7 +575,8 @@ class Planning:
         if row not in self.plans:
             return 0.0
         begun, plan, _ = self.plans[row]
-        thetas, inputs = plan.thetas[: until - begun], plan.inputs[: until - begun]
+        thetas = plan.thetas[: until - begun]
+        inputs = plan.inputs[: until - begun]
         costs = self.task.problem.deviations.stage_cost(thetas, inputs)
         return self._kept[row] + float(np.sum(costs))
 

@@ -151,7 +151,9 @@ class EnvPool:
     def __init__(
         self, source: Source, most: int | None = None, each: Callable[..., Iterable[Any]] = map
     ) -> None:
-        self.source, self.most, self.each = as_source(source), most, each
+        self.source = as_source(source)
+        self.most = most
+        self.each = each
         self.envs: list[gym.Env[Any, Any]] = []
 
     @contextmanager
@@ -326,7 +328,10 @@ class _Envs:
         problem: LinearMPC | None,
         each: Callable[..., Iterable[Any]] = map,
     ) -> None:
-        self.envs, self.resets, self.problem, self.each = envs, resets, problem, each
+        self.envs = envs
+        self.resets = resets
+        self.problem = problem
+        self.each = each
 
     def reset(self) -> NDArray[Any]:
         """Return the first observations (k, n)."""
@@ -363,7 +368,8 @@ class _Copies:
         starts: Sequence[ArrayLike] | None,
     ) -> None:
         self.envs = [env]
-        self.env, self.seeds = env, seeds
+        self.env = env
+        self.seeds = seeds
         self.options = None if starts is None else {"state": starts}
 
     def reset(self) -> NDArray[Any]:
@@ -388,11 +394,14 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
     n = len(shown)
     running = np.ones(n, dtype=bool)
     rows: Rows = np.arange(n)
-    lengths, costs = np.zeros(n, dtype=np.int64), np.zeros(n)
+    lengths = np.zeros(n, dtype=np.int64)
+    costs = np.zeros(n)
     violations = np.zeros(n, dtype=np.int64)
     terminated, truncated, succeeded = np.zeros((3, n), dtype=bool)
-    states, inputs = [np.array(shown, dtype=np.float64)], list[Array]()
-    rewards, own_rewards = list[Array](), list[Array]()
+    states = [np.array(shown, dtype=np.float64)]
+    inputs = list[Array]()
+    rewards = list[Array]()
+    own_rewards = list[Array]()
     while running.any():
         actions = np.asarray(controller(len(inputs), shown, rows))
         step = plant.step(actions, rows)
@@ -510,7 +519,8 @@ def require_like_training(source: Source | EnvPool, training_env: Any, name: str
                 f"{name} is the training env, whose episodes its own would interrupt. Give it "
                 "another one, e.g. its id."
             )
-        ours, theirs = env.observation_space.shape, training_env.observation_space.shape
+        ours = env.observation_space.shape
+        theirs = training_env.observation_space.shape
         if ours != theirs or env.action_space != training_env.action_space:
             raise ValueError(
                 f"{name} has observations of shape {ours} and {env.action_space}, the training env "
@@ -589,8 +599,10 @@ class OneOf(gym.Env[Any, Any]):
     """
 
     def __init__(self, envs: Any, number: int) -> None:
-        self.all, self.number = envs, number
-        self.observation_space, self.action_space = envs.observation_space, envs.action_space
+        self.all = envs
+        self.number = number
+        self.observation_space = envs.observation_space
+        self.action_space = envs.action_space
 
     def reset(self, **kwargs: Any) -> Any:
         """Start an episode."""
@@ -648,7 +660,8 @@ def may_change_reward(info: Mapping[str, Any]) -> bool:
 @contextmanager
 def preserve_rng() -> Iterator[None]:
     """Restore the global random states that older envs, and modules of torch, draw from."""
-    python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    python = random.getstate()
+    legacy = np.random.get_state()  # noqa: NPY002
     torch: Any = sys.modules.get("torch")
     cpu = None if torch is None else torch.get_rng_state()
     cuda = torch.cuda.get_rng_state_all() if torch and torch.cuda.is_initialized() else []
@@ -683,7 +696,8 @@ def _require_same_inputs(policy: Any, space: Any) -> None:
         return
     if not isinstance(space, gym.spaces.Box) or not np.any(model.u_ss):
         return
-    own, half = (policy.u_min, policy.u_max), half_widths(policy.u_min, policy.u_max)
+    own = (policy.u_min, policy.u_max)
+    half = half_widths(policy.u_min, policy.u_max)
     if same_bounds((space.low, space.high), own, half):
         raise ValueError(
             f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "

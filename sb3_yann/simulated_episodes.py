@@ -103,8 +103,12 @@ class SimulatedEpisodes(BaseCallback):
         check_int("max_hold_steps", max_hold_steps)
         check_range("noise", noise, 0, np.inf)
         check_int("seed", seed, 0)
-        self.env, self.per_episode, self.seed = as_source(env), per_episode, seed
-        self.step_tests, self.max_hold_steps, self.noise = step_tests, max_hold_steps, noise
+        self.env = as_source(env)
+        self.per_episode = per_episode
+        self.seed = seed
+        self.step_tests = step_tests
+        self.max_hold_steps = max_hold_steps
+        self.noise = noise
         # Single envs, whose steps are the training env's: copies that step as one may round.
         given = isinstance(self.env, gym.Env)
         self._pool = EnvPool(self.env if given else lambda: make_env(self.env))
@@ -208,7 +212,8 @@ class _Exploration:
     """What acts in one episode in the place of the policy's actions."""
 
     def __init__(self, settings: SimulatedEpisodes, rng: np.random.Generator) -> None:
-        self.settings, self.rng = settings, rng
+        self.settings = settings
+        self.rng = rng
         self.left = 0  # samples of a step test
         self.held: Array = np.zeros(0)
 

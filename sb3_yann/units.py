@@ -68,8 +68,10 @@ def fields_in_deviations(problem: Any) -> dict[str, Any]:
     outputs = problem.outputs
     disturbances = problem.disturbances
     terminal = problem.terminal
-    mixed, price = problem.mixed, problem.price
-    r_ss, y_ss = tracking.C @ model.x_ss, outputs.C @ model.x_ss
+    mixed = problem.mixed
+    price = problem.price
+    r_ss = tracking.C @ model.x_ss
+    y_ss = outputs.C @ model.x_ss
     mixed_ss = mixed.F @ model.x_ss + mixed.G @ model.u_ss
     spent = price.x @ model.x_ss + price.u @ model.u_ss
     shifted = {
@@ -121,7 +123,9 @@ class ActionUnits(ReadOnlyArrays):
 
         They may be rounded to their own type.
         """
-        u_min, u_max, u_ss = problem.u_min, problem.u_max, problem.model.u_ss
+        u_min = problem.u_min
+        u_max = problem.u_max
+        u_ss = problem.model.u_ss
         half = half_widths(u_min, u_max)
         if same_bounds((low, high), (u_min, u_max), half):
             return cls("plant", np.ones_like(u_ss), u_ss.copy())
@@ -149,7 +153,8 @@ def same_bounds(
 
     Where half-widths are infinite, the size of the bound is the unit.
     """
-    found, bounds = np.array(given, np.float64), np.array(wanted)
+    found = np.array(given, np.float64)
+    bounds = np.array(wanted)
     if found.shape != bounds.shape:
         return False
     finite = np.where(np.isfinite(bounds), np.abs(bounds), 0).max(0)

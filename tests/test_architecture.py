@@ -200,3 +200,32 @@ def test_names_for_type_checkers_are_those_that_are_loaded() -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         sb3_yann.nothing  # noqa: B018
+
+
+def _packed(tree: ast.AST) -> list[int]:
+    """Return the lines of assignments that do in one statement what two would do."""
+    return [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign)
+        and isinstance(node.targets[0], ast.Tuple)
+        and isinstance(node.value, ast.Tuple)
+        and not any(isinstance(each, ast.Starred) for each in node.value.elts)
+        and not {ast.dump(each) for each in ast.walk(node.targets[0])} & _read(node.value)
+    ]
+
+
+def _read(node: ast.AST) -> set[str]:
+    """Return what is read, as it would look where it is written."""
+    return {ast.dump(each).replace("Load()", "Store()") for each in ast.walk(node)}
+
+
+def test_a_statement_assigns_one_thing_but_for_swaps() -> None:
+    assert _packed(ast.parse("a, b = x, y")) == [1]
+    assert not _packed(ast.parse("a, b = b, a\na, b = pair"))
+    found = {
+        name: lines
+        for name, path in MODULES.items()
+        if (lines := _packed(ast.parse(path.read_text(encoding="utf-8"))))
+    }
+    assert found == {}

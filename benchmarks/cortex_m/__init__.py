@@ -14,7 +14,8 @@ from sb3_yann import Controller, export
 from sb3_yann.deployment.code import insensitive, sample_observations, table
 
 HERE = Path(__file__).parent
-COMPILER, EMULATOR = "arm-none-eabi-gcc", "qemu-system-arm"
+COMPILER = "arm-none-eabi-gcc"
+EMULATOR = "qemu-system-arm"
 TOOLS = COMPILER, "arm-none-eabi-size", EMULATOR
 POINTS = 200
 CORE = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]

@@ -45,7 +45,8 @@ class ProblemEnv(gymnasium.Env[Single, Single]):
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}.")
-        self.render_mode, self.observation_space = render_mode, states
+        self.render_mode = render_mode
+        self.observation_space = states
         self.action_space = gymnasium.spaces.Box(-max_input, max_input, (1,), np.float32)
         self.limit = max_input
 
@@ -114,7 +115,8 @@ class ProblemEnv(gymnasium.Env[Single, Single]):
         return min(max(value, -self.limit), self.limit)
 
     def _valid(self, start: Array) -> Array:
-        names, shape = self.state_names, self.lowest.shape
+        names = self.state_names
+        shape = self.lowest.shape
         if start.shape != shape:
             raise ValueError(
                 f"options['state'] must have shape {shape} ({', '.join(names)}), "
@@ -161,7 +163,8 @@ class ProblemVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
     }
 
     def __init__(self, num_envs: int = 1, max_episode_steps: int | None = None) -> None:
-        self.num_envs, self.max_episode_steps = num_envs, max_episode_steps
+        self.num_envs = num_envs
+        self.max_episode_steps = max_episode_steps
         self._env: ProblemEnv = self.single()
         self.single_observation_space = states = self._env.observation_space
         self.single_action_space = self._env.action_space
@@ -202,7 +205,8 @@ class ProblemVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
         ]
         states = [self._start(i, start) for i, start in enumerate(starts)]
         self._state = np.ascontiguousarray(np.array(states).T)
-        self._over[:], self._steps[:] = False, 0
+        self._over[:] = False
+        self._steps[:] = 0
         observed = self._observed()
         return observed.astype(np.float32), {"state": observed, "_state": ~self._over}
 
@@ -217,12 +221,15 @@ class ProblemVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
             raise ValueError(
                 f"actions must be numbers of shape ({self.num_envs}, 1), got {actions!r}."
             )
-        begun, limit = np.flatnonzero(self._over), self._env.limit
+        begun = np.flatnonzero(self._over)
+        limit = self._env.limit
         cost, terminated = self._advance(np.clip(u[:, 0], -limit, limit))
         self._steps += 1
         for i in begun:
             self._state[:, i] = self._start(i, None)
-        cost[begun], terminated[begun], self._steps[begun] = 0.0, False, 0
+        cost[begun] = 0.0
+        terminated[begun] = False
+        self._steps[begun] = 0
         longest = np.inf if self.max_episode_steps is None else self.max_episode_steps
         truncated = self._steps >= longest
         self._over = terminated | truncated

@@ -50,7 +50,8 @@ class ActionRepeat(
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Take up to k steps; the reward is their sum."""
-        total, violation = 0.0, False
+        total = 0.0
+        violation = False
         for _ in range(self.k):
             observation, reward, terminated, truncated, info = self.env.step(action)
             total += float(reward)

@@ -144,7 +144,8 @@ class ClippedPendulumEnv(ProblemEnv):
     start_low = constant(-start_high)
 
     def __init__(self, render_mode: str | None = None) -> None:
-        low, high = self.lowest.astype(np.float32), self.highest.astype(np.float32)
+        low = self.lowest.astype(np.float32)
+        high = self.highest.astype(np.float32)
         states = ProblemBox(low, high, problem="sb3_yann_envs.problems:clipped_pendulum")
         super().__init__(render_mode, states, MAX_TORQUE)
         self._torque = 0.0
@@ -208,7 +209,8 @@ def pendulum_frame(theta: float, torque: float, max_torque: float) -> Frame:
     axes.plot([0.0], [0.0], "o", color="black", markersize=7)
     if torque:
         sweep = np.linspace(0.0, torque / max_torque * math.pi / 2, 30) + math.pi / 2
-        x, y = 0.45 * np.cos(sweep), 0.45 * np.sin(sweep)
+        x = 0.45 * np.cos(sweep)
+        y = 0.45 * np.sin(sweep)
         axes.plot(x, y, color="tab:blue", lw=3)
         ahead = math.copysign(0.15, torque)
         tip = (x[-1] - ahead * math.sin(sweep[-1]), y[-1] + ahead * math.cos(sweep[-1]))

@@ -43,7 +43,10 @@ VOLUME = 4000.0  # L
 AREA = 5.3  # m2
 COOLANT_TEMPERATURE = 373.0  # K
 DILUTION = 0.0609  # 1/h, flow over volume
-FEED_A, FEED_B, FEED_S = 4.3, 5.1, 3.0  # mol/L
+# mol/L
+FEED_A = 4.3
+FEED_B = 5.1
+FEED_S = 3.0
 
 _HEATING_1 = REACTION_HEAT_1 / HEAT_CAPACITY  # K L/mol
 _HEATING_2 = REACTION_HEAT_2 / HEAT_CAPACITY  # K L/mol
@@ -83,9 +86,11 @@ R = constant([[1e-4]])
 """Input weight of the stage cost, for the deviation in kJ/(h m2 K)."""
 
 # Bounds that the paper puts on the deviations; no start may lie beyond them.
-STATE_LOW, STATE_HIGH = constant([-2.0, -2.0, -2.0, -70.0]), constant([2.0, 2.0, 2.0, 5.0])
+STATE_LOW = constant([-2.0, -2.0, -2.0, -70.0])
+STATE_HIGH = constant([2.0, 2.0, 2.0, 5.0])
 # Bounds of the random starts.
-START_LOW, START_HIGH = constant([-0.05, -0.4, -0.4, -7.5]), constant([0.05, 0.4, 0.4, 4.0])
+START_LOW = constant([-0.05, -0.4, -0.4, -7.5])
+START_HIGH = constant([0.05, 0.4, 0.4, 4.0])
 
 PRINTED_A = constant(
     [
@@ -179,9 +184,13 @@ def advance(
     """
     substeps = RICH_SUBSTEPS if is_rich(a, b) else SUBSTEPS
     h = DT / substeps
-    half, sixth = h / 2, h / 6
+    half = h / 2
+    sixth = h / 6
     for _ in range(substeps):
-        A, B, S, T = _A_SS + a, _B_SS + b, _S_SS + s, _T_SS + t
+        A = _A_SS + a
+        B = _B_SS + b
+        S = _S_SS + s
+        T = _T_SS + t
         a1, b1, s1, t1 = _rates(A, B, S, T, transfer)
         a2, b2, s2, t2 = _rates(
             A + half * a1, B + half * b1, S + half * s1, T + half * t1, transfer
@@ -201,7 +210,10 @@ def advance(
 def advance_all(deviations: Array, transfer: Array, after: Array) -> None:
     """Write `advance` of many reactors: deviations of shape (4, n), transfer of shape (n,)."""
     for i in range(len(transfer)):
-        a, b, s, t = deviations[0, i], deviations[1, i], deviations[2, i], deviations[3, i]
+        a = deviations[0, i]
+        b = deviations[1, i]
+        s = deviations[2, i]
+        t = deviations[3, i]
         after[0, i], after[1, i], after[2, i], after[3, i] = advance(a, b, s, t, transfer[i])
 
 
@@ -294,8 +306,10 @@ class CSTREnv(ProblemEnv):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
     state_names = ("C_A deviation", "C_B deviation", "C_S deviation", "T deviation")
     # A concentration cannot be negative, so the deviation cannot be below minus the steady one.
-    lowest, highest = constant(np.maximum(STATE_LOW, [*-X_SS[:3], -np.inf])), STATE_HIGH
-    start_low, start_high = START_LOW, START_HIGH
+    lowest = constant(np.maximum(STATE_LOW, [*-X_SS[:3], -np.inf]))
+    highest = STATE_HIGH
+    start_low = START_LOW
+    start_high = START_HIGH
 
     def __init__(self, render_mode: str | None = None) -> None:
         low, high = np.array([[-3, -3, -3, -70], [3, 3, 3, 25]], np.float32)

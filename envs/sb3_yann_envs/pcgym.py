@@ -173,9 +173,12 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
             self.plant = _make_env()(given)
             info = self.plant.model.info()
             self._rate = rate_of(self.plant.model, len(info["states"]), len(info["inputs"]))
-        self.state_names, self.input_names = tuple(info["states"]), tuple(info["inputs"])
+        self.state_names = tuple(info["states"])
+        self.input_names = tuple(info["inputs"])
         self.units = UNITS.get(given.get("model", ""), {})
-        n, self.dt, self.draw = len(self.state_names), float(self.plant.dt), draw
+        n = len(self.state_names)
+        self.dt = float(self.plant.dt)
+        self.draw = draw
         self.x0: Array = np.array(given["x0"], np.float64)[:n]
         self.outputs = [self.state_names.index(name) for name in given["SP"]]
         self.schedule: Array = np.array([*given["SP"].values()], np.float64).T  # (N, p)
@@ -193,7 +196,8 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
             self.u_min.astype(np.float32), self.u_max.astype(np.float32), dtype=np.float32
         )
         self.state: Array | None = None
-        self.taken, self.wanted = 0, self.schedule
+        self.taken = 0
+        self.wanted = self.schedule
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -207,7 +211,9 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
                 f"options['state'] = {x.tolist()} must be {len(self.x0)} finite numbers: "
                 f"{', '.join(self.state_names)}."
             )
-        self.state, self.taken, self.wanted = x, 0, self._drawn() if self.draw else self.schedule
+        self.state = x
+        self.taken = 0
+        self.wanted = self._drawn() if self.draw else self.schedule
         names = self.plant.SP
         self.plant.SP = dict(zip(names, self.wanted.T, strict=True))  # PC-Gym's reward reads it
         return self._seen(), {"state": x.copy()}
@@ -260,7 +266,8 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         >>> x.round(3).tolist()[2:]
         [0.3, 0.25]
         """
-        n, (low, width) = len(self.x0), self._box()
+        n = len(self.x0)
+        (low, width) = self._box()
         r = (self.r_min + self.r_max) / 2 if set_point is None else np.asarray(set_point, float)
 
         def errors(z: Array, pull: float) -> Array:
@@ -350,7 +357,8 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
 
     def _reward(self, u: Array, violation: bool) -> float:
         """Return PC-Gym's reward, by its own function."""
-        plant, shown = self.plant, self.wanted[self.taken - 1]
+        plant = self.plant
+        shown = self.wanted[self.taken - 1]
         plant.t = self.taken
         state = np.concatenate([self.state, shown])
         if plant.custom_reward:
@@ -368,7 +376,8 @@ class _Split:
     """
 
     def __init__(self, model: Any) -> None:
-        self.model, self.int_method = model, "casadi"
+        self.model = model
+        self.int_method = "casadi"
 
     def __call__(self, x: Any, u: Any) -> Any:
         """Return dx/dt for vectors of CasADi."""

@@ -25,7 +25,8 @@ def rate_of(model: Any, n: int, m: int) -> Any:
     """Return CasADi's function dx/dt = f(x, u) of a PC-Gym model with n states and m inputs."""
     import casadi
 
-    x, u = casadi.SX.sym("x", n), casadi.SX.sym("u", m)
+    x = casadi.SX.sym("x", n)
+    u = casadi.SX.sym("u", m)
     return casadi.Function("rate", [x, u], [casadi.vertcat(*model(x, u))])
 
 
@@ -54,7 +55,8 @@ def _chosen(equations: str, dt: float, x0: Floats, low: Floats, width: Floats) -
     """Return the flow that the trial chooses."""
     import casadi
 
-    rate, n = casadi.Function.deserialize(equations), len(x0)
+    rate = casadi.Function.deserialize(equations)
+    n = len(x0)
     exact = _cvodes(rate, dt)
     ranges = np.array(width)
     inputs = np.array(low[n:]) + ranges[n:] * _trial(len(low) - n)
@@ -73,7 +75,8 @@ def _cvodes(rate: Any, dt: float) -> Flow:
     """Return CasADi's adaptive integrator, made once."""
     import casadi
 
-    x, u = casadi.SX.sym("x", rate.size1_in(0)), casadi.SX.sym("u", rate.size1_in(1))
+    x = casadi.SX.sym("x", rate.size1_in(0))
+    u = casadi.SX.sym("u", rate.size1_in(1))
     ode = {"x": x, "p": u, "ode": rate(x, u)}
     sample = casadi.integrator("sample", "cvodes", ode, 0.0, dt, TOLERANCES)
 
@@ -100,8 +103,10 @@ def _runge_kutta(rate: Any, dt: float, steps: int) -> Flow:
     """Return the classical Runge-Kutta method of fourth order, as one compiled expression."""
     import casadi
 
-    start, u = casadi.SX.sym("x", rate.size1_in(0)), casadi.SX.sym("u", rate.size1_in(1))
-    x, h = start, dt / steps
+    start = casadi.SX.sym("x", rate.size1_in(0))
+    u = casadi.SX.sym("u", rate.size1_in(1))
+    x = start
+    h = dt / steps
     for _ in range(steps):
         k1 = rate(x, u)
         k2 = rate(x + h / 2 * k1, u)

@@ -91,7 +91,8 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
 
 def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:
     """Yield what the states that are shown may mean, in words, and what to do."""
-    names, n = labels_of(problem.model)[0], problem.model.n_states
+    names = labels_of(problem.model)[0]
+    n = problem.model.n_states
     for order in _orders(n):
         back = np.argsort(order).tolist()
         yield (
@@ -111,7 +112,8 @@ def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:
         every.append(("all states", np.ones(n, dtype=bool)))
     for name, which in every:
         for factor, shift in UNITS:
-            factors, shifts = np.where(which, factor, 1.0), np.where(which, shift, 0.0)
+            factors = np.where(which, factor, 1.0)
+            shifts = np.where(which, shift, 0.0)
             what = f"{name} times {factor:.3g}" if factor != 1 else name
             acts = f" It may also be that inputs act {factor:.3g} times as far as in the model."
             yield (
@@ -137,7 +139,8 @@ def _orders(n: int) -> Iterator[list[int]]:
         return
     for i, j in combinations(range(n), 2):
         order = list(range(n))
-        order[i], order[j] = j, i
+        order[i] = j
+        order[j] = i
         yield order
 
 
@@ -145,12 +148,10 @@ def _left_open(
     problem: LinearMPC, reading: Reading, theta: Array, u: Array, following: Array
 ) -> float:
     """Return the share of the states' movement that the model leaves open, 1 where none moves."""
-    at, after, states, x_ss = (
-        theta.copy(),
-        following.copy(),
-        problem.layout.state,
-        problem.model.x_ss,
-    )
+    at = theta.copy()
+    after = following.copy()
+    states = problem.layout.state
+    x_ss = problem.model.x_ss
     at[:, states] = reading(theta[:, states] + x_ss) - x_ss
     after[:, states] = reading(following[:, states] + x_ss) - x_ss
     error = (after - problem.deviations.predict(at, u))[:, states]
@@ -178,7 +179,9 @@ def warn_of_signs(
     ``played`` are the MPC's episodes from the seeds; ``theta`` and ``inputs`` map what the env
     shows and takes to the problem's.
     """
-    names, B, states = labels_of(problem.model)[1], problem.model.B, problem.layout.state
+    names = labels_of(problem.model)[1]
+    B = problem.model.B
+    states = problem.layout.state
     shown = np.concatenate([theta(each)[:, states] for each in played.observations])
     spread = np.std(shown[np.isfinite(shown).all(axis=1)], axis=0)
     weight = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 0)

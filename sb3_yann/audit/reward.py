@@ -157,11 +157,13 @@ class Line:
         if np.ptp(x) <= 1e-12 * np.abs(x).max() or np.ptp(y) <= 1e-12 * np.abs(y).max():
             return cls(0.0, float(y.mean()), 0.0)
         # Centered: with a large offset the normal equations would lose what varies.
-        dx, dy = x - x.mean(), y - y.mean()
+        dx = x - x.mean()
+        dy = y - y.mean()
         scale = float(dx @ dy / (dx @ dx))
         offset = float(y.mean() - scale * x.mean())
         if abs(offset) <= EXACT * np.abs(y).mean():
-            scale, offset = float(x @ y / (x @ x)), 0.0
+            scale = float(x @ y / (x @ x))
+            offset = 0.0
         residual = y - scale * x - offset
         return cls(scale, offset, float(1 - residual @ residual / (dy @ dy)))
 

@@ -124,7 +124,9 @@ class Commissioning:
                 f"plant_env = {plant_env!r} must be the id of an environment, a gymnasium.Env or a "
                 "function that makes one."
             )
-        self.model, self.plant_env, self.verbose = model, plant_env, verbose
+        self.model = model
+        self.plant_env = plant_env
+        self.verbose = verbose
         self.batch = check_int("batch", batch, 2)
         self.smallest = check_range("max_correction", max_correction, 0, 1, "(]")
         self.excite = check_range("excite", excite, 0, 1, "[]")
@@ -189,8 +191,10 @@ class Commissioning:
 
     def report(self) -> str:
         """Return the batches as a table, and what the pairs of the policy on trial show."""
-        journal, state = self.journal, self.journal.state
-        verdict, rows = "The MPC acts.", {}
+        journal = self.journal
+        state = self.journal.state
+        verdict = "The MPC acts."
+        rows = {}
         if journal.accepted:
             verdict = f"The policy of {state.policy} is on trial."
             if state.is_kept:
@@ -289,14 +293,17 @@ class Commissioning:
 
     def _learn(self, plant: Plant, number: int) -> tuple[Costs, CommissioningState, Verdict, str]:
         """Decide by the pairs, fit the twin anew, and improve where no policy is on trial."""
-        before, numbers, seed = self.twin, self.journal.log, self.seed + number
+        before = self.twin
+        numbers = self.journal.log
+        seed = self.seed + number
         twin = self._fit(numbers, seed) if len(numbers) > 1 else None
         known = twin if twin is not None and twin.trusted else None
         costs = compare(self.journal, plant, before, known or before)
         state = self.journal.state
         said = ""
         if known is not None:
-            self.twin, self.watchdog = known, Watchdog.of(known)
+            self.twin = known
+            self.watchdog = Watchdog.of(known)
             state = replace(state, twin=numbers, twin_seed=seed)
         if why := why_taken_back(self.journal, costs):
             return costs, *self._take_back(state, number, why)

@@ -64,7 +64,8 @@ def compare(
     acted = [each for each, own in journal.batch if own] if by_policy else quiet
     if not acted:
         return Costs()
-    pays_own, predicted = pays_its_own(problem, journal.episodes), np.nan
+    pays_own = pays_its_own(problem, journal.episodes)
+    predicted = np.nan
     actual = float(_costs(problem, acted, pays_own).mean())
     if before is not None and not pays_own:
         act = plant.policy if by_policy else plant.mpc
@@ -165,7 +166,8 @@ def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
 def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]) -> str:
     mpc = excess_of_mpc(journal, problem)
     ours = excess_of_episodes(problem, ((each.thetas, each.actions) for each in played))
-    summed, before = float(ours.summed.mean()), float(mpc.summed.mean())
+    summed = float(ours.summed.mean())
+    before = float(mpc.summed.mean())
     if summed <= allowed_excess(before) + mpc.largest.max():
         return ""
     most = int(np.argmax(ours.largest))
@@ -190,7 +192,9 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inpu
 
     References and measured disturbances are those of the episodes.
     """
-    dynamics, row, problem = twin.dynamics, twin.dynamics.row, twin.problem
+    dynamics = twin.dynamics
+    row = twin.dynamics.row
+    problem = twin.problem
     lengths = np.array([len(each.actions) for each in episodes])
     steps = np.arange(lengths.max())[:, None]
     first = row.begin(np.array([each.thetas[0] for each in episodes]))

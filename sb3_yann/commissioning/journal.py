@@ -62,7 +62,8 @@ class Record:
                     f"{self.path} has changed since it was written: its last line does not end. "
                     "Name another file, or the one that was begun."
                 )
-            self._size, self._seen = len(whole) + (len(whole) > 0), len(read)
+            self._size = len(whole) + (len(whole) > 0)
+            self._seen = len(read)
         else:
             self._size = self._seen = 0
 
@@ -284,12 +285,14 @@ class Journal:
     """
 
     def __init__(self, record: Record, settings: dict[str, Any], state: CommissioningState) -> None:
-        self.record, self.state = record, state
+        self.record = record
+        self.state = state
         self.episodes: list[PlantEpisode] = []
         self.by_policy: list[bool] = []
         self.batches: list[Batch] = []
         self._first_of_batch = 0
-        self._cut_off, self._open = 0, ""
+        self._cut_off = 0
+        self._open = ""
         begin: Event = {"event": "begin", **settings}
         if not record.events:
             record.append(begin)
@@ -416,7 +419,8 @@ class Journal:
             self._close(Batch(**{**named, **costs}), state)
 
     def _begin(self, acts: str) -> None:
-        self._cut_off, self._open = self.cut_off, acts
+        self._cut_off = self.cut_off
+        self._open = acts
 
     def _add(self, played: PlantEpisode, by_policy: bool) -> None:
         self._open = ""
@@ -425,7 +429,9 @@ class Journal:
 
     def _close(self, batch: Batch, state: CommissioningState) -> None:
         self.batches.append(batch)
-        self.state, self._first_of_batch, self._cut_off = state, len(self.episodes), 0
+        self.state = state
+        self._first_of_batch = len(self.episodes)
+        self._cut_off = 0
 
     def report(self) -> str:
         """Return the batches as a table."""

@@ -69,14 +69,16 @@ class Plant:
     """A plant's env, and the two that may act on it: the MPC and the actor of a model."""
 
     def __init__(self, env: gym.Env[Any, Any], model: OffPolicyAlgorithm) -> None:
-        self.env, self.model = env, model
+        self.env = env
+        self.model = model
         self.yann = require_yann_policy(model.policy, "Commissioning")
         self.problem = self.yann.problem
         if model.get_vec_normalize_env() is None and getattr(model, "sees_normalized", False):
             raise ValueError(LOST_STATISTICS)  # before anything acts on the plant
         require_state_shown(env, self.yann.observation_given)
         for name in ("observation_space", "action_space"):
-            own, its = getattr(model, name), getattr(env, name)
+            own = getattr(model, name)
+            its = getattr(env, name)
             if own.shape != its.shape or (
                 name == "action_space"
                 and not np.allclose([own.low, own.high], [its.low, its.high], rtol=1e-4)
@@ -84,7 +86,8 @@ class Plant:
                 raise ValueError(
                     f"plant_env has {name} = {its}, the model {own}: it is another plant."
                 )
-        self.law, self.device = law_of(self.problem), self.yann.device
+        self.law = law_of(self.problem)
+        self.device = self.yann.device
         self.range = self.problem.deviations.u_max - self.problem.deviations.u_min
         units = self.yann.action_units
         self.as_is = units.kind == "plant" and not np.any(units.shift)
@@ -109,7 +112,8 @@ class Plant:
 
     def excited_mpc(self, seed: int, share: float) -> Inputs:
         """Return the MPC of one episode, moved at random by a share of the range at most."""
-        moved, steps = Excited(self.problem, seed, 2 * share), count()
+        moved = Excited(self.problem, seed, 2 * share)
+        steps = count()
         within = self.problem.deviations.input_range
 
         def act(theta: Array) -> Array:
@@ -146,9 +150,16 @@ class Plant:
         """
         if watchdog is not None:
             watchdog.start(known)
-        thetas, actions, reward, violations, apart = [known], list[Array](), 0.0, 0, 0.0
+        thetas = [known]
+        actions = list[Array]()
+        reward = 0.0
+        violations = 0
+        apart = 0.0
         excited = act not in (self.policy, self.mpc)
-        alarm, step, over, space = None, -1, False, cast(Any, self.env.action_space)
+        alarm = None
+        step = -1
+        over = False
+        space = cast(Any, self.env.action_space)
         while not over:
             u = act(known[None])[0].astype(np.float32)
             wanted = u if act == self.policy else self.policy(known[None])[0]
@@ -157,7 +168,8 @@ class Plant:
             action = u if self.as_is else self.yann.action_units.action(u).astype(np.float32)
             action = np.clip(action, space.low, space.high).astype(space.dtype)  # to the last bit
             observation, gained, terminated, over, info = self.env.step(action)
-            over, read = over or terminated, self._theta(observation)
+            over = over or terminated
+            read = self._theta(observation)
             after = self._known(known, u, read)
             beyond = bound_excess(self.problem, np.array([known, after]), u[None])
             excess = beyond.largest
@@ -165,7 +177,8 @@ class Plant:
             sized = EXCESS_ROOM < excess <= limit
             reported = bool(info.get("violation", False)) and not sized
             unsafe = reported or terminated or bool(excess > limit)
-            reward, violations = reward + float(gained), violations + unsafe
+            reward = reward + float(gained)
+            violations = violations + unsafe
             if alarm is None:
                 why = "The plant reports a violation, or ends the episode." if unsafe else ""
                 if excess > limit:
@@ -173,7 +186,9 @@ class Plant:
                     why = f"On the plant {names.in_words(float(beyond.worst), float(excess))}."
                 found = self._look(watchdog, known, u, read, why)
                 if found is not None:
-                    alarm, step, act = found, len(actions), self.mpc
+                    alarm = found
+                    step = len(actions)
+                    act = self.mpc
             known = after
             thetas.append(known)
             actions.append(u.astype(np.float64))
@@ -220,7 +235,8 @@ class AcceptedPolicy:
     def __init__(self, model: OffPolicyAlgorithm) -> None:
         if not isinstance(model, OffPolicyAlgorithm):
             raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
-        self.model, self.policy = model, require_yann_policy(model.policy, "Commissioning")
+        self.model = model
+        self.policy = require_yann_policy(model.policy, "Commissioning")
         with preserve_rng():  # building an actor draws weights
             mpc = self.policy.make_actor().state_dict()
         self._first = {name: each.clone() for name, each in self.policy.state_dict().items()}

@@ -17,7 +17,8 @@ from sb3_yann.twin.selection import FOLDS
 
 GAINS = np.array([1.0, 0.2, 0.05, 0.02])
 """Of the charts: one without a memory, others with one of 5, 20 and 50 samples."""
-FACTOR, FACTOR_OF_FEW = 2.0, 7.5
+FACTOR = 2.0
+FACTOR_OF_FEW = 7.5
 """A band is so many times the largest held-out ratio: 2 + 7.5 / episodes."""
 LEAST_RATIO = 0.5
 """The largest ratio is taken to be at least this, however well the log is predicted."""
@@ -117,8 +118,10 @@ class Bands:
                 "The twin's log is one episode: nothing is left to calibrate a watchdog on. Log "
                 "at least one episode more; four are a good number."
             )
-        unseen, log = twin.judges[0].dynamics, pieces(twin.episodes, FOLDS)
-        row, units = unseen.row, unseen.coordinates.units
+        unseen = twin.judges[0].dynamics
+        log = pieces(twin.episodes, FOLDS)
+        row = unseen.row
+        units = unseen.coordinates.units
         left = []
         for i, each in enumerate(log):
             one = Dynamics(unseen.problem, unseen.coordinates, (unseen.members[i % FOLDS],))
@@ -132,7 +135,8 @@ class Bands:
         size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST * error) ** 2)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log])
         known = PredictiveVariance(unseen, seen.min(axis=0), seen.max(axis=0), size)
-        means, doubts = [], []
+        means = []
+        doubts = []
         for each, errors in zip(log, left, strict=True):
             charts = _Charts(len(units))
             for step in zip(errors, known.doubt(each.thetas[:-1], each.actions), strict=True):
@@ -242,7 +246,8 @@ class Watchdog:
             If theta has another shape, or is not finite.
         """
         first = check_array("theta", theta, (self.dynamics.problem.n_theta,))
-        self.alarm, self._episode = None, _Episode(self.dynamics, self.dynamics.row.begin(first))
+        self.alarm = None
+        self._episode = _Episode(self.dynamics, self.dynamics.row.begin(first))
 
     def watch(self, theta: Array, u: Array, after: Array) -> Alarm | None:
         """Return an alarm, or None: after one the episode's alarm stays as it is.
@@ -286,11 +291,13 @@ class Watchdog:
         A noisy sensor does so never, or as the log shows. A settled one may for ever: there the
         twin must say that the state moves.
         """
-        stands, bands = episode.stands, self.bands
+        stands = episode.stands
+        bands = self.bands
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
         unsure = np.hypot(bands.error, episode.charts.doubts[0])  # what is not familiar counts
         moving = np.abs(episode.moved) > MOVED * stands * unsure
-        problem, reading = self.dynamics.problem, episode.row[self.dynamics.row.state]
+        problem = self.dynamics.problem
+        reading = episode.row[self.dynamics.row.state]
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             name = problem.model.state_names
             shown = problem.units.to_plant(reading)[i]
@@ -320,8 +327,11 @@ class _Episode:
     def __init__(self, dynamics: Dynamics, row: Array) -> None:
         n = dynamics.problem.model.n_states
         self.first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
-        self.row, self.charts, self.steps = row, _Charts(n), 0
-        self.stands, self.moved = np.zeros(n, np.int64), np.zeros(n)
+        self.row = row
+        self.charts = _Charts(n)
+        self.steps = 0
+        self.stands = np.zeros(n, np.int64)
+        self.moved = np.zeros(n)
 
     def take(
         self, theta: Array, u: Array, after: Array, doubt: Callable[[Array, Array], Array]
@@ -330,7 +340,8 @@ class _Episode:
         layout = self.first.row
         if not np.array_equal(layout.shown(self.row), theta):  # one that does not follow the last
             self.row = layout.begin(theta)
-        before, self.row = self.row, layout.after(self.row, u, after)
+        before = self.row
+        self.row = layout.after(self.row, u, after)
         predicted = self.first.step(before[None, None], u[None, None])[0, 0]
         innovation = (self.row - predicted)[layout.state]
         self.charts.take(innovation, doubt(before, u))

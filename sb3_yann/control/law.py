@@ -382,7 +382,8 @@ class PiecewiseAffine(PlantLaw):
         from sb3_yann.control._kernels.law import locate_batch
 
         points, rows = as_points(theta, self.n_theta)
-        region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
+        region = np.empty(len(rows), np.int64)
+        inside = np.empty(len(rows))
         locate_batch(*self.packed, rows, region, inside)
         return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
 

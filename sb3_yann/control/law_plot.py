@@ -136,7 +136,8 @@ def _clipped(polygon: Array, rows: Array, levels: Array) -> Array:
         room = level - polygon @ row
         if np.all(room >= 0):
             continue
-        after, beyond = np.roll(polygon, -1, axis=0), np.roll(room, -1)
+        after = np.roll(polygon, -1, axis=0)
+        beyond = np.roll(room, -1)
         kept = []
         for z, next_z, here, there in zip(polygon, after, room, beyond, strict=True):
             if here >= 0:
@@ -151,7 +152,8 @@ def _clipped(polygon: Array, rows: Array, levels: Array) -> Array:
 
 def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axes:
     """Draw the inputs over the only parameter."""
-    (low,), (high,) = law.theta_min, law.theta_max
+    (low,) = law.theta_min
+    (high,) = law.theta_max
     if not np.all(np.isfinite([low, high])):
         raise ValueError(
             "The law's box is not bounded: there is no frame to draw. Solve the problem for a "

@@ -86,7 +86,8 @@ def zero_order_hold(A: Array, B: Array, E: Array, dt: float) -> tuple[Array, Arr
     """Return A, B, E of ``dx/dt = A x + B u + E d`` in discrete time, u and d held for ``dt``."""
     import control  # imports matplotlib: only paid for where it is used
 
-    m, driven = B.shape[1], np.hstack([B, E])
+    m = B.shape[1]
+    driven = np.hstack([B, E])
     plant = control.ss(A, driven, np.eye(len(A)), np.zeros(driven.shape))
     with np.errstate(all="ignore"):
         sampled = control.sample_system(plant, dt, method="zoh")
@@ -204,7 +205,8 @@ def missing_observer(model: LinearSystem) -> str:
 
 def past_inputs(model: LinearSystem) -> list[tuple[int, str]]:
     """Return the number of the input, and the lag as in ``(k-1)``, of each last state named so."""
-    inputs, found = labels_of(model)[1], list[tuple[int, str]]()
+    inputs = labels_of(model)[1]
+    found = list[tuple[int, str]]()
     for label in reversed(model.state_names):
         name, lag, rest = label.partition("(k-")
         if name not in inputs or not rest.removesuffix(")").isdigit():
@@ -224,7 +226,8 @@ def completed(
 
     ``past`` are the last states of a model with dead time: numbers of inputs, and lags.
     """
-    own, m = model.n_states - len(past), model.n_inputs
+    own = model.n_states - len(past)
+    m = model.n_inputs
     named = len(input_names) == m
     if not isinstance(state_names, str) and len(state_names) == own and own:
         inputs = list(input_names) if named else labels_of(model)[1]
@@ -249,8 +252,10 @@ def from_control(
     step, continuous = _sample_time(system.dt, dt)
     chosen = [_input(system, each) for each in disturbances]
     inputs = [i for i in range(system.ninputs) if i not in chosen]
-    A, both = check_array("A", system.A, ("n", "n")), check_array("B", system.B, ("n", "m"))
-    B, E = both[:, inputs], both[:, chosen]
+    A = check_array("A", system.A, ("n", "n"))
+    both = check_array("B", system.B, ("n", "m"))
+    B = both[:, inputs]
+    E = both[:, chosen]
     if continuous:
         A, B, E = zero_order_hold(A, B, E, step)
     sampled = "sampled with a zero-order hold" if continuous else "taken as it is, discrete"
@@ -320,7 +325,8 @@ def _output_notes(system: Any, A: Array) -> list[str]:
     """Return notes on outputs that are not the states."""
     import control
 
-    C, n = np.asarray(system.C), len(A)
+    C = np.asarray(system.C)
+    n = len(A)
     notes = []
     if np.any(system.D):
         notes.append("D is not zero and was dropped: the outputs it feeds are not used.")

@@ -25,7 +25,8 @@ def riccati(
     (0, 1] and the weights Q (n, n), R (m, m) and N (n, m), ``cross``. A model without a stabilizing
     solution raises ValueError with the reason.
     """
-    A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
+    A = np.sqrt(gamma) * model.A
+    B = np.sqrt(gamma) * model.B
     try:
         with np.errstate(all="ignore"):
             P = linalg.solve_discrete_are(A, B, Q, R, s=cross)

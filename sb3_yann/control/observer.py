@@ -83,7 +83,8 @@ class StateEstimator:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         known = self._measured(model)
-        n, d = model.n_states, model.n_disturbances - len(known)
+        n = model.n_states
+        d = model.n_disturbances - len(known)
         self.model = model
         self.C = check_outputs("measured", model.shown if measured is None else measured, n)
         E = np.delete(model.E, known, axis=1)
@@ -230,7 +231,8 @@ class StateEstimator:
 
     def _gain_of_rates(self, W: Array, V: Array, cross: Array) -> Array:
         """Return the mean gain of each output, over the samples at which it is read."""
-        A, C = self.A, self.C_aug
+        A = self.A
+        C = self.C_aug
         period = int(np.lcm.reduce(self.every))
         total: Array = np.zeros((len(A), len(C)))
         P = W + np.eye(len(A)) * np.trace(W) / len(A)
@@ -305,7 +307,9 @@ def _covariance(name: str, value: ArrayLike, size: int) -> tuple[Array, list[flo
 
 def _require_observable(model: LinearModel, E: Array, C: Array) -> None:
     """Raise unless the augmented model is detectable (Pannocchia & Rawlings 2003, Lemma 1)."""
-    n, d, q = model.n_states, E.shape[1], len(C)
+    n = model.n_states
+    d = E.shape[1]
+    q = len(C)
     for pole in np.linalg.eigvals(model.A):
         hautus = np.vstack([pole * np.eye(n) - model.A, C])
         if abs(pole) > 1 - 1e-9 and _rank(hautus) < n:

@@ -43,7 +43,8 @@ def known_answers(data: Arrays, precision: str) -> dict[str, str]:
 
     ValueError if a rounding changes all answers.
     """
-    controller, n_points = Controller(data), 48
+    controller = Controller(data)
+    n_points = 48
     drawn = sample_observations(controller, 4 * n_points)
     if precision == "float":
         drawn = drawn.astype(np.float32).astype(np.float64)
@@ -57,7 +58,8 @@ def known_answers(data: Arrays, precision: str) -> dict[str, str]:
         )
     ranges = input_ranges(controller, controller.evaluate(drawn))
     run = Run.with_estimator(data, obs) if "est_gain" in data else Run.of_readings(obs)
-    answers, room_in_loop = run.play(controller), 0.0
+    answers = run.play(controller)
+    room_in_loop = 0.0
     if run.plant:
         # What roundings of the outputs do to the loop, code may do too.
         moved = run.play(controller, 1e-6 if precision == "float" else 1e-13)
@@ -124,7 +126,9 @@ class Run:
         It begins beside the operating point, with a load that the estimator must find; references
         and measured loads change.
         """
-        (size, q), source, rest = data["est_gain"].shape, data["source"], data["obs_rest"]
+        (size, q) = data["est_gain"].shape
+        source = data["source"]
+        rest = data["obs_rest"]
         half = (data["box"][1] - data["box"][0]) / 2
         x = data["est_first"] @ np.append(rest[:q], 1.0)
         spread = np.zeros(size)
@@ -156,7 +160,8 @@ class Run:
         generator = np.random.default_rng(2)
         x = self.plant["start_of_plant"] if self.plant else np.zeros(0)
         actions: list[Array] = []
-        status, modes = [], []
+        status = []
+        modes = []
         for k, reading in enumerate(self.readings.copy()):
             given = reading.copy()
             if self.plant:
@@ -184,7 +189,8 @@ class Run:
 def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, str]:
     """Return the texts of the C files by their names."""
     lines = [f"  {line}" for line in code.signal_lines(data, "action")]
-    n_obs, n_seen = len(data["obs_rest"]), data["obs_matrix"].shape[1]
+    n_obs = len(data["obs_rest"])
+    n_seen = data["obs_matrix"].shape[1]
     sizes = {"N_OBS": n_obs, "N_SEEN": n_seen, "N_INPUTS": len(data["action_scale"])}
     memory = ""
     if estimates := len(data.get("est_gain", ())):
@@ -234,8 +240,10 @@ def _definitions(data: Arrays, precision: str) -> str:
     """Return sizes, options and tables."""
     numbers, indices = code.controller_tables(data, precision)
     search_numbers, search_indices = code.search_tables(data)
-    numbers, indices = {**numbers, **search_numbers}, {**indices, **search_indices}
-    walks, n_networks = data["neighbors"].size > 0, len(data["pinned"])
+    numbers = {**numbers, **search_numbers}
+    indices = {**indices, **search_indices}
+    walks = data["neighbors"].size > 0
+    n_networks = len(data["pinned"])
     suffix = "f" if precision == "float" else ""
     flags: dict[str, object] = {
         "N_THETA": data["gains"].shape[2],
@@ -253,7 +261,8 @@ def _definitions(data: Arrays, precision: str) -> str:
     if "est_gain" in data:
         flags |= {"N_OUTPUTS": len(data["est_C"]), "N_LOADS": len(data["est_loads"])}
     if "qp_gram" in data:
-        rows, most = len(data["qp_d0"]), int(data["qp_most"])
+        rows = len(data["qp_d0"])
+        most = int(data["qp_most"])
         flags |= {"QP_ROWS": rows, "QP_MOST": most, "QP_FIXED": len(data["qp_fixed"])}
         flags |= {"QP_ROOM": most if data["zero_input"] else rows, "QP_STEPS": steps_of(data)}
     flags |= {
@@ -334,7 +343,8 @@ def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for path, content in parts.items():
             entry = zipfile.ZipInfo(path)  # with the same date each time: the same file
-            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
             archive.writestr(entry, content)
     return file.getvalue()
 
@@ -378,7 +388,8 @@ def _library(sources: dict[str, str]) -> bytes:
 
 def _description(data: Arrays, about: str, identity: str, units: list[str]) -> bytes:
     """Return modelDescription.xml."""
-    name, dt = str(data["name"]), float(data["dt"])
+    name = str(data["name"])
+    dt = float(data["dt"])
     root = ET.Element(
         "fmiModelDescription",
         fmiVersion="2.0",

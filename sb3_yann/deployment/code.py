@@ -37,7 +37,8 @@ def scale_within(
     ``low`` and ``high``. Where these have no room for that, in float32 beside a huge operating
     point, the scale stays.
     """
-    found, middle = scale.astype(real), shift.astype(real)
+    found = scale.astype(real)
+    middle = shift.astype(real)
     step = np.spacing(np.maximum(found, np.abs(middle)))
     tried = found - np.arange(8)[:, None].astype(real) * step
     inside = (middle - tried >= low) & (middle + tried <= high) & (tried > 0)
@@ -47,7 +48,8 @@ def scale_within(
 
 def action_scale(data: Arrays, precision: str) -> NDArray[Any]:
     """Return the scale of a controller's outputs for code of that precision."""
-    scale, shift = data["action_scale"], data["action_shift"]
+    scale = data["action_scale"]
+    shift = data["action_shift"]
     if precision == "double":
         return np.asarray(scale)
     return scale_within(scale, shift, shift - scale, shift + scale, np.float32)
@@ -140,14 +142,17 @@ class Cost:
         """Return the cost of a controller's arrays."""
         numbers, indices = controller_tables(data, "double")
         search_numbers, search_indices = search_tables(data)
-        (_, m, n), q, n_obs = data["gains"].shape, len(data["b"]), data["obs_matrix"].shape[1]
+        (_, m, n) = data["gains"].shape
+        q = len(data["b"])
+        n_obs = data["obs_matrix"].shape[1]
         widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]
         search = 2 * q * n + (q * n if data["neighbors"].size else 0)
         products = sum(a * b for a, b in zip([n, *widths], widths, strict=False))
         hidden = sum(widths[:-1])
         program = 0
         if "qp_gram" in data:
-            rows, most = len(data["qp_d0"]), int(data["qp_most"])
+            rows = len(data["qp_d0"])
+            most = int(data["qp_most"])
             program = rows * n + steps_of(data) * most * (rows + 2 * most)
         products += 2 * data["kept"].size
         filtering = sum(
@@ -213,7 +218,8 @@ def literal(value: float, precision: str) -> str:
 
 def wrap(entries: Iterable[str], width: int) -> list[str]:
     """Return lines of entries with commas between them, a line of at least one entry each."""
-    lines, line = [], ""
+    lines = []
+    line = ""
     for entry in entries:
         if line and len(line) + len(entry) > width:
             lines.append(line)
@@ -229,7 +235,8 @@ def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> 
 
 
 def _nested(values: NDArray[np.generic], precision: str, depth: int) -> str:
-    indent, outer = "    " * (depth + 1), "    " * depth
+    indent = "    " * (depth + 1)
+    outer = "    " * depth
     if values.ndim > 1:
         rows = f",\n{indent}".join(_nested(each, precision, depth + 1) for each in values)
         return f"{{\n{indent}{rows},\n{outer}}}"
@@ -250,7 +257,8 @@ def ascii_text(lines: Iterable[str]) -> str:
 
 def sample_observations(controller: Controller, count: int, seed: int = 0) -> Array:
     """Return observations (count, n_obs): the operating point, then some in and around the box."""
-    data, generator = controller.data, np.random.default_rng(seed)
+    data = controller.data
+    generator = np.random.default_rng(seed)
     low, high = data["box"]
     theta = (low + high) / 2 + generator.uniform(-0.65, 0.65, (count, len(low))) * (high - low)
     theta[0] = 0.0
@@ -264,7 +272,8 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     """
     size = 1e-6 if precision == "float" else 1e-13
     scale = np.abs(obs).max(0)
-    actions, kept = controller.evaluate(obs), np.ones(len(obs), bool)
+    actions = controller.evaluate(obs)
+    kept = np.ones(len(obs), bool)
     half = input_ranges(controller, actions) / 2
     rooms = room_outside(controller.data, precision), room_of(controller.data, precision)
     inside = controller.in_domain(obs)
@@ -282,6 +291,7 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
 
 def input_ranges(controller: Controller, actions: Array) -> Array:
     """Return the ranges of the inputs (m,), of those without bounds what the actions span."""
-    scale, bounds = controller.data["action_scale"], controller.data["bounds"]
+    scale = controller.data["action_scale"]
+    bounds = controller.data["bounds"]
     largest = np.abs(actions - controller.data["action_shift"]).max(0)
     return 2 * np.where(np.isfinite(bounds).all(0), scale, np.maximum(scale, largest))

@@ -54,7 +54,8 @@ def _shapes_of_program(
     """Return names and shapes of the program of a law that is solved online; none of others."""
     if "qp_gram" not in data:
         return []
-    rows, fixed = len(data["qp_d0"]), len(data["qp_fixed"])
+    rows = len(data["qp_d0"])
+    fixed = len(data["qp_fixed"])
     shapes: dict[str, tuple[int, ...]] = {"D": (n, rows), "d0": (rows,), "gram": (rows, rows)}
     shapes |= {"E": (rows, m), "softness": (rows,), "fixed": (fixed, n + 1), "most": ()}
     return [(f"qp_{name}", shape) for name, shape in shapes.items()]
@@ -69,7 +70,8 @@ def _shapes_of_estimator(
     """
     size = q = k = 0
     if "est_gain" in data:
-        (size, q), k = data["est_gain"].shape, len(data["est_loads"])
+        (size, q) = data["est_gain"].shape
+        k = len(data["est_loads"])
     places = data["source"]
     for name, most in (("source", n_read + size + m), ("est_loads", n_read)):
         at = data[name] if name in data else places[:0]
@@ -89,7 +91,9 @@ def _shapes_of_estimator(
 
 def _check_arrays(data: Mapping[str, Any]) -> None:
     """Raise ValueError where arrays do not fit together, or a step cannot use them."""
-    (p, m, n), (q,), n_obs = data["gains"].shape, data["b"].shape, data["obs_matrix"].shape[-1]
+    (p, m, n) = data["gains"].shape
+    (q,) = data["b"].shape
+    n_obs = data["obs_matrix"].shape[-1]
     n_read = len(data["obs_rest"])
     counts = "hold recover transfer frozen_after n_layers"
     shapes: list[tuple[tuple[int, ...], str]] = [
@@ -111,7 +115,9 @@ def _check_arrays(data: Mapping[str, Any]) -> None:
         ((), f"{counts} late_after reach zero_input"),
     ]
     wanted = [(name, shape) for shape, names in shapes for name in names.split()]
-    size, k, n_layers = n, len(data["pinned"]), int(data["n_layers"])
+    size = n
+    k = len(data["pinned"])
+    n_layers = int(data["n_layers"])
     for i in range(n_layers):
         width = m if i == n_layers - 1 else data[f"layer{i}"].shape[1]
         wanted.append((f"layer{i}", (k, width, size + 1)))
@@ -128,7 +134,8 @@ def _check_arrays(data: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} holds NaN")
         if name not in may_be_infinite and np.isinf(data[name]).any():
             raise ValueError(f"{name} holds infinite entries")
-    starts, used = data["starts"], data["network_of"]
+    starts = data["starts"]
+    used = data["network_of"]
     whole = all(data[name].dtype.kind == "i" for name in ("starts", "network_of", *counts.split()))
     if not whole or any(int(data[name]) < 0 for name in counts.split()):
         raise ValueError("a count or an index is no whole number")
@@ -220,7 +227,8 @@ class Controller:
                     "model again, or take the reader of the version that wrote it."
                 )
             _check_arrays(self.data)
-            self.name, self.activation = str(self.data["name"]), str(self.data["activation"])
+            self.name = str(self.data["name"])
+            self.activation = str(self.data["activation"])
             self.note = str(self.data.get("note", ""))
             self.obs_names = tuple(map(str, self.data["obs_names"]))
             self.action_names = tuple(map(str, self.data["action_names"]))
@@ -255,7 +263,8 @@ class Controller:
 
     def reset(self) -> None:
         """Forget all steps, as at the start: the policy acts, from the operating point."""
-        n_read, m = len(self.data["obs_rest"]), len(self.data["action_scale"])
+        n_read = len(self.data["obs_rest"])
+        m = len(self.data["action_scale"])
         self.request = self.mode = POLICY
         self.status = Status(0)
         found = [str(each.name).lower() for each in Status]
@@ -264,11 +273,13 @@ class Controller:
         self._last: Array = np.full(n_read, np.nan)
         self._same: NDArray[np.int64] = np.zeros(n_read, np.int64)
         self._absent: NDArray[np.int64] = np.zeros(n_read, np.int64)
-        self._faults, self._sound = 0, int(self.data["recover"])
+        self._faults = 0
+        self._sound = int(self.data["recover"])
         self._output: Array = self.evaluate(self.data["seen_rest"], networks=False)
         self._estimate: Array | None = None  # x_hat, d_hat in plant units
         self._loads: Array = np.zeros(0)  # the measured disturbances that act until the next step
-        self._bump, self._left = np.zeros(m), 0
+        self._bump = np.zeros(m)
+        self._left = 0
 
     def evaluate(self, obs: ArrayLike, networks: bool = True) -> Array:
         """Return the policy's actions, without memory: (m,), or (batch, m) for a batch.
@@ -321,7 +332,8 @@ class Controller:
                 f"obs has shape {rows.shape}, request is {self.request!r}; a step takes "
                 f"({self._good.size},) and one of {MODES}. Use evaluate(obs) for a batch."
             )
-        data, m = self.data, len(self._output)
+        data = self.data
+        m = len(self._output)
         given = np.full(m, np.nan) if manual is None else _as_readings("manual", manual)
         if given.shape != (m,):
             raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
@@ -336,7 +348,8 @@ class Controller:
         action, low, high, inside, sound = self._act(seen[None], mode == POLICY)
         status |= Status(0) if inside[0] else Status.OUTSIDE
         status |= Status(0) if sound[0] else Status.NETWORK
-        scale, shift = data["action_scale"], data["action_shift"]
+        scale = data["action_scale"]
+        shift = data["action_shift"]
         target = action[0] * scale + shift
         if mode == MANUAL:
             by_hand = np.isfinite(given) & (self.request == MANUAL)
@@ -357,7 +370,8 @@ class Controller:
                 last = (self._output - shift) / scale  # rates count from the own output then
                 low, high = np.clip(last + data["change"], *data["bounds"])[:, None]
         self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
-        self.mode, self.status = mode, status
+        self.mode = mode
+        self.status = status
         found = [str(each.name).lower() for each in Status if each in status]
         for name in ("steps", mode, *found):
             self.counters[name] += 1
@@ -365,7 +379,8 @@ class Controller:
 
     def _readings(self, obs: Array) -> tuple[NDArray[np.bool_], Status]:
         """Keep the good readings; return which others there are, and what is wrong with them."""
-        finite, status = np.isfinite(obs), Status(0)
+        finite = np.isfinite(obs)
+        status = Status(0)
         beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
         moved = obs != self._last
         others = (moved & finite & np.isfinite(self._last)).any()  # NaN has not moved
@@ -390,9 +405,11 @@ class Controller:
         if "est_gain" not in data:
             return np.asarray(self._good[data["source"]])
         scale, shift = data["est_input"]
-        u, q = self._output * scale + shift, len(data["est_C"])
+        u = self._output * scale + shift
+        q = len(data["est_C"])
         y = np.where(faulty, np.nan, obs)[:q]
-        loads, rest = self._good[data["est_loads"]], data["obs_rest"][:q]
+        loads = self._good[data["est_loads"]]
+        rest = data["obs_rest"][:q]
         with np.errstate(over="ignore", invalid="ignore"):
             if self._estimate is not None:
                 found = data["est_next"] @ [*self._estimate, *u, *self._loads, 1.0]
@@ -404,7 +421,8 @@ class Controller:
                 found = data["est_first"] @ [*np.where(np.isnan(y), rest, y), 1.0]
         if not np.isfinite(found).all():
             found = data["est_first"] @ [*rest, 1.0]
-        self._estimate, self._loads = found, loads
+        self._estimate = found
+        self._loads = loads
         low, high = data["est_box"]
         shown = np.concatenate([self._good, np.clip(found, low, high), u])
         return np.asarray(shown[data["source"]])
@@ -431,7 +449,8 @@ class Controller:
 
         All but the last two, (batch,), are (batch, m).
         """
-        data, lost = self.data, ~np.isfinite(obs)
+        data = self.data
+        lost = ~np.isfinite(obs)
         with np.errstate(over="ignore", invalid="ignore"):
             theta = np.where(lost, 0.0, obs) @ data["obs_matrix"].T + data["obs_offset"]
         theta[(lost @ (data["obs_matrix"] != 0).T) | np.isnan(theta)] = 0.0
@@ -454,8 +473,10 @@ class Controller:
         if len(data["change"]):  # these are reached as fast as the rate allows
             last = theta[:, -law.shape[1] :] * data["per_input"] - data["middle"]
             slowest = np.clip(last + data["change"][:, None], *data["bounds"])
-            low, high = np.clip(low, *slowest), np.clip(high, *slowest)
-        law, sound = np.clip(law, low, high), np.ones(len(law), bool)
+            low = np.clip(low, *slowest)
+            high = np.clip(high, *slowest)
+        law = np.clip(law, low, high)
+        sound = np.ones(len(law), bool)
         action = law
         if networks:
             middle, per_half, (full, none) = *data["confines"], data["fades"]
@@ -479,12 +500,17 @@ class Controller:
 
         Those on it already stay to the bit.
         """
-        kept, n = self.data["kept"], theta.shape[1]
-        a, b, c, margin = kept[:, :n], kept[:, n:-2], kept[:, -2], kept[:, -1]
+        kept = self.data["kept"]
+        n = theta.shape[1]
+        a = kept[:, :n]
+        b = kept[:, n:-2]
+        c = kept[:, -2]
+        margin = kept[:, -1]
         slack = c - theta @ a.T - law @ b.T
         room = np.maximum(slack - margin, 0)
         beyond = (action - law) @ b.T - np.minimum(slack, room)
-        worst, most = beyond.argmax(1), beyond.max(1)[:, None]
+        worst = beyond.argmax(1)
+        most = beyond.max(1)[:, None]
         reach = self.data["reach"]
         moved = np.clip(action - most * b[worst], law - reach, law + reach)
         moved = np.clip(moved, low, high)
@@ -495,9 +521,11 @@ class Controller:
 
     def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the first region that theta violates least, and whether it holds theta."""
-        data, rows = self.data, max(1, MAX_SLACKS // len(self.data["b"]))
+        data = self.data
+        rows = max(1, MAX_SLACKS // len(self.data["b"]))
         tolerance, tie = data["tolerances"]
-        region, inside = np.empty(len(theta), np.int64), np.empty(len(theta), bool)
+        region = np.empty(len(theta), np.int64)
+        inside = np.empty(len(theta), bool)
         for i in range(0, len(theta), rows):
             slack = data["b"] - theta[i : i + rows] @ data["A"].T
             slack = np.minimum.reduceat(slack, data["starts"], axis=1)
@@ -509,18 +537,22 @@ class Controller:
 
     def _networks(self, x: Array, used: NDArray[np.int64]) -> Array:
         """Return (batch, m): what network number ``used`` puts out, zero for -1."""
-        data, act = self.data, ACTIVATIONS[self.activation]
+        data = self.data
+        act = ACTIVATIONS[self.activation]
         layers = [data[f"layer{i}"] for i in range(int(data["n_layers"]))]
         found = np.zeros((len(x), len(data["action_scale"])))
         for k in np.unique(used[used >= 0]):
-            rows, pinned = used == k, bool(data["pinned"][k])
+            rows = used == k
+            pinned = bool(data["pinned"][k])
             y = x[rows]
             at_zero = pinned & ~y.any(1, keepdims=True)
             with np.errstate(over="ignore", invalid="ignore"):
                 for layer in layers[:-1]:
-                    W, b = layer[k, :, :-1], layer[k, :, -1]
+                    W = layer[k, :, :-1]
+                    b = layer[k, :, -1]
                     y = act(y @ W.T + b) - (act(b) if pinned else 0.0)
-                W, b = layers[-1][k, :, :-1], layers[-1][k, :, -1]
+                W = layers[-1][k, :, :-1]
+                b = layers[-1][k, :, -1]
                 y = y @ W.T + (0.0 if pinned else b)
             found[rows] = np.where(at_zero, 0.0, y)
         return found
@@ -569,7 +601,8 @@ def _solve(
         entering = int(np.argmin(slack))
         if slack[entering] >= 0:
             return _certified(data, d, extra, gram, active)
-        violation, own = -float(slack[entering]), 0.0
+        violation = -float(slack[entering])
+        own = 0.0
         while True:
             step = np.linalg.solve(gram[np.ix_(active, active)], gram[active, entering])
             rest = float(gram[entering, entering] - gram[entering, active] @ step)

@@ -99,9 +99,12 @@ def estimator_arrays(
     in plant units. Of what the policy sees, x and estimated disturbances come from the filter, the
     previous input is the controller's own, and the rest are readings, behind the outputs.
     """
-    model, layout = problem.model, problem.layout
+    model = problem.model
+    layout = problem.layout
     _require_same(model, estimator)
-    q, size, n_known = estimator.n_measured, len(estimator.A), estimator.n_known
+    q = estimator.n_measured
+    size = len(estimator.A)
+    n_known = estimator.n_known
     estimated = [*range(n_known, model.n_disturbances)]
     x = np.concatenate([model.x_ss, model.d_ss[estimated]])
     y = estimator.C_aug @ x
@@ -193,11 +196,13 @@ def describe(
         change = layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs))
     else:
         law, program = _with_regions(policy.law() if isinstance(policy, LinearMPC) else policy)
-        networks, change = _no_networks(law), np.empty((0, law.n_inputs))
+        networks = _no_networks(law)
+        change = np.empty((0, law.n_inputs))
         if law.rate is not None:
             change = law.rate / _input_range(law)[2]
 
-    n, states = law.n_theta, np.zeros(law.n_theta, bool)
+    n = law.n_theta
+    states = np.zeros(law.n_theta, bool)
     state_names: list[str] = []
     input_names = [f"u[{i}]" for i in range(law.n_inputs)]
     if law.model is not None:
@@ -275,16 +280,19 @@ def _shows_theta(policy: Any) -> bool:
     """Return whether what is seen is theta, in its own units."""
     if not isinstance(policy, StartsAsMPC):
         return True
-    extractor, n = policy.actor.features_extractor, policy.problem.n_theta
+    extractor = policy.actor.features_extractor
+    n = policy.problem.n_theta
     if not isinstance(extractor, AffineFeatures):
         return True
-    matrix, offset = extractor.matrix.cpu().numpy(), extractor.offset.cpu().numpy()
+    matrix = extractor.matrix.cpu().numpy()
+    offset = extractor.offset.cpu().numpy()
     return np.array_equal(matrix, np.eye(n)) and np.allclose(offset, -policy.problem.theta_ss)
 
 
 def _with_sources(problem: LinearMPC) -> list[str]:
     """Return the names of theta's entries, with the source of a disturbance."""
-    labels, layout = [*problem.labels()], problem.layout
+    labels = [*problem.labels()]
+    layout = problem.layout
     for i, name in enumerate(layout.names):
         if layout.disturbance.start <= i < layout.disturbance.stop:
             is_estimated = int(name[:-1].partition("[")[2]) in problem.model.estimated
@@ -323,13 +331,17 @@ def _signal_maps(policy: Any, law: PiecewiseAffine) -> tuple[Array, Array, Array
     if isinstance(policy, StartsAsMPC):
         extractor = policy.actor.features_extractor
         box: Any = policy.action_space
-        matrix, offset = np.eye(n), np.zeros(n)
+        matrix = np.eye(n)
+        offset = np.zeros(n)
         if isinstance(extractor, AffineFeatures):
-            matrix, offset = extractor.matrix.T.cpu().numpy(), extractor.offset.cpu().numpy()
-        low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
+            matrix = extractor.matrix.T.cpu().numpy()
+            offset = extractor.offset.cpu().numpy()
+        low = np.asarray(box.low, np.float64)
+        high = np.asarray(box.high, np.float64)
         shift = (high + low) / 2
         return matrix, offset, scale_within((high - low) / 2, shift, low, high), shift
-    theta_ss, u_ss = law.units.theta_ss, law.units.u_ss
+    theta_ss = law.units.theta_ss
+    u_ss = law.units.u_ss
     finite, middle, half = _input_range(law)
     low = np.where(finite, law.u_min, -1.0) + u_ss
     high = np.where(finite, law.u_max, 1.0) + u_ss
@@ -412,7 +424,8 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
 def _input_range(law: PiecewiseAffine) -> tuple[Any, Array, Array]:
     """Return which inputs (m,) are bounded, the middles of their ranges and half-widths."""
     finite = np.isfinite(law.u_min) & np.isfinite(law.u_max)
-    low, high = np.where(finite, law.u_min, -1.0), np.where(finite, law.u_max, 1.0)
+    low = np.where(finite, law.u_min, -1.0)
+    high = np.where(finite, law.u_max, 1.0)
     return finite, (high + low) / 2, (high - low) / 2
 
 
@@ -437,7 +450,8 @@ def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
     nodes = network.first.nodes.detach().double().cpu().numpy()
     first = nodes.sum(1)
     rest = [each.detach().double().cpu().numpy() for each in network.weights()[1:]]
-    layers, pinned = [first, *rest], network.pinned_array > 0
+    layers = [first, *rest]
+    pinned = network.pinned_array > 0
     if not all(np.all(np.isfinite(each)) for each in layers):
         raise ValueError(
             "The actor's weights hold NaN or infinite entries: there is nothing to export. Load an "

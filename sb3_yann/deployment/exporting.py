@@ -146,7 +146,8 @@ def export(
             f"C, FMU or npz in double, not as {kind} in {precision}: or solve problem.explicit() "
             "without a limit before the model is made, or shorten the horizon."
         )
-    digest, note = digest_of(data)[:12], str(data["note"])
+    digest = digest_of(data)[:12]
+    note = str(data["note"])
     about = (
         f"{prefix}, a controller, written by sb3-yann {version('sb3-yann')}; digest {digest}."
         + f"\nNOTE: {note}" * bool(note)

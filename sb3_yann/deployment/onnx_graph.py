@@ -25,7 +25,8 @@ def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
     graph = _Graph(precision)
     action, outside = _policy(graph, data, precision)
     value = onnx.helper.make_tensor_value_info
-    n_obs, m = data["obs_matrix"].shape[1], len(data["action_scale"])
+    n_obs = data["obs_matrix"].shape[1]
+    m = len(data["action_scale"])
     graph.op("Identity", action, name="action")
     graph.op("Identity", outside, name="outside")
     whole = onnx.helper.make_graph(
@@ -58,7 +59,8 @@ class _Graph:
 
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
-        wide, self.helper = precision == "double", onnx.helper
+        wide = precision == "double"
+        self.helper = onnx.helper
         self.real = np.float64 if wide else np.float32
         self.kind = onnx.TensorProto.DOUBLE if wide else onnx.TensorProto.FLOAT
         self.from_array = onnx.numpy_helper.from_array
@@ -105,7 +107,8 @@ class _Graph:
 
 def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
     """Return the names of action and outside."""
-    op, constant = graph.op, graph.constant
+    op = graph.op
+    constant = graph.constant
     zero = constant(0.0)
     lost = graph.not_finite("obs")
     seen = op("Where", lost, zero, "obs")
@@ -160,13 +163,16 @@ def _locate(
     graph: _Graph, data: Arrays, theta: str, tolerances: dict[str, float]
 ) -> tuple[str, str]:
     """Return the region (batch,) that theta violates least, and whether it holds it (batch, 1)."""
-    op, constant = graph.op, graph.constant
-    starts, rows = data["starts"], len(data["b"])
+    op = graph.op
+    constant = graph.constant
+    starts = data["starts"]
+    rows = len(data["b"])
     counts = np.diff([*starts, rows])
     A = np.zeros((len(starts), counts.max(), theta_size := data["A"].shape[1]))
     b = np.full(A.shape[:2], np.inf)  # rows that never bind fill up the shorter regions
     for i, (start, count) in enumerate(zip(starts, counts, strict=True)):
-        A[i, :count], b[i, :count] = data["A"][start : start + count], data["b"][start:][:count]
+        A[i, :count] = data["A"][start : start + count]
+        b[i, :count] = data["b"][start:][:count]
     slack = op("MatMul", theta, constant(A.reshape(-1, theta_size).T))
     slack = op("Sub", constant(b.reshape(1, -1)), slack)
     slack = op("Reshape", slack, constant(np.array([-1, *b.shape])))
@@ -181,8 +187,10 @@ def _locate(
 
 def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
     """Return what the networks add, (batch, m)."""
-    op, constant = graph.op, graph.constant
-    number, act = data["network_of"], ACTIVATIONS[str(data["activation"])]
+    op = graph.op
+    constant = graph.constant
+    number = data["network_of"]
+    act = ACTIVATIONS[str(data["activation"])]
     used = op("Gather", constant(np.maximum(number, 0)), region)
     shared = bool(np.all(number == 0))
 
@@ -195,7 +203,8 @@ def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
     last = int(data["n_layers"]) - 1
     for i in range(last + 1):
         layer = data[f"layer{i}"]
-        W, bias = layer[:, :, :-1], layer[:, :, -1]
+        W = layer[:, :, :-1]
+        bias = layer[:, :, -1]
         if i == last:
             bias = np.where(pinned[:, None], 0.0, bias)
         # A shared network is one matrix for all rows, not a copy of it for each.
@@ -225,10 +234,13 @@ def _kept(
     graph: _Graph, data: Arrays, theta: str, law: str, action: str, low: str, high: str
 ) -> str:
     """Return actions that break no row further than the law, as `Controller` does."""
-    op, constant, n = graph.op, graph.constant, data["A"].shape[1]
+    op = graph.op
+    constant = graph.constant
+    n = data["A"].shape[1]
     kept = data["kept"]
     rows = kept[:, n:-2]
-    b, zero = constant(rows.T), constant(0.0)
+    b = constant(rows.T)
+    zero = constant(0.0)
     slack = op("Sub", constant(kept[None, :, -2]), op("MatMul", theta, constant(kept[:, :n].T)))
     slack = op("Sub", slack, op("MatMul", law, b))
     room = op("Max", op("Sub", slack, constant(kept[None, :, -1])), zero)
@@ -253,7 +265,8 @@ def _kept(
 
 def _activate(graph: _Graph, x: str, data: Arrays) -> str:
     """Return the activation of x."""
-    kind, op = str(data["activation"]), graph.op
+    kind = str(data["activation"])
+    op = graph.op
     if kind == "tanh":
         return op("Tanh", x)
     zero = graph.constant(0.0)

@@ -43,7 +43,8 @@ RESERVED = set(
     """.split()
 )
 """Words of the language that a function block cannot be called."""
-LARGEST, SMALLEST = 1e37, 1e-37
+LARGEST = 1e37
+SMALLEST = 1e-37
 """Larger readings count as infinite, which no standard function asks; smaller entries are zero.
 
 Both are for LREAL too: MatIEC, the compiler of OpenPLC and Beremiz, reads its literals as REAL
@@ -93,7 +94,8 @@ def plcopen_xml(data: Arrays, precision: str, about: str) -> str:
 
 def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str]:
     """Return the interface, declarations of constants and of variables, and the body."""
-    networks, n_layers = len(data["pinned"]) > 0, int(data["n_layers"])
+    networks = len(data["pinned"]) > 0
+    n_layers = int(data["n_layers"])
     flags = {
         str(data["activation"]): networks,
         "networks": networks,
@@ -106,13 +108,15 @@ def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str
         "readings alone": "est_gain" not in data,
         "loads": len(data.get("est_loads", ())) > 0,
     }
-    (p, m, n), hidden = data["gains"].shape, [1, 1]
+    (p, m, n) = data["gains"].shape
+    hidden = [1, 1]
     for i in range(n_layers - 1):
         hidden[i] = data[f"layer{i}"].shape[1]
     sizes = {"OBS": len(data["obs_rest"]), "SEEN": data["obs_matrix"].shape[1]}
     sizes |= {"M": m, "N": n, "P": p}
     if flags["estimator"]:
-        (size, q), loads = data["est_gain"].shape, len(data["est_loads"])
+        (size, q) = data["est_gain"].shape
+        loads = len(data["est_loads"])
         sizes |= {"EST": size, "Q": q, "LOADS": loads, "FIRST": q + 1}
         sizes |= {"STEP": size + m + loads + 1, "REST": q + m + loads + 1}
         sizes["ROOM"] = size + q + m + loads
@@ -199,7 +203,8 @@ def _variable(declared: str) -> str:
     """Return a declaration, ``name : type := value;``, as PLCopen has it."""
     name, _, rest = declared.split("(*")[0].strip().rstrip(";").partition(" : ")
     kind, _, value = rest.partition(" := ")
-    shown, initial = f"<{kind}/>", f'<simpleValue value="{value}"/>'
+    shown = f"<{kind}/>"
+    initial = f'<simpleValue value="{value}"/>'
     if kind.startswith("ARRAY"):
         bounds, _, base = kind.removeprefix("ARRAY[").partition("] OF ")
         low, _, high = bounds.partition("..")

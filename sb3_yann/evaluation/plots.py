@@ -66,7 +66,8 @@ def inputs_of(problem: LinearMPC, policy: Any, theta: Array) -> Array:
         return np.asarray(policy(theta), np.float64).reshape(len(theta), -1)
     import torch as th
 
-    device, bounds = next(actor.mu.buffers()).device, problem.deviations
+    device = next(actor.mu.buffers()).device
+    bounds = problem.deviations
     with th.no_grad():
         scaled = actor.mu(th.as_tensor(theta, device=device)).double().cpu().numpy()
     return np.asarray((bounds.u_max + bounds.u_min) / 2 + problem.u_half * scaled)
@@ -84,7 +85,8 @@ class ActiveConstraints:
 
     def at(self, theta: Array) -> list[str] | None:
         """Return the active constraints at theta (n_theta,), None where no plan is feasible."""
-        scaled, z = self.units.scaled, (theta - self.units.center) / self.units.half
+        scaled = self.units.scaled
+        z = (theta - self.units.center) / self.units.half
         U = scaled.solve(z)
         if U is None:
             return None
@@ -158,7 +160,8 @@ class _Surface:
             raise ValueError(
                 f"output = {output} must be an input, from 0 to {problem.model.n_inputs - 1}."
             )
-        low, high = problem.theta_min[chosen], problem.theta_max[chosen]
+        low = problem.theta_min[chosen]
+        high = problem.theta_max[chosen]
         if frame is not None:
             low, high = (check_array("frame", each, (2,)) for each in frame)
         if not np.all(np.isfinite([low, high])) or np.any(low >= high):
@@ -177,7 +180,8 @@ class _Surface:
         self.theta = problem.units.to_deviations(shown)
         self.inside = law.in_domain(self.theta).astype(float).reshape(points, points)
         self.labels = [problem.labels(units=True)[i] for i in chosen]
-        self.problem, self.output = problem, output
+        self.problem = problem
+        self.output = output
         self.name = with_units(problem.model)[1][output]
 
     def values(self, policy: Any) -> Array:
@@ -243,7 +247,8 @@ def plot_surface(
     2.0
     """
     surface = _Surface(problem, entries, at, output, frame)
-    u, axes = surface.values(policy), axes_or_new(axes, 5.4, 4.2)
+    u = surface.values(policy)
+    axes = axes_or_new(axes, 5.4, 4.2)
     mesh = surface.draw(axes, u, (u.min(), u.max()))
     axes.figure.colorbar(mesh, ax=axes, label=surface.name)
     return axes
@@ -281,7 +286,8 @@ def surfaces_figure(
     figure = new_figure(10.2, 3.2)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     surface = _Surface(problem, entries, at, output, frame)
-    first, second = surface.values(before), surface.values(after)
+    first = surface.values(before)
+    second = surface.values(after)
     scale = min(first.min(), second.min()), max(first.max(), second.max())
     surface.draw(panels[0], first, scale)
     mesh = surface.draw(panels[1], second, scale)
@@ -315,7 +321,8 @@ def region_use(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Regio
     theta = np.concatenate([each[:-1] for each in episodes.observations])
     theta = problem.units.to_deviations(theta[np.isfinite(theta).all(axis=1)])
     apart = np.abs(inputs_of(problem, policy, theta) - law(theta)) / problem.u_half
-    distance, region = apart.max(axis=1), law.locate(theta)
+    distance = apart.max(axis=1)
+    region = law.locate(theta)
     found, where, visits = np.unique(region, return_inverse=True, return_counts=True)
     largest = np.zeros(len(found))
     np.maximum.at(largest, where, distance)
@@ -380,7 +387,8 @@ def _check_runs(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
     found = {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
     if not found or not all(len(each.costs) for each in found.values()):
         raise ValueError("There are no episodes to draw: pass {name: evaluate(...)} of some seeds.")
-    n, m = problem.n_theta, problem.model.n_inputs
+    n = problem.n_theta
+    m = problem.model.n_inputs
     for name, episodes in found.items():
         for x, u in episodes.pairs:
             if x.shape[1:] != (n,) or u.shape[1:] != (m,):
@@ -550,7 +558,8 @@ def _draw_rows(axes: Axes, rows: Array, dt: float, style: dict[str, Any], name: 
 
 def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: float) -> None:
     """Draw limits near the data, name those far away, and set the range of the axis."""
-    k, model = entry - problem.n_theta, problem.model
+    k = entry - problem.n_theta
+    model = problem.model
     kind = ""
     sides = -np.inf, np.inf
     if k >= 0:
@@ -560,15 +569,18 @@ def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: f
         sides = problem.x_min[entry], problem.x_max[entry]
         kind = "soft limit" if problem.soft.penalty and problem.soft.x[entry] > 0 else "limit"
     width = max(high - low, 1e-9 * max(abs(low), abs(high), 1.0))
-    bottom, top = low, high
+    bottom = low
+    top = high
     for value, corner in zip(sides, ("bottom", "top"), strict=True):
         if not np.isfinite(value):
             continue
         if low - width <= value <= high + width:
             axes.axhline(value, label=kind, **LIMIT)  # type: ignore[arg-type]
-            bottom, top = min(bottom, value), max(top, value)
+            bottom = min(bottom, value)
+            top = max(top, value)
         else:
-            y, text = 0.04 if corner == "bottom" else 0.96, f"{kind}: {value:.4g}"
+            y = 0.04 if corner == "bottom" else 0.96
+            text = f"{kind}: {value:.4g}"
             place: dict[str, Any] = {"ha": "right", "va": corner, "transform": axes.transAxes}
             axes.text(0.98, y, text, fontsize=7, **place)
     room = 0.06 * max(top - bottom, width)
@@ -657,10 +669,12 @@ def _range_of_costs(costs: Array, accepted: Array, mpc: Array) -> tuple[float, f
     known = known[np.isfinite(known)]
     if not known.size:
         known = costs[np.isfinite(costs)] if np.isfinite(costs).any() else np.zeros(1)
-    low, high = float(known.min()), float(known.max())
+    low = float(known.min())
+    high = float(known.max())
     width = max(high - low, 0.02 * max(abs(low), abs(high)), 1e-12)
     near = costs[(costs >= low - 2 * width) & (costs <= high + 2 * width)]
-    low, high = min([low, *near]), max([high, *near])
+    low = min([low, *near])
+    high = max([high, *near])
     room = 0.08 * max(high - low, width)
     return low - room, high + room
 
@@ -686,11 +700,14 @@ def plot_headroom(found: Any, axes: Axes | None = None) -> Axes:
         "nonlinearity": "nonlinearity\nand constraints",
         "total": "all of it",
     }
-    axes, start = axes_or_new(axes, 6.4, 2.6), 0.0
+    axes = axes_or_new(axes, 6.4, 2.6)
+    start = 0.0
     for k, name in enumerate(parts):
-        value, error = 100 * getattr(found, name), None
+        value = 100 * getattr(found, name)
+        error = None
         if name == "total":
-            start, error = 0.0, 100 * found.standard_error
+            start = 0.0
+            error = 100 * found.standard_error
         axes.barh(k, value, left=start, color=COLORS[k], xerr=error, capsize=3, height=0.6)
         end = max(start, start + value) + (error or 0.0)
         axes.annotate(f"{value:+.2f} %", (end, k), (4, 0), textcoords="offset points", va="center")

@@ -196,7 +196,8 @@ class ImprovementGuard(BaseCallback):
         if isinstance(env, PlantTwin):
             env.require_trust()
             # The seed of an episode names a member: all of them are played.
-            self.twin, env = env, env.env
+            self.twin = env
+            env = env.env
         if not (isinstance(env, str | gym.Env) or callable(env)):
             raise TypeError(
                 f"env = {env!r} must be a simulator of the plant: the id of an environment, a "
@@ -280,9 +281,11 @@ class ImprovementGuard(BaseCallback):
         check_not_nested(self)
         check_alone(self)
         require_same_statistics(self.model)
-        self._has_begun, self._steps = False, 0
+        self._has_begun = False
+        self._steps = 0
         self._final = None
-        player, settings = self.player, self.settings
+        player = self.player
+        settings = self.settings
         with preserve_rng():
             require_like_training(self.env, self.model.get_env(), f"The guard's env {settings.env}")
         known: GuardState | None = getattr(self.model, "guard_state", None)
@@ -302,7 +305,8 @@ class ImprovementGuard(BaseCallback):
             evidence, leading, refusals = first_evidence(player, settings, known)
             state = GuardState(settings.of_evidence, evidence, player.max_input_step)
             if known is not None:  # other starts or another plant: what was decided stays
-                state.decisions, state.episodes = [*known.decisions], known.episodes
+                state.decisions = [*known.decisions]
+                state.episodes = known.episodes
             self.model.guard_state = state  # type: ignore[attr-defined]
             leading.restore(player.policy)
         restore = self._leave_accepted
@@ -334,7 +338,8 @@ class ImprovementGuard(BaseCallback):
         if self._audit is not None and self._audit.finding is None:
             self._audit.on_step()
             self._compare_rewards()
-        dones, state = self.locals["dones"], self.state
+        dones = self.locals["dones"]
+        state = self.state
         state.episodes += int(np.sum(dones))
         self._warn_of_an_endless_episode(dones)
         last = state.last_trial
@@ -360,7 +365,8 @@ class ImprovementGuard(BaseCallback):
 
         Until it is decided, the state is that of before: that is left where Ctrl-C cuts this off.
         """
-        state, policy = self.state, self.player.policy
+        state = self.state
+        policy = self.player.policy
         if state.accepted.is_actor_of(policy):
             return
         candidate = ActorCheckpoint.of(policy)
@@ -374,7 +380,8 @@ class ImprovementGuard(BaseCallback):
 
     def _log(self, decision: Decision) -> None:
         """Set the step size; write a decision to the record, to the logger and to the screen."""
-        state, logger = self.state, self.model.logger
+        state = self.state
+        logger = self.model.logger
         step = self.step_size.after(state.step, decision)
         state.step = self.player.policy.actor_step = step
         decision = replace(
@@ -419,7 +426,8 @@ class ImprovementGuard(BaseCallback):
 
     def _save_accepted(self) -> None:
         """Save the model with the accepted policy, if it is another one than was saved last."""
-        accepted, policy = self.state.accepted, self.player.policy
+        accepted = self.state.accepted
+        policy = self.player.policy
         if self._folder is None or accepted is self._saved:
             return
         path = self._folder / ACCEPTED_FILE
@@ -465,7 +473,8 @@ class ImprovementGuard(BaseCallback):
 
     def _end(self) -> None:
         """Try the last candidate, and confirm what is accepted on the final new starts."""
-        state, settings = self.state, self.settings
+        state = self.state
+        settings = self.settings
         # There is no later: a candidate that is refused now is not kept.
         state.evidence = replace(state.evidence, rejections=settings.patience - 1)
         try:

@@ -92,14 +92,17 @@ def decide(
     None where the candidate differs from the accepted policy only in regions that no episode comes
     through.
     """
-    before, rule = evidence.accepted, settings.rule
+    before = evidence.accepted
+    rule = settings.rule
     changed = before.changed_regions(candidate)
     diverged = candidate.has_diverged()
     if not diverged and not np.any(changed & evidence.scores.visits.any(axis=0)):
         return None
     tried = _accept(evidence, candidate, play, settings)
-    after, verdict = tried.evidence, tried.verdict
-    reason, share = verdict.reason, float(verdict.accepted)
+    after = tried.evidence
+    verdict = tried.verdict
+    reason = verdict.reason
+    share = float(verdict.accepted)
     hopeless = verdict.breaks_limit or (verdict.above_mpc and not settings.keep_if_worse)
     # What is as good as the accepted policy costs no patience.
     rejections = evidence.rejections + (TOO_LITTLE not in reason) if reason else 0
@@ -126,7 +129,8 @@ def decide_at_end(
     Where it loses, its parts and the latest earlier checkpoints are tried, else the MPC is
     accepted. All that are tried share the probability of an error.
     """
-    tried, rule = evidence.accepted, settings.rule
+    tried = evidence.accepted
+    rule = settings.rule
     if settings.n_final_starts == 0 or not tried.has_learned():
         return evidence, None
     seeds = NewSeeds(evidence.next_seed)
@@ -178,7 +182,8 @@ def try_on_known(
     if candidate.has_diverged():
         reason = "a parameter of the actor is not a finite number, or too large"
         return evidence, None, Verdict(reason, breaks_limit=True)
-    known, verdict = evidence.starts, Verdict()
+    known = evidence.starts
+    verdict = Verdict()
     trial = PairedTrial(play, evidence.mpc, known, NewSeeds(evidence.next_seed))
     counts = [known.n_hard + each for each in looks(FIRST_LOOK, len(settings.seeds))]
     try:
@@ -229,7 +234,8 @@ def _accept(
         after = after.with_passed(after.accepted)
         return _Tried(after, verdict, cost, scores, others)
     if new is not None:
-        scores, others = scores.extended_by(new), others.extended_by(trial.mpc_scores)
+        scores = scores.extended_by(new)
+        others = others.extended_by(trial.mpc_scores)
     evidence = replace(evidence, next_seed=seeds.next)
     after = _after_loss(evidence, trial.starts, new, play)
     return _Tried(after, verdict, cost, scores, others)
@@ -260,7 +266,8 @@ def _confirm(
     With a ``significance`` it is the final trial: the gain must be sure at it, over all looks, and
     large enough, but for a strict rule.
     """
-    rule, at_end = settings.rule, significance is not None
+    rule = settings.rule
+    at_end = significance is not None
     strict = not rule.cvar_alpha
     counts = looks(FIRST_LOOK, settings.n_new_starts)
     if at_end:
@@ -331,7 +338,8 @@ def _parts(
     if rule.by_region and scores is not None and others is not None:
         more = np.nan_to_num(scores.costs - others.costs, nan=np.inf)
         more[less_safe(scores.unsafe, others.unsafe).any(axis=1)] = np.inf
-        visits, changed = scores.visits | others.visits, accepted.changed_regions(candidate)
+        visits = scores.visits | others.visits
+        changed = accepted.changed_regions(candidate)
         lost = np.where(visits, np.maximum(more, 0.0)[:, None], 0.0).sum(axis=0)
         won = np.where(visits, np.maximum(-more, 0.0)[:, None], 0.0).sum(axis=0)
         kept = changed & (won > lost)
@@ -354,7 +362,8 @@ def _decision(
     regions: Sequence[int] = (),
     share: float = 0.0,
 ) -> Decision:
-    starts, costs = evidence.starts, evidence.scores.costs
+    starts = evidence.starts
+    costs = evidence.scores.costs
     verdict: Outcome = "accepted"
     if reason:
         verdict = "accepted in part" if regions or share else "rejected"
@@ -405,7 +414,10 @@ class Player:
     def __init__(
         self, model: OffPolicyAlgorithm, policy: StartsAsMPC, env: Source, mpc: ActorCheckpoint
     ) -> None:
-        self.model, self.policy, self.mpc, self.envs = model, policy, mpc, EnvPool(env)
+        self.model = model
+        self.policy = policy
+        self.mpc = mpc
+        self.envs = EnvPool(env)
         self.max_input_step: Array | None = None
         self.pays_cost = True
         self.interrupted = False
@@ -440,7 +452,8 @@ class Player:
 
     def scores(self, played: Trajectories) -> Scores:
         """Return what the episodes cost and break, and the regions that they come through."""
-        policy, layer = self.policy, self.policy.actor.mu
+        policy = self.policy
+        layer = self.policy.actor.mu
         thetas = [self.theta(each) for each in played.observations]
         inputs = [policy.inputs(each) for each in played.actions]
         excess = excess_of_episodes(policy.problem, zip(thetas, inputs, strict=True))

@@ -38,7 +38,9 @@ def first_evidence(
     starts of an earlier run stay.
     """
     present = ActorCheckpoint.of(player.policy)
-    candidates, hard, next_seed = [present], list[int](), settings.seeds.stop
+    candidates = [present]
+    hard = list[int]()
+    next_seed = settings.seeds.stop
     if known is not None:
         candidates = [known.accepted, present]
         next_seed = max(known.evidence.next_seed, next_seed)
@@ -51,7 +53,8 @@ def first_evidence(
     mpc = mpc.at(order)
     starts = Starts(tuple(seeds[i] for i in order), mpc, tolerance, len(hard))
     evidence = Evidence(player.mpc, player.mpc, starts, mpc, next_seed)
-    leading, decisions = player.mpc, list[Decision]()
+    leading = player.mpc
+    decisions = list[Decision]()
     for candidate in candidates:
         if candidate.has_networks_of(leading):
             continue
@@ -105,7 +108,9 @@ def _regions_first(visits: NDArray[np.bool_]) -> NDArray[np.int64]:
 
     The first look at a candidate is at these: what it is worth in a region shows there.
     """
-    left, seen, chosen = [*range(len(visits))], np.zeros(visits.shape[1], dtype=bool), []
+    left = [*range(len(visits))]
+    seen = np.zeros(visits.shape[1], dtype=bool)
+    chosen = []
     while left and np.any(new := (visits[left] & ~seen).sum(axis=1)):
         chosen.append(left.pop(int(np.argmax(new))))
         seen |= visits[chosen[-1]]
@@ -123,7 +128,8 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
     before = np.concatenate([each[:-1] for each in thetas])
     after = np.concatenate([each[1:] for each in thetas])
     warn_of_order(policy.problem, before, np.concatenate(inputs), after, stacklevel=2)
-    options, rewards = policy.critic_options, np.concatenate(mpc.own_rewards)
+    options = policy.critic_options
+    rewards = np.concatenate(mpc.own_rewards)
     cost = policy.problem.deviations.stage_cost(before, np.concatenate(inputs))
     error = np.abs(options.reward_scale * cost + rewards - options.reward_offset)
     error = error[np.isfinite(error)]  # steps that violate may cost more
@@ -221,7 +227,9 @@ class InterruptHandler:
     """
 
     def __init__(self, model: BaseAlgorithm, restore: Callable[[], None], before: Any) -> None:
-        self.before, self.run, self.model = before, model.start_time, weakref.ref(model)
+        self.before = before
+        self.run = model.start_time
+        self.model = weakref.ref(model)
         self.restore = weakref.WeakMethod(restore, lambda _: self.remove())
 
     @classmethod

@@ -224,7 +224,8 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     >>> restore_accepted(model)
     """
     check_type("model", model, BaseAlgorithm, "a DDPG or TD3 model")
-    state, policy = getattr(model, "guard_state", None), model.policy
+    state = getattr(model, "guard_state", None)
+    policy = model.policy
     if not isinstance(state, GuardState) or not isinstance(policy, StartsAsMPC):
         name = type(model).__name__
         raise ValueError(f"No ImprovementGuard has been at work on this {name}: pass one to learn.")
@@ -240,9 +241,11 @@ class Record:
 
         A run that goes on from a checkpoint drops what it had decided after it.
         """
-        self.path, self.is_complete = path, False
+        self.path = path
+        self.is_complete = False
         try:
-            ours, theirs = _rows(decisions, header=True), path.read_bytes().decode(errors="replace")
+            ours = _rows(decisions, header=True)
+            theirs = path.read_bytes().decode(errors="replace")
             is_ours = ours.startswith(theirs) or (decisions != [] and theirs.startswith(ours))
         except FileNotFoundError:
             is_ours = True
@@ -309,7 +312,8 @@ ADVICE = {
 
 def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
     """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
-    decisions, starts = state.decisions, state.evidence.starts
+    decisions = state.decisions
+    starts = state.evidence.starts
     played = slice(starts.n_hard, len(state.evidence.scores.costs))
     ours = state.evidence.scores.at(played)
     mpc = starts.mpc.at(played)

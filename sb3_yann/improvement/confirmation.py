@@ -42,7 +42,8 @@ from sb3_yann.twin.plant_twin import PlantTwin
 RULE = AcceptanceRule()
 """When a policy is no worse on the starts that begin as the log does: as a guard has it."""
 MARGIN = 0.01  # what one start around the log may cost more on one member, in mean costs of the MPC
-AROUND, RAREST = 0.005, 10.0
+AROUND = 0.005
+RAREST = 10.0
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
 many times as much at most where it is rare."""
 FURTHER = 0.01  # how much farther than the MPC a run may leave what the log shows, in its widths
@@ -128,7 +129,8 @@ class Trial:
         return cls(twin, rows, count, follow)
 
     def __post_init__(self) -> None:
-        episodes, part = self.twin.episodes, self.twin.dynamics.row.given
+        episodes = self.twin.episodes
+        part = self.twin.dynamics.row.given
         self.steps = max(map(len, episodes))
         self.given = np.repeat(self.starts[:1, :, part], self.steps, axis=0)
         for number, each in enumerate(episodes):
@@ -172,14 +174,17 @@ class Trial:
 
     def _beyond(self, thetas: Array) -> Array:
         """Return how far each run gets beyond what the log shows, in its widths; 0 inside."""
-        limits, x = self.twin.limits, thetas[1:][..., self.twin.dynamics.row.state]
+        limits = self.twin.limits
+        x = thetas[1:][..., self.twin.dynamics.row.state]
         over = np.maximum(x - limits.high, limits.low - x) / (limits.high - limits.low)
         return np.asarray(np.maximum(over, 0.0).max(axis=(0, -1)).ravel())
 
     def check(self, iteration: int, played: Outcome) -> Check:
         """Compare a policy with the MPC, by what came of it."""
         costs, unsafe = played
-        known, mean, excess = self.known, self.mean, costs - self.mpc[0]
+        known = self.known
+        mean = self.mean
+        excess = costs - self.mpc[0]
         safe = not np.any(less_safe(unsafe, self.mpc[1]))
         policy, mpc = (Scores(c[known], u[known]) for c, u in (played, self.mpc))
         allowed_more = RULE.tolerance(self.mpc[0][known], BoundNames.of(self.twin.problem))
@@ -192,7 +197,8 @@ class Trial:
         beyond = (excess - self.room())[~known]
         if not reason and not np.all(beyond <= 0):
             reason = f"a start outside the log costs {excess[~known][np.argmax(beyond)]:.4g} more"
-        change, worst = float(excess[known].mean()), float(excess[known].max())
+        change = float(excess[known].mean())
+        worst = float(excess[known].max())
         shown = change / mean, worst / mean, safe, logged / mean, error / mean
         return Check(iteration, not reason, reason, *shown)
 
@@ -203,7 +209,8 @@ class Trial:
         a log could have made.
         """
         by_member = excess.reshape(self.starts.shape[:2])
-        numbers, count = self.follow[self.follow >= 0], len(self.starts)
+        numbers = self.follow[self.follow >= 0]
+        count = len(self.starts)
         by_start = by_member[:, self.follow >= 0]
         means = np.array([by_start[:, numbers == each].mean() for each in np.unique(numbers)])
         by_episodes = means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else 0.0
@@ -247,7 +254,8 @@ class SimulatorTrial(PairedTrial):
     """
 
     def __init__(self, simulator: Simulator) -> None:
-        self.simulator, self.episodes = simulator, list[Episode | None]()
+        self.simulator = simulator
+        self.episodes = list[Episode | None]()
         self.played: Trajectories | None = None
         none = Scores(np.empty(0), np.empty((0, 9)))
         super().__init__(

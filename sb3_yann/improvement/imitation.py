@@ -44,9 +44,12 @@ class Teacher:
     """
 
     def __init__(self, scenarios: Scenarios, seed: int) -> None:
-        self.scenarios, self.rng = scenarios, np.random.default_rng([seed, 4])
-        model, problem = scenarios.model, scenarios.model.problem
-        self.problem, self.units = problem, model.dynamics.coordinates.units
+        self.scenarios = scenarios
+        self.rng = np.random.default_rng([seed, 4])
+        model = scenarios.model
+        problem = scenarios.model.problem
+        self.problem = problem
+        self.units = model.dynamics.coordinates.units
         self.mpc = scenarios.play(of_law(problem))
         self.best = self.mpc.costs.copy()
         self.steps = len(self.mpc.inputs)
@@ -120,7 +123,9 @@ class SwitchedController:
     """
 
     def __init__(self, planning: Planning, begins: NDArray[np.int64], act: Inputs) -> None:
-        self.planning, self.begins, self.act = planning, begins, act
+        self.planning = planning
+        self.begins = begins
+        self.act = act
         self.plans: list[dict[int, tuple[int, Plans, Array]]] = []
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
@@ -147,7 +152,8 @@ def imitate(
     2011). The layer ends with the fit that cost the least. Return what it saves in the model: see
     :meth:`Teacher.saved`.
     """
-    most, best = -np.inf, copy.deepcopy(layer.state_dict())
+    most = -np.inf
+    best = copy.deepcopy(layer.state_dict())
     for fit in range(FITS):
         teacher.teach(layer, updates if fit == 0 else updates // 2)
         act = policy_of(layer, teacher.problem)
@@ -155,7 +161,8 @@ def imitate(
         saved = teacher.saved(played.costs)
         say(f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model")
         if saved > most:
-            most, best = saved, copy.deepcopy(layer.state_dict())
+            most = saved
+            best = copy.deepcopy(layer.state_dict())
         if most >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
             break
         teacher.show(act, played)
@@ -182,10 +189,12 @@ def fit_layer(
 
     Rows that are not finite are left out. The networks go on from where they are.
     """
-    low, half = problem.deviations.u_min, problem.u_half
+    low = problem.deviations.u_min
+    half = problem.u_half
     wanted = np.clip((inputs - low) / half - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
-    at, to = th.as_tensor(rows[finite]), th.as_tensor(wanted[finite], dtype=th.float32)
+    at = th.as_tensor(rows[finite])
+    to = th.as_tensor(wanted[finite], dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
     for k in range(updates if len(at) else 0):
@@ -199,7 +208,8 @@ def fit_layer(
 
 def policy_of(layer: LawLayer, problem: LinearMPC) -> Inputs:
     """Return an actor of now as a function from theta (rows, n_theta) to inputs (rows, m)."""
-    middle, half = (problem.deviations.u_max + problem.deviations.u_min) / 2, problem.u_half
+    middle = (problem.deviations.u_max + problem.deviations.u_min) / 2
+    half = problem.u_half
     act = layer.frozen()
     return lambda theta: np.asarray(middle + half * act(theta))
 
@@ -216,8 +226,10 @@ def controller_of(act: Inputs) -> Controller:
 
 def refit_critic(policy: StartsAsMPC, twin: LearntModel, seed: int) -> None:
     """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
-    problem, rng = policy.problem, np.random.default_rng([seed, 2])
-    layer, half = copy.deepcopy(policy.actor.mu).cpu(), problem.u_half
+    problem = policy.problem
+    rng = np.random.default_rng([seed, 2])
+    layer = copy.deepcopy(policy.actor.mu).cpu()
+    half = problem.u_half
     members = len(twin.dynamics.members)
     starts = twin.starts.draw_logged(RETURNS // members * members, rng)
     seen = twin.dynamics.row.shown(starts)
@@ -240,9 +252,12 @@ def _discounted(
     policy: StartsAsMPC, twin: LearntModel, layer: LawLayer, at: Array, u: Array
 ) -> Array:
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
-    problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
+    problem = policy.problem
+    gamma = policy.gamma
+    dynamics = twin.dynamics
     shape = len(dynamics.members), -1
-    starts, u = at.reshape(*shape, at.shape[-1]), u.reshape(*shape, problem.model.n_inputs)
+    starts = at.reshape(*shape, at.shape[-1])
+    u = u.reshape(*shape, problem.model.n_inputs)
     shown = dynamics.row.shown
     with np.errstate(all="ignore"):
         first = dynamics.step(starts, u)
@@ -263,7 +278,8 @@ def _fit_critic(
     policy: StartsAsMPC, theta: Array, actions: Array, returns: Array, rng: np.random.Generator
 ) -> None:
     """Take steps of Adam on the critics' squared errors, in units of the returns' spread."""
-    critic, device = policy.critic, policy.device
+    critic = policy.critic
+    device = policy.device
     points = th.cat([th.as_tensor(theta), th.as_tensor(actions)], dim=1).to(device)
     wanted = th.as_tensor(returns, dtype=th.float32)[:, None].to(device)
     unit = float(np.std(returns)) or 1.0

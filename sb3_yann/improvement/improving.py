@@ -316,7 +316,9 @@ class _Progress:
     """Lines that say what is done: they read as well in a file as on a screen."""
 
     def __init__(self, shown: bool, rounds: int) -> None:
-        self.shown, self.rounds, self.begun = shown, rounds, time.monotonic()
+        self.shown = shown
+        self.rounds = rounds
+        self.begun = time.monotonic()
         self.simulator: Simulator | None = None
         self.ends: list[float] = []  # when the data were there, and when each round was over
 
@@ -325,7 +327,8 @@ class _Progress:
         if not self.shown:
             return
         now = time.monotonic() - self.begun
-        steps, left = "", ""
+        steps = ""
+        left = ""
         if self.simulator:
             steps = f" {self.simulator.steps:>9,} steps"
         if len(self.ends) > 1:
@@ -354,8 +357,13 @@ class _Work:
         seed: int,
         say: _Progress,
     ) -> None:
-        self.policy, self.problem, self.say = policy, policy.problem, say
-        self.n_starts, self.rounds, self.updates, self.seed = n_starts, rounds, updates, seed
+        self.policy = policy
+        self.problem = policy.problem
+        self.say = say
+        self.n_starts = n_starts
+        self.rounds = rounds
+        self.updates = updates
+        self.seed = seed
         self.layer: LawLayer = copy.deepcopy(policy.actor.mu).cpu()
         self.rng = np.random.default_rng([seed, 1])
         self.checks: list[Check] = []
@@ -447,13 +455,16 @@ class _Work:
 
     def _check_in(self, trial: Trial, share: float = 1.0) -> Check:
         """Check the layer on the known starts of a twin, then on new ones, and by other models."""
-        act, number = self.act(), len(self.checks) + 1
+        act = self.act()
+        number = len(self.checks) + 1
         played = trial.play(act)
-        found, self.hard = trial.check(number, played), trial.hard(played)
+        found = trial.check(number, played)
+        self.hard = trial.hard(played)
         if found.accepted:
             new = Trial.draw(trial.twin, self.n_starts, self.rng)
             played = new.play(act)
-            confirmed, self.hard = new.check(number, played), new.hard(played)
+            confirmed = new.check(number, played)
+            self.hard = new.hard(played)
             if not confirmed.accepted:
                 reason = f"on new starts, {confirmed.reason}"
                 found = replace(found, accepted=False, reason=reason)
@@ -486,7 +497,8 @@ class _Work:
         simulator = Simulator(self.problem, env, self.seed, max_steps, seen)
         self.say.simulator = simulator
         before: Check | None = None
-        note, accepted = "", False
+        note = ""
+        accepted = False
         try:
             simulator.begin()
             self.keep_margin(simulator.row, simulator.episodes)
@@ -536,7 +548,9 @@ class _Work:
     ) -> tuple[LearntModel, str]:
         """Fit, plan and imitate until the simulator shows what the model promised."""
         lost: list[Any] = []
-        weights, least, note = self.weights(), best, ""
+        weights = self.weights()
+        least = best
+        note = ""
         self.say.end_of_round()
         for number in range(self.rounds):
             model, teacher = self._taught(simulator, lost, number)
@@ -553,10 +567,13 @@ class _Work:
                 f"{-100 * promised:+.2f} %, the simulator shows {100 * found.logged:+.2f} %"
                 f" from {len(trial.scores.costs)} starts; plans gain {100 * teacher.gain:.2f} %"
             )
-            lost, useful = trial.lost, found.safe and found.change < least
+            lost = trial.lost
+            useful = found.safe and found.change < least
             stalls = least < best and found.change > (1 + LITTLE) * least
             if useful:
-                weights, least, note = self.weights(), found.change, ""
+                weights = self.weights()
+                least = found.change
+                note = ""
             elif least == best:
                 note = found.reason or "no gain in the simulator"
             kept = useful and found.accepted and -found.logged >= PROMISED * teacher.gain

@@ -206,7 +206,8 @@ def verdict_of(offset: float, model_error: float, nonlinearity: float, doubt: fl
     verdict = [*ADVICE][1 + int(np.argmax(parts))]
     worth = WORTH if verdict == "learn" else LITTLE
     if sum(parts) < worth and max(offset, model_error) >= LITTLE:
-        verdict, worth = [*ADVICE][1 + int(np.argmax(parts[:2]))], LITTLE
+        verdict = [*ADVICE][1 + int(np.argmax(parts[:2]))]
+        worth = LITTLE
     if sum(parts) < worth or WORTH > sum(parts) < doubt:
         return "keep the MPC"
     return verdict if sum(parts) >= doubt else UNKNOWN
@@ -306,7 +307,10 @@ class _Search:
         max_steps: int | None,
         shown: bool,
     ) -> None:
-        self.mpc, self.seeds, self.shown, self.begun = mpc, seeds, shown, time.monotonic()
+        self.mpc = mpc
+        self.seeds = seeds
+        self.shown = shown
+        self.begun = time.monotonic()
         self.twin = given if isinstance(given, PlantTwin) else None
         if self.twin is not None:
             self.twin.require_trust()
@@ -418,10 +422,12 @@ class _Search:
 
     def plan(self) -> None:
         """Play plans: those of a twin, or of a model that learns from what was played."""
-        base, simulator = self.base, self.simulator
+        base = self.base
+        simulator = self.simulator
         unit = max(float(np.abs(base.costs).sum() / base.lengths.sum()), 1e-300)
         if self.twin is not None:
-            twin, count = self.twin, len(self.twin.dynamics.members)
+            twin = self.twin
+            count = len(self.twin.dynamics.members)
             acting = TwinPlant(twin.dynamics, [seed % count for seed in self.seeds])
             self.add("plan", simulator.play(self._planning(twin, acting, unit), self.seeds))
             self.say("plans in the twin")
@@ -432,7 +438,8 @@ class _Search:
         todo: NDArray[np.intp] = np.arange(len(base.costs))
         latest = base.costs.copy()
         for number in range(ROUNDS):
-            began, now = time.monotonic(), todo[: simulator.affordable()]
+            began = time.monotonic()
+            now = todo[: simulator.affordable()]
             if not len(now):
                 raise OutOfStepsError
             model = SimulatorModel.fit(
@@ -461,7 +468,8 @@ class _Search:
     def _planning(self, model: Any, plant: TwinPlant, unit: float) -> Planning:
         pause = PAUSE if self.simulator.row.observer is not None else 0
         task = task_of(model, unit, priced=self.twin is None)
-        steps, rows = int(self.base.lengths.max()), np.empty(0, dtype=np.intp)
+        steps = int(self.base.lengths.max())
+        rows = np.empty(0, dtype=np.intp)
         if not self.random:
             return Planning(plant, task, steps, pause)
         return Planning(plant, task, steps, pause, LEFT, lambda theta: self.law(0, theta, rows))
@@ -472,7 +480,8 @@ class _Search:
         observer, model = (_whole(self.fair.get(name), base) for name in ("observer", "model"))
         best = self.best
         total, offset, known = (gain(base, each) for each in (best, observer, model))
-        offset, known = min(offset, total), min(known, total)
+        offset = min(offset, total)
+        known = min(known, total)
         parts = offset, max(0.0, known - offset), total - max(offset, known)
         whole = Headroom(base, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
@@ -499,7 +508,9 @@ def _whole(costs: Array | None, ours: Array) -> Array:
 
 def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
     """Return an MPC with another model and operating point, as a law of the problem's theta."""
-    law, own, its = other.online(), problem.units, other.units
+    law = other.online()
+    own = problem.units
+    its = other.units
     limits = problem.deviations.u_min, problem.deviations.u_max
 
     def act(t: int, theta: Array, rows: Rows) -> Array:
@@ -515,13 +526,16 @@ class Observing:
     remembers = True
 
     def __init__(self, problem: LinearMPC, other: LinearMPC, observer: DisturbanceObserver) -> None:
-        self.problem, self.other, self.observer = problem, other, observer
+        self.problem = problem
+        self.other = other
+        self.observer = observer
         self.observers: list[DisturbanceObserver] = []
         self.u: Array = np.zeros((0, 0))
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
-        layout, bounds = self.problem.layout, self.other.deviations.disturbances
+        layout = self.problem.layout
+        bounds = self.other.deviations.disturbances
         x = theta[:, layout.state]
         if t == 0:
             self.observers = [copy.copy(self.observer) for _ in x]

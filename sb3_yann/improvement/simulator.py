@@ -64,7 +64,9 @@ class _Count:
     """Steps, of which there may be no more than so many; ``strict`` envs may not fail in one."""
 
     def __init__(self, most: float, strict: bool = True) -> None:
-        self.steps, self.most, self.strict = 0, most, strict
+        self.steps = 0
+        self.most = most
+        self.strict = strict
 
     def add(self) -> None:
         """Count a step before it is taken; OutOfStepsError where none is left."""
@@ -121,16 +123,21 @@ class Simulator:
         max_steps: int | None = None,
         observation: Callable[[Array], Array] | None = None,
     ) -> None:
-        self.problem, self.seed, self.max_steps = problem, seed, max_steps
-        self.played, self.seconds = 0, 0.0
+        self.problem = problem
+        self.seed = seed
+        self.max_steps = max_steps
+        self.played = 0
+        self.seconds = 0.0
         self.counted = _Count(np.inf if max_steps is None else max_steps)
         self.make = in_deviations(maker(env, "twin"), problem, observation)
         self.envs = pool_of(env, lambda: _Counted(self.make(), self.counted))
         with self.envs.acquire(1) as (one,):
-            self.row, self.unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
+            self.row = RowLayout(problem, observer_of(one))
+            self.unaware = below_set_points(one)
             require_spaces(problem, one)
             self.name = str(getattr(one.spec, "id", type(one.unwrapped).__name__))
-        self.new_seeds, self.longest = NewSeeds(FIRST + APART * seed), 0
+        self.new_seeds = NewSeeds(FIRST + APART * seed)
+        self.longest = 0
         self.episodes: list[Episode] = []
 
     def begin(self) -> None:
@@ -205,7 +212,8 @@ class Simulator:
         controller ``remembers``. Unless it is ``strict``, an episode in which the env fails ends
         there.
         """
-        counted, problem = self.counted, self.problem
+        counted = self.counted
+        problem = self.problem
         left = counted.most - counted.steps
         if len(seeds) > self.affordable():
             raise OutOfStepsError
@@ -241,7 +249,8 @@ class Simulator:
         found: list[Episode | None] = []
         for thetas, inputs in played.pairs:
             if not np.isfinite(thetas[-1]).all():  # where an env has failed
-                thetas, inputs = thetas[:-1], inputs[:-1]
+                thetas = thetas[:-1]
+                inputs = inputs[:-1]
             finite = np.isfinite(thetas).all() and np.isfinite(inputs).all()
             usable = len(inputs) >= SHORTEST and bool(finite)
             found.append(Episode(*self.row.recovered(thetas, inputs)) if usable else None)
@@ -255,7 +264,8 @@ class Simulator:
 
 def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
     """Raise unless an env shows theta and takes the inputs."""
-    shape, actions = env.observation_space.shape, env.action_space.shape
+    shape = env.observation_space.shape
+    actions = env.action_space.shape
     if shape != (problem.n_theta,) or actions != (problem.model.n_inputs,):
         raise ValueError(
             f"The env shows {shape} and takes {actions}; theta of the MPC has {problem.n_theta} "
@@ -291,12 +301,16 @@ class Excited:
     def __init__(
         self, problem: LinearMPC, seed: int, push: float = PUSH, often: float = OFTEN
     ) -> None:
-        self.problem, self.seed, self.law = problem, seed, of_law(problem)
-        self.push, self.often = push, often
+        self.problem = problem
+        self.seed = seed
+        self.law = of_law(problem)
+        self.push = push
+        self.often = often
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m): those of an episode do not depend on what others there are."""
-        problem, every = self.problem, (int(rows.max(initial=-1)) + 1, self.problem.model.n_inputs)
+        problem = self.problem
+        every = (int(rows.max(initial=-1)) + 1, self.problem.model.n_inputs)
         moves, times = (np.random.default_rng([self.seed, t // HELD, i]) for i in range(2))
         moved = self.push * problem.u_half * moves.uniform(-1, 1, every)
         moved *= times.random((len(moved), 1)) < self.often
@@ -315,7 +329,8 @@ def one_step_error(row: RowLayout, episodes: Sequence[Episode]) -> float:
 
     It is what the inputs that keep the problem's bounds are computed with.
     """
-    half, errors = row.problem.theta_half[row.problem.layout.state], []
+    half = row.problem.theta_half[row.problem.layout.state]
+    errors = []
     for each in episodes:
         predicted = np.hstack([each.thetas[:-1], each.actions]) @ row.linear[row.state].T
         errors.append(np.max(np.abs(each.thetas[1:, row.state] - predicted) / half, axis=1))
@@ -347,7 +362,8 @@ class SimulatorModel(LearntModel):
         """
         from scipy.spatial import cKDTree
 
-        row, units = self.dynamics.row, self.dynamics.coordinates.units
+        row = self.dynamics.row
+        units = self.dynamics.coordinates.units
         rows = np.concatenate([each.thetas[:-1] for each in self.episodes])
         inputs = np.concatenate([each.actions for each in self.episodes])
         after = np.concatenate([each.thetas[1:, row.state] for each in self.episodes])
@@ -379,7 +395,8 @@ class Disagreement:
 
     def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
         """Return gradients (T, k, n_theta + m) and Gauss-Newton curvatures of that."""
-        shape, apart = thetas.shape[:2], self._apart(thetas, inputs)
+        shape = thetas.shape[:2]
+        apart = self._apart(thetas, inputs)
         flat = (each.reshape(1, -1, each.shape[-1]) for each in (thetas, inputs))
         slopes = np.concatenate(self.dynamics.jacobians(*flat), axis=-1)
         slopes = slopes[..., self.dynamics.row.state, :]
@@ -411,7 +428,8 @@ def task_of(model: LearntModel, unit: float, priced: bool = True) -> Task:
     doubt = None
     if priced and model.dynamics.row.observer is None:
         doubt = Disagreement(model.dynamics, DOUBT * unit)
-    end, limits = value_at_end(model.problem), model.limits
+    end = value_at_end(model.problem)
+    limits = model.limits
     box = limits.low, limits.high
     return Task(model.problem, *box, end.P, WEIGHT * unit, doubt, end.slope)
 
@@ -452,7 +470,9 @@ class Scenarios:
 
         Every other one begins as its episode did, the others in the box of all first states.
         """
-        row, steps, n = model.dynamics.row, max(map(len, episodes)), model.problem.model.n_states
+        row = model.dynamics.row
+        steps = max(map(len, episodes))
+        n = model.problem.model.n_states
         thetas = row.shown(np.array([each.thetas[0] for each in episodes])).copy()
         moved = thetas[1::2, :n]
         thetas[1::2, :n] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
@@ -470,12 +490,15 @@ class Scenarios:
 
     def play(self, controller: Controller) -> Imagined:
         """Return the episodes of a controller."""
-        problem, row = self.model.problem, self.model.dynamics.row
+        problem = self.model.problem
+        row = self.model.dynamics.row
         steps, k = self.given.shape[:2]
-        rows, numbers = np.empty((steps + 1, *self.starts.shape)), np.arange(k)
+        rows = np.empty((steps + 1, *self.starts.shape))
+        numbers = np.arange(k)
         inputs = np.empty((steps, k, problem.model.n_inputs))
         rows[0] = self.starts
-        low, high = problem.deviations.u_min, problem.deviations.u_max
+        low = problem.deviations.u_min
+        high = problem.deviations.u_max
         with np.errstate(all="ignore"):
             for t in range(steps):
                 rows[t][:, row.given] = self.given[t]

@@ -42,7 +42,10 @@ class PaperYann(nn.Module):
         check_type("law", law, PiecewiseAffine, "a PiecewiseAffine, such as LinearMPC.explicit()")
         width = check_int("width", width, 0, "It counts nodes.")
         scale = check_range("scale", scale, 0, np.inf, "[)")
-        p, m, n, q = law.n_regions, law.n_inputs, law.n_theta, law.n_halfspaces
+        p = law.n_regions
+        m = law.n_inputs
+        n = law.n_theta
+        q = law.n_halfspaces
         counts = np.diff([*law.starts, q])
         owner = np.repeat(np.eye(p), counts, axis=1)  # (p, q): which region a half-space bounds
         sign = np.array([1.0, -1.0])
@@ -102,7 +105,8 @@ class PaperYann(nn.Module):
 
 def _largest(law: PiecewiseAffine) -> float:
     """Return a bound on |K theta + r| of every region over the whole box."""
-    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
+    middle = (law.theta_max + law.theta_min) / 2
+    half = (law.theta_max - law.theta_min) / 2
     at_middle = np.abs(law.gains @ middle + law.offsets)
     return float(np.max(at_middle + np.abs(law.gains) @ half))
 

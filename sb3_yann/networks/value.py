@@ -257,7 +257,8 @@ class AfterstateValue(nn.Module):
         super().__init__()
         known = 0.0 if scale is None else check_positive("scale", scale)  # 0: not known yet
         import_module("sb3_yann.networks._kernels.afterstate_value")  # see YannLayer
-        n, m = len(ranges.theta_half), len(ranges.u_min)
+        n = len(ranges.theta_half)
+        m = len(ranges.u_min)
         self.model = untrained(model) if isinstance(model, nn.Module) else model
         require_prediction(self.model, n, m)
         self.n_before_one = n if len(P) > n else 0
@@ -306,7 +307,8 @@ class AfterstateValue(nn.Module):
         """W, the model's [A B], the scale of the quadratic form, and others, for compiled code."""
         modules: Any = self._modules
         own: Any = self._buffers
-        model, quadratic = modules["model"]._buffers, modules["quadratic"]._buffers
+        model = modules["model"]._buffers
+        quadratic = modules["quadratic"]._buffers
         used = (
             own["W"], model["A"], model["B"], quadratic["root"],
             own["network_scale"], own["to_input"], own["middle"],
@@ -380,9 +382,11 @@ def _keeping_one(model: PredictionModel) -> PredictionModel:
     """Return the prediction of ``[theta, 1]``; a linear one stays one, which is compiled."""
     if not isinstance(model, LinearPrediction):
         return KeepsOne(model)
-    A, B = model.A.T.numpy(), model.B.T.numpy()
+    A = model.A.T.numpy()
+    B = model.B.T.numpy()
     one = np.zeros((len(A) + 1, len(A) + 1))
-    one[:-1, :-1], one[-1, -1] = A, 1.0
+    one[:-1, :-1] = A
+    one[-1, -1] = 1.0
     return LinearPrediction(one, np.vstack([B, np.zeros((1, B.shape[1]))]))
 
 

@@ -153,7 +153,8 @@ class LawLayer(nn.Module):
                 )
                 for at, side in zip(self.moving, (-1.0, 1.0), strict=True)
             )
-            low, high = low.clamp(*slowest), th.maximum(low, high).clamp(*slowest)
+            high = th.maximum(low, high).clamp(*slowest)
+            low = low.clamp(*slowest)
         return low.to(self.theta_half), high.to(self.theta_half)
 
     def slopes_of_law(self, theta: Array) -> Array:

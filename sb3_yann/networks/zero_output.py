@@ -86,7 +86,8 @@ class Rows:
         if self.one_hot is not None:
             own = (self.one_hot[:, :, None] * x[:, None]).flatten(1)
             return th.addmm(self.one_hot @ bias, own, weight.transpose(1, 2).flatten(0, 1))
-        weight, bias = weight.index_select(0, self.index), bias.index_select(0, self.index)
+        weight = weight.index_select(0, self.index)
+        bias = bias.index_select(0, self.index)
         # Forward and backward, a fifth of the time of einsum, which multiplies matrix by matrix.
         return (weight * x[:, None]).sum(-1) + bias
 
@@ -181,7 +182,8 @@ class ZeroOutputNetwork(nn.Module):
     def weights(self) -> tuple[nn.Parameter, ...]:
         """Return the parameters, layer by layer."""
         modules: Any = self._modules
-        first, rest = modules["first"], modules["rest"]._modules.values()
+        first = modules["first"]
+        rest = modules["rest"]._modules.values()
         try:  # from the modules' own tables: an attribute of a module takes a microsecond to find
             return (first._parameters["nodes"], *[each._parameters["weight"] for each in rest])
         except KeyError:  # made of others, by torch.nn.utils.parametrize
@@ -226,7 +228,8 @@ class ZeroOutputNetwork(nn.Module):
         *hidden, last = self.layers()
         for layer in hidden:
             matrix = layer.matrix()
-            weight, bias = matrix[..., :-1], matrix[..., -1]
+            weight = matrix[..., :-1]
+            bias = matrix[..., -1]
             x = self.activation(rows.affine(weight, bias, x)) - rows.each(
                 lambda bias, pinned: pinned * self.activation(bias), bias, self.pinned
             )

@@ -263,7 +263,8 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         sb3_kwargs |= {"activation_fn": activation_fn, "n_critics": n_critics}
         super().__init__(net_arch=[], **sb3_kwargs)
         self.gamma = gamma
-        self.scale, self.offset = float(options.reward_scale), options.offset_of_return(gamma)
+        self.scale = float(options.reward_scale)
+        self.offset = options.offset_of_return(gamma)
         self.scales_itself = options.scales_itself
         self.batch: th.Tensor | None = None  # the latest points to learn from
         common: dict[str, Any] = {
@@ -291,7 +292,8 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
 
     def _know_scale(self, points: th.Tensor) -> None:
         if self.scales_itself:
-            self.batch, first = points.detach(), cast("Any", self.q_networks[0])
+            self.batch = points.detach()
+            first = cast("Any", self.q_networks[0])
             if not first.value_scale > 0:
                 self.scale_values(self.stage_cost_of_batch())
 
@@ -400,7 +402,8 @@ def _initial_value(
     model = options.prediction_model
     if model is None:
         model = networks.LinearPrediction(*problem.prediction)
-    W, terms = problem.stage_matrix, problem.value_terms(gamma)
+    W = problem.stage_matrix
+    terms = problem.value_terms(gamma)
     P = terms.form if is_priced else terms.P
     if is_priced:
         stage = Value(W, problem.stage_slope, problem.deviations.price.constant)
@@ -417,7 +420,8 @@ def _with_one(terms: Value, n: int) -> Array:
 
 EPS = 1e-8
 """Of Adam, for gradients in units of the values' scale."""
-FOLLOWS, RECENT = 10, 0.1
+FOLLOWS = 10
+RECENT = 0.1
 """Updates after which the values' scale is checked; share of that batch in the mean cost."""
 
 
@@ -437,7 +441,8 @@ def follow_scale(
     """
     if taken % FOLLOWS:
         return
-    cost, share = critic.stage_cost_of_batch(), max(FOLLOWS / (taken + FOLLOWS), RECENT)
+    cost = critic.stage_cost_of_batch()
+    share = max(FOLLOWS / (taken + FOLLOWS), RECENT)
     mean.add_(share * (cost - mean))
     if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
         target.load_state_dict(critic.state_dict())

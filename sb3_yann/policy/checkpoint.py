@@ -125,7 +125,8 @@ class ActorCheckpoint:
         index = th.tensor(sorted(regions), dtype=th.long)
         mixed = copy.deepcopy(self)
         for name in ("actor", "target"):
-            ours, theirs = getattr(mixed, name), getattr(other, name)
+            ours = getattr(mixed, name)
+            theirs = getattr(other, name)
             for key in self.networks():
                 ours[key][index] = theirs[key][index]
         ours = mixed.optimizer["state"]
@@ -146,7 +147,8 @@ class ActorCheckpoint:
         """
         mixed = replace(copy.deepcopy(self), optimizer=copy.deepcopy(other.optimizer))
         for name in ("actor", "target"):
-            ours, theirs = getattr(mixed, name), getattr(other, name)
+            ours = getattr(mixed, name)
+            theirs = getattr(other, name)
             for key in self.networks():
                 ours[key] = th.lerp(ours[key], theirs[key], share)
         return mixed
@@ -251,7 +253,8 @@ def retarget(model: Model, mpc: LinearMPC, env: Any = None) -> Model:
     found = type(model)(**own)
     lost = _lost(model, policy)
     actor: Any = found.policy.actor
-    layer, kept = policy.actor.mu, actor.mu
+    layer = policy.actor.mu
+    kept = actor.mu
     if layer.network.is_zero():
         pass
     elif not isinstance(layer, SharedYannLayer) or not isinstance(kept, SharedYannLayer):

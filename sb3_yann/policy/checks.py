@@ -252,7 +252,9 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
     units = ActionUnits.of(problem, action_space.low, action_space.high)
     if units is not None:
         return units
-    low, high, u_ss = problem.u_min.tolist(), problem.u_max.tolist(), problem.model.u_ss
+    low = problem.u_min.tolist()
+    high = problem.u_max.tolist()
+    u_ss = problem.model.u_ss
     advice = (
         "They must be the same: build the LinearMPC with the bounds of the env, or rescale actions "
         "to [-1, 1] in all entries; retarget(model, mpc, env=) takes an env of the new bounds."
@@ -280,7 +282,8 @@ def require_theta(
     observation: AffineObservation | None,
 ) -> None:
     """Raise unless theta is what is observed, or what ``observation`` makes of it."""
-    shape, names = observation_space.shape, ", ".join(problem.labels())
+    shape = observation_space.shape
+    names = ", ".join(problem.labels())
     takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
     states_alone = shape == (problem.model.n_states,) != (problem.n_theta,)
     if states_alone and (observation is None or observation.n_obs == problem.n_theta):
@@ -358,7 +361,8 @@ FREE = {"confines", "margin", "value_scale"}
 """Buffers of theirs that follow from what was learnt."""
 OF_ORDER_ONE = {"offsets", "resting", "half_space_b", "change"}
 """Those that are in units of a range: zeros among them are not exact."""
-ROUNDING, SMALLEST = 1e-6, 1e-9
+ROUNDING = 1e-6
+SMALLEST = 1e-9
 """A law that another machine has solved differs by less, of each number and of the largest."""
 
 
@@ -392,7 +396,8 @@ def _difference(part: nn.Module, prefix: str, state: Mapping[str, Any], strict: 
     if strict and (unknown := sorted(given - own.keys())):
         return f"there is {prefix}{unknown[0]}, which this policy does not have"
     for name in sorted(own.keys() & given):
-        value, wanted = state[f"{prefix}{name}"], own[name]
+        value = state[f"{prefix}{name}"]
+        wanted = own[name]
         if value.shape != wanted.shape:
             return f"{prefix}{name} has shape {tuple(value.shape)}, expected {tuple(wanted.shape)}"
         if not th.equal(value.to(wanted), wanted) and not _agree(part, name, value, wanted):
@@ -404,7 +409,8 @@ def _agree(part: nn.Module, name: str, value: th.Tensor, wanted: th.Tensor) -> b
     """Return whether numbers are the same but for the rounding of another machine."""
     if isinstance(part, SharedYannLayer) and name == "samples":
         return part.answers_as(value, ROUNDING)
-    ours, theirs = wanted.double().cpu(), value.double().cpu()
+    ours = wanted.double().cpu()
+    theirs = value.double().cpu()
     size = _largest(ours)
     if name in OF_ORDER_ONE:
         size = max(size, 1.0)

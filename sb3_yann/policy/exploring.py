@@ -21,7 +21,8 @@ from sb3_yann.policy.actor_critic import YannActor, YannCritic
 from sb3_yann.policy.policies import NOT_OURS, StartsAsMPC
 from sb3_yann.policy.sb3_hooks import restore_learning_rate, single_precision
 
-SMALLEST, LARGEST = math.log(1e-4), math.log(2.0)
+SMALLEST = math.log(1e-4)
+LARGEST = math.log(2.0)
 """Bounds of the logarithm of a standard deviation, of actions in [-1, 1]."""
 EDGE = 1e-12
 """A quantile stays so far from 0 and 1, where the normal distribution's inverse is not finite."""
@@ -42,7 +43,8 @@ class TruncatedNormal:
         # Float64: the tails of float32 end at five standard deviations.
         self.m = center.double()
         self.std = log_std.double().clamp(SMALLEST, LARGEST).exp()
-        self.low, self.high = (-1 - self.m) / self.std, (1 - self.m) / self.std
+        self.low = (-1 - self.m) / self.std
+        self.high = (1 - self.m) / self.std
         self.below = th.special.ndtr(self.low)
         self.mass = th.special.ndtr(self.high) - self.below
 
@@ -230,7 +232,8 @@ class OptimizerGroup:
     """One group of an optimizer's parameters, kept and restored as an optimizer of its own."""
 
     def __init__(self, optimizer: th.optim.Optimizer, index: int) -> None:
-        self.optimizer, self.index = optimizer, index
+        self.optimizer = optimizer
+        self.index = index
 
     @property
     def param_groups(self) -> list[dict[str, Any]]:
@@ -360,7 +363,8 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Return values, the logarithm of the actions' density, and the entropy."""
         self.critic.know_scale(obs, actions)
-        distribution, values = self.get_distribution(obs), self.predict_values(obs)
+        distribution = self.get_distribution(obs)
+        values = self.predict_values(obs)
         if values.requires_grad:
             # The error of values in their own unit: one gradient of both networks is clipped, and
             # in units of rewards the critic's would leave nothing of the actor's.

@@ -128,7 +128,8 @@ class AffineObservation(ReadOnlyArrays):
 
         It comes last in SB3's `VecFrameStack` and in gymnasium's `FrameStackObservation`.
         """
-        frames, size = check_int("frames", frames), check_int("size", size)
+        frames = check_int("frames", frames)
+        size = check_int("size", size)
         return cls.pick(range((frames - 1) * size, frames * size), frames * size)
 
     @classmethod
@@ -232,7 +233,8 @@ def with_extra_shown(
             f"theta is made of {theta.n_obs} others. See extra= and observation=."
         )
     rest = np.setdiff1d(np.arange(found.n_theta), found.extra[-extra:])
-    matrix, offset = np.zeros((found.n_theta, len(low))), np.zeros(found.n_theta)
+    matrix = np.zeros((found.n_theta, len(low)))
+    offset = np.zeros(found.n_theta)
     matrix[rest, :size] = theta.matrix
     offset[rest] = theta.offset
     matrix[found.extra[-extra:], size:] = np.eye(extra)
@@ -294,7 +296,8 @@ def require_outermost(normalize: VecNormalize, seen: tuple[int, ...] | None) -> 
 
 def _rows(name: str, entries: Sequence[int], size: int) -> Array:
     """Return the rows (k, size) of the identity that pick so many entries of an observation."""
-    size, found = check_int("size", size), [*entries] if isinstance(entries, Iterable) else [None]
+    size = check_int("size", size)
+    found = [*entries] if isinstance(entries, Iterable) else [None]
     whole = all(isinstance(each, int | np.integer) for each in found)
     if not whole or not all(0 <= each < size for each in found):
         given = found if isinstance(entries, Iterable) else entries

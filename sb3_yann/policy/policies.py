@@ -145,7 +145,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             priced = self.problem.price.counts  # it does not rest at the operating point
             pin_equilibrium = not (layout.has_constants or layout.bounds or priced)
         self.pin_equilibrium = check_bool("pin_equilibrium", pin_equilibrium)
-        self.law, self.networks = check_choice("law", law, LAWS), networks
+        self.law = check_choice("law", law, LAWS)
+        self.networks = networks
         shared = layer_for(self.problem.law(law), networks) is SharedYannLayer
         if keep_bounds is None:
             keep_bounds = self.problem.has_hard_bounds and self.problem.infeasible != "zero_input"
@@ -233,7 +234,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         if self.batch_is_finite:
             if self.critic_options.scales_itself and self.lr_mult["critic"] > 0:
                 networks = self.actor, self.critic, self.critic_target
-                taken, eps = int(self.critic_updates), self.optimizer_kwargs.get("eps", EPS)
+                taken = int(self.critic_updates)
+                eps = self.optimizer_kwargs.get("eps", EPS)
                 follow_scale(*networks, self.mean_stage_cost, taken, eps)
             self.critic_updates.add_(1)
         sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
@@ -307,7 +309,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
         """Return a critic that is the law's value on the linear model, with networks of zero."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        options, pinned = self.critic_options, self.pin_equilibrium
+        options = self.critic_options
+        pinned = self.pin_equilibrium
         with single_precision():
             critic = self.CRITIC(self.problem, self.gamma, options, pinned, **kwargs)
         return critic.to(self.device)

@@ -121,7 +121,9 @@ class FiniteRows:
         assert buffer is not None  # whoever calls has it
         self.rows += 1
         if self.keeps_place:
-            buffer.pos, buffer.full, self.keeps_place = 0, False, False
+            buffer.pos = 0
+            buffer.full = False
+            self.keeps_place = False
         parts = (obs, next_obs, action, reward)
         total = sum(float(np.vdot(part, part)) for part in parts)
         sure = 1e36  # sums of squares up to this are of entries that are finite in float32

@@ -146,7 +146,9 @@ def _subject(
 def _body(title: str, parts: Sequence[Part]) -> list[Html]:
     """Return heading, summary, contents, the parts themselves, and a table for signatures."""
     written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    rows, links, sections = [], [], []
+    rows = []
+    links = []
+    sections = []
     counts = Counter[str]()
     for k, part in enumerate(parts, start=1):
         links.append(tag("li", tag("a", part.title, href=f"#part-{k}")))

@@ -59,20 +59,25 @@ ROUNDING = 1e-6  # a relative difference of costs, or one in half-widths of inpu
 
 def loops_part(subject: Subject) -> Part:
     """Return the closed loops against the MPC: costs, and a picture in plant units."""
-    title, loops = "Closed loops against the MPC", subject.loops
+    title = "Closed loops against the MPC"
+    loops = subject.loops
     if loops is None:
         return left_out(title, NO_ENV)
-    mpc, policy = loops[MPC], loops[POLICY]
+    mpc = loops[MPC]
+    policy = loops[POLICY]
     rows = []
     for name, of in (("mean", np.mean), ("median", np.median), ("worst", np.max)):
-        old, new = float(of(mpc.costs)), float(of(policy.costs))
+        old = float(of(mpc.costs))
+        new = float(of(policy.costs))
         rows.append([f"{name} cost", f"{old:.6g}", f"{new:.6g}", _change(old, new)])
     for name, before, after in (
         ("steps that violate a limit", mpc.violations.sum(), policy.violations.sum()),
         ("episodes that the env terminates", mpc.terminated.sum(), policy.terminated.sum()),
     ):
         rows.append([name, str(before), str(after), f"{after - before:+d}"])
-    first, last, count = subject.seeds[0], subject.seeds[-1], len(subject.seeds)
+    first = subject.seeds[0]
+    last = subject.seeds[-1]
+    count = len(subject.seeds)
     is_range = count > 2 and subject.seeds == (*range(first, first + count),)
     seeds = f"{first} to {last}" if is_range else ", ".join(map(str, subject.seeds))
     how = (
@@ -137,14 +142,17 @@ def statistics_part(subject: Subject) -> Part:
     title = "Statistics in words"
     if subject.loops is None:
         return left_out(title, NO_ENV)
-    mpc, policy = subject.loops[MPC], subject.loops[POLICY]
-    change, count = policy.costs - mpc.costs, len(policy.costs)
+    mpc = subject.loops[MPC]
+    policy = subject.loops[POLICY]
+    change = policy.costs - mpc.costs
+    count = len(policy.costs)
     if not np.all(np.isfinite(change)):
         text = "Some costs are not finite: no average says anything."
         return Part(title, paragraph(text), (make_finding(False, text),))
     mean, finding = _mean_in_words(change, float(np.mean(mpc.costs)))
     rounding = ROUNDING * np.abs(mpc.costs)
-    less, more = int(np.sum(change < -rounding)), int(np.sum(change > rounding))
+    less = int(np.sum(change < -rounding))
+    more = int(np.sum(change > rounding))
     worst = int(np.argmax(np.where(change > rounding, change, 0.0)))
     largest = f"{change[worst]:.4g}, from seed {subject.seeds[worst]}" if more else "0"
     # The upper limit of Clopper and Pearson: how often a violation may still happen.
@@ -164,7 +172,9 @@ def statistics_part(subject: Subject) -> Part:
 
 def _mean_in_words(change: Array, typical: float) -> tuple[str, Finding]:
     """Return what the mean difference and its t interval say."""
-    mean, count, scale = float(change.mean()), len(change), abs(typical) or 1.0
+    mean = float(change.mean())
+    count = len(change)
+    scale = abs(typical) or 1.0
     if np.all(np.abs(change) <= ROUNDING * scale):
         text = "From these starts the policy costs what the MPC costs."
         return text, Finding("note", text)
@@ -173,7 +183,8 @@ def _mean_in_words(change: Array, typical: float) -> tuple[str, Finding]:
     if count < 2:
         return f"{text}. One episode says nothing about others.", Finding("note", f"{text}.")
     width = float(stats.t.ppf(0.975, count - 1) * change.std(ddof=1) / count**0.5)
-    low, high = 100 * (mean - width) / scale, 100 * (mean + width) / scale
+    low = 100 * (mean - width) / scale
+    high = 100 * (mean + width) / scale
     text += f"; the change lies between {low:+.2f} and {high:+.2f} % with a confidence of 95 %."
     passed = True if high < 0 else False if low > 0 else None
     if passed is None:
@@ -187,7 +198,9 @@ def _mean_in_words(change: Array, typical: float) -> tuple[str, Finding]:
 
 def distance_part(subject: Subject) -> Part:
     """Return where, and how far, the policy leaves the MPC."""
-    problem, policy, theta = subject.problem, subject.policy, subject.samples
+    problem = subject.problem
+    policy = subject.policy
+    theta = subject.samples
     points = {"random points of the box": theta}
     if subject.loops is not None:
         visited = [x[:-1] for x in subject.loops[POLICY].observations]
@@ -196,10 +209,12 @@ def distance_part(subject: Subject) -> Part:
     for where, of in points.items():
         apart = _distance(subject, of)
         for k, name in enumerate(with_units(problem.model)[1]):
-            own, share = apart[:, k], 50 * apart[:, k].max() / problem.u_half[k]
+            own = apart[:, k]
+            share = 50 * apart[:, k].max() / problem.u_half[k]
             values = own.mean(), np.percentile(own, 95), own.max()
             rows.append([name, where, *map(number, values), f"{share:.2f}"])
-    bound, networks = policy.max_correction, policy.actor.mu.n_networks
+    bound = policy.max_correction
+    networks = policy.actor.mu.n_networks
     adds = "networks add" if networks > 1 else "network adds"
     most = "What it may add is bounded by the range of the inputs alone."
     if bound is not None:
@@ -230,11 +245,13 @@ def distance_part(subject: Subject) -> Part:
         _farthest(subject),
         *_pictures(subject),
     ]
-    u, rounding = inputs_of(problem, policy, theta), ROUNDING * problem.u_half
+    u = inputs_of(problem, policy, theta)
+    rounding = ROUNDING * problem.u_half
     low, high = problem.deviations.input_range(theta)
     # Where the MPC has no solution, bounds that change may give way: no further than with it.
     law = subject.law(theta)
-    low, high = np.minimum(low, law) - rounding, np.maximum(high, law) + rounding
+    low = np.minimum(low, law) - rounding
+    high = np.maximum(high, law) + rounding
     inside = bool(np.all((u >= low) & (u <= high)))
     text = "Inputs leave their bounds at random points of the box of parameters."
     if inside:
@@ -254,7 +271,8 @@ def _distance(subject: Subject, theta: Array) -> Array:
 
 def _farthest(subject: Subject) -> Html:
     """Return at which random point the policy is farthest from the MPC."""
-    problem, theta = subject.problem, subject.samples
+    problem = subject.problem
+    theta = subject.samples
     apart = (_distance(subject, theta) / problem.u_half).max(axis=1)
     if apart.max() < ROUNDING:
         return paragraph(
@@ -272,7 +290,10 @@ def _farthest(subject: Subject) -> Html:
 
 def _pictures(subject: Subject) -> list[Html]:
     """Return the regions that are used, and the surface before and after."""
-    problem, policy, loops, found = subject.problem, subject.policy, subject.loops, []
+    problem = subject.problem
+    policy = subject.policy
+    loops = subject.loops
+    found = []
     if subject.has_regions and loops is not None:
         caption = (
             "The regions that the policy's closed loops visit, and how far it is from the MPC in "
@@ -285,13 +306,15 @@ def _pictures(subject: Subject) -> list[Html]:
         return found
     plane = subject.steepest_plane
     entries = [*plane]
-    low, high = problem.theta_min[entries], problem.theta_max[entries]
+    low = problem.theta_min[entries]
+    high = problem.theta_max[entries]
     if loops is not None:
         shown = subject.shown_loops[POLICY].observations
         visited = np.concatenate([x[:, entries] for x in shown])
         visited = visited[np.isfinite(visited).all(axis=1)]
         room = 0.05 * np.ptp(visited, axis=0)
-        low, high = visited.min(axis=0) - room, visited.max(axis=0) + room
+        low = visited.min(axis=0) - room
+        high = visited.max(axis=0) + room
     if not np.all(np.isfinite([low, high])) or np.any(low >= high):
         return found
     names = " and ".join(problem.labels()[k] for k in plane)
@@ -308,7 +331,8 @@ def _pictures(subject: Subject) -> list[Html]:
 
 def guard_part(subject: Subject) -> Part:
     """Return every decision of the guard with its reason, and whether its policy is this one."""
-    title, state = "Decisions of the guard", subject.state
+    title = "Decisions of the guard"
+    state = subject.state
     if state is None:
         why = (
             "No guard was at work on this model: nothing has confirmed the policy on new starts. "
@@ -373,10 +397,12 @@ def _decisions(decisions: Sequence[Decision]) -> list[Html]:
 
 def improve_part(subject: Subject) -> Part:
     """Return what `improve` did, in what, with how many episodes, and whose the policy is."""
-    title, found = "What improve did", subject.improvements
+    title = "What improve did"
+    found = subject.improvements
     if not found:
         return left_out(title, "improve was not at work on this model.")
-    now, state = subject.improved, subject.state
+    now = subject.improved
+    state = subject.state
     if now is not None:
         place = f"{now.where} ({now.episodes} episodes, {100 * now.change:+.2f} %)"
         text = f"The policy is the one that improve accepted last, in {place}."
@@ -415,7 +441,8 @@ def improve_part(subject: Subject) -> Part:
 
 def twin_part(subject: Subject) -> Part:
     """Return the twin's report and evidence."""
-    twin, title = subject.twin, "The twin and its verdict"
+    twin = subject.twin
+    title = "The twin and its verdict"
     if twin is None:
         return left_out(title, "No twin was given: pass report(model, twin=...) to show it.")
     text = "The twin is trusted." if twin.trusted else "The twin is NOT trusted."
@@ -430,7 +457,8 @@ def twin_part(subject: Subject) -> Part:
 
 def headroom_part(subject: Subject) -> Part:
     """Return the headroom: how much could be gained over the MPC, and of which kind."""
-    found, title = subject.headroom, "Headroom"
+    found = subject.headroom
+    title = "Headroom"
     if found is None:
         why = "No headroom was given: pass report(model, headroom=headroom(mpc, env)) to show it."
         return left_out(title, why)
@@ -446,8 +474,11 @@ def headroom_part(subject: Subject) -> Part:
 
 def cost_part(subject: Subject) -> Part:
     """Return how long a call takes on this machine, and how large things are."""
-    policy, law, calls = subject.policy, subject.law, 200
-    space, theta = policy.observation_space, subject.problem.theta_rest
+    policy = subject.policy
+    law = subject.law
+    calls = 200
+    space = policy.observation_space
+    theta = subject.problem.theta_rest
     observation = np.zeros(space.shape or (1,), space.dtype)
 
     def times(call: Callable[[], Any]) -> tuple[str, str]:
@@ -488,7 +519,8 @@ def cost_part(subject: Subject) -> Part:
 
 def again_part(subject: Subject) -> Part:
     """Return versions, seeds, settings and fingerprints."""
-    model, problem = subject.model, subject.problem
+    model = subject.model
+    problem = subject.problem
     versions = [["Python", platform.python_version()]]
     for library in (
         "sb3-yann", "stable-baselines3", "torch", "gymnasium", "numpy", "scipy", "numba", "daqp",
@@ -513,7 +545,8 @@ def again_part(subject: Subject) -> Part:
         elif callable(value):
             text = getattr(value, "__name__", type(value).__name__)
         settings.append([name, text])
-    program, digest = problem.condensed(), hashlib.sha256()
+    program = problem.condensed()
+    digest = hashlib.sha256()
     arrays = [program.H, program.F, program.c, program.G, program.w, program.S]
     arrays += [] if program.feedback is None else [program.feedback]
     arrays += [problem.deviations.theta_min, problem.deviations.theta_max, problem.theta_ss]

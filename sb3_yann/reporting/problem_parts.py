@@ -37,7 +37,8 @@ from sb3_yann.rollout import Trajectories
 
 def plant_part(subject: Subject) -> Part:
     """Return the plant and the problem, in plant units."""
-    problem, model = subject.problem, subject.problem.model
+    problem = subject.problem
+    model = subject.problem.model
     states, inputs = with_units(model)
     point = [[name, "state", number(x)] for name, x in zip(states, model.x_ss, strict=True)]
     point += [[name, "input", number(u)] for name, u in zip(inputs, model.u_ss, strict=True)]
@@ -90,7 +91,8 @@ def _matrix(M: Array) -> str:
 
 def constraints_part(subject: Subject) -> Part:
     """Return the register of all constraints: bounds, where they act, and what the loops show."""
-    problem, loops = subject.problem, subject.loops or {}
+    problem = subject.problem
+    loops = subject.loops or {}
     plans = [ActiveConstraints(problem).at(theta) for theta in subject.samples]
     solvable = [plan for plan in plans if plan is not None]
     acting = Counter(
@@ -105,7 +107,8 @@ def constraints_part(subject: Subject) -> Part:
         row = [name, number(low), number(high), kind, f"{share:.1f} %"]
         rounding = 1e-6 * (high - low if np.isfinite(high - low) else 1.0)
         for episodes in subject.shown_loops.values():
-            parts, beyond = [np.zeros(0)], 0
+            parts = [np.zeros(0)]
+            beyond = 0
             for x, u in _pairs(episodes):
                 values = series(x, u)
                 below, above = problem.limits_at(of, x[: len(values)])  # at run time
@@ -129,7 +132,8 @@ def constraints_part(subject: Subject) -> Part:
 
 def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple[Finding, ...]:
     """Return whether the policy exceeds bounds of the problem by more than the MPC does."""
-    mpc, policy = loops[MPC].excess, loops[POLICY].excess
+    mpc = loops[MPC].excess
+    policy = loops[POLICY].excess
     assert mpc is not None and policy is not None
     is_worse = bool(
         np.any(less_safe(unsafe_columns(0, 0, 0, policy), unsafe_columns(0, 0, 0, mpc)))
@@ -183,9 +187,12 @@ def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, tuple[str, int], str
 
     All of it is in plant units.
     """
-    model, C = problem.model, problem.outputs.C
-    labels, names = with_units(model), labels_of(model)
-    outputs, previous = [f"y[{i}]" for i in range(len(C))], problem.layout.previous
+    model = problem.model
+    C = problem.outputs.C
+    labels = with_units(model)
+    names = labels_of(model)
+    outputs = [f"y[{i}]" for i in range(len(C))]
+    previous = problem.layout.previous
     hard = np.zeros(model.n_inputs, bool)
     groups: list[tuple[Any, ...]] = [
         (labels[1], names[1], "u", hard, lambda x, u: u),
@@ -274,9 +281,14 @@ def _error_of_law(subject: Subject) -> tuple[int, float, int]:
 
     Points within rounding of the border, solvable for one and not for the other, do not count.
     """
-    problem, law, theta_half = subject.problem, subject.law, subject.problem.theta_half
-    program, errors, doubtful = ActiveConstraints(problem).units, [0.0], 0
-    inputs, inside = law(subject.samples), law.in_domain(subject.samples)
+    problem = subject.problem
+    law = subject.law
+    theta_half = subject.problem.theta_half
+    program = ActiveConstraints(problem).units
+    errors = [0.0]
+    doubtful = 0
+    inputs = law(subject.samples)
+    inside = law.in_domain(subject.samples)
     for theta, u, is_inside in zip(subject.samples, inputs, inside, strict=True):
         U = program.scaled.solve((theta - program.center) / program.half)
         if (U is not None) != is_inside:
@@ -290,7 +302,8 @@ def _error_of_law(subject: Subject) -> tuple[int, float, int]:
 
 def _error_inside_policy(subject: Subject) -> float:
     """Return the error of the law inside the policy, in half-widths of the input range."""
-    problem, policy = subject.problem, subject.policy
+    problem = subject.problem
+    policy = subject.policy
     with th.no_grad():
         own = policy.actor.mu.law(th.as_tensor(subject.samples, device=policy.device)).double()
     middle = (problem.deviations.u_max + problem.deviations.u_min) / 2

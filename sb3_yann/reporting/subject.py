@@ -172,10 +172,12 @@ def picture(draw: Callable[[], Axes | Figure], caption: str) -> Html:
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
         drawn: Any = draw()
         figure = getattr(drawn, "figure", None) or drawn  # of Axes, else itself
-        kind, buffer = "svg+xml", BytesIO()
+        kind = "svg+xml"
+        buffer = BytesIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
         if len(buffer.getvalue()) > 120_000:
-            kind, buffer = "png", BytesIO()
+            kind = "png"
+            buffer = BytesIO()
             figure.savefig(buffer, format="png", dpi=110)
     source = f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
     shown = Html(f'<img alt="{escape(caption)}" src="{source}">')
@@ -187,7 +189,8 @@ def page(title: str, body: Iterable[Any]) -> str:
     return PAGE.substitute(title=clean(title), style=STYLE, body=join(body))
 
 
-POLICY, MPC = "policy", "MPC"
+POLICY = "policy"
+MPC = "MPC"
 
 
 @dataclass(frozen=True)
@@ -325,7 +328,8 @@ class Subject:
     @cached_property
     def samples(self) -> Array:
         """500 points drawn uniformly from the box of theta (500, n_theta), with a seed of 0."""
-        rng, bounds = np.random.default_rng(0), self.problem.deviations
+        rng = np.random.default_rng(0)
+        bounds = self.problem.deviations
         middle = (bounds.theta_min + bounds.theta_max) / 2
         half = (bounds.theta_max - bounds.theta_min) / 2
         middle, half = np.where(np.isfinite(half), [middle, half], [[0.0], [1.0]])

@@ -36,7 +36,8 @@ SLOPE_TOLERANCE = 0.1
 """How far from one the slope of an input on the law may be: sensors' noise lowers it."""
 LEAST_GAIN = 0.6
 """A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
-RUN, MUCH_BETTER = 10, 0.8
+RUN = 10
+MUCH_BETTER = 0.8
 """Steps of a run of the model; share of its squared error that a unit's factor leaves at most."""
 ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
 MOVING = 1e-3  # of a standard deviation: a state that moves by more in a step moves
@@ -113,7 +114,9 @@ class _OnLaw:
 
 def _rows(log: _Log, shift: int = 0) -> tuple[Array, Array]:
     """Return rows of theta (N, n_theta), ``shift`` away from the inputs (N, m) beside them."""
-    layout, thetas, inputs = log.problem.layout, [], []
+    layout = log.problem.layout
+    thetas = []
+    inputs = []
     for each in log.episodes:
         k = np.arange(1, len(each) - 1)
         theta = log.coordinates.row.shown(each.thetas)[k + shift].copy()
@@ -135,7 +138,9 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
         theta[:, state] = theta[:, state] @ change[0].T + change[1]
     answer = law_of(log.problem)(theta)
     known = np.isfinite(answer).all(axis=1)
-    theta, u, answer = theta[known], u[known], answer[known]
+    theta = theta[known]
+    u = u[known]
+    answer = answer[known]
     slope, offset, deviation, room = np.zeros((4, m, m))
     error, left, left_of_rows = np.ones((3, m, m))
     unique = np.zeros(m, dtype=bool)
@@ -143,7 +148,9 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
     for i in range(m):
         inside = np.minimum(answer[:, i] - own.u_min[i], own.u_max[i] - answer[:, i])
         inside = inside > 1e-3 * log.problem.u_half[i]
-        y, a, x = u[inside], answer[inside, i], theta[inside]
+        y = u[inside]
+        a = answer[inside, i]
+        x = theta[inside]
         if len(a) < LEAST_ROWS or np.std(a) < 1e-6 * log.problem.u_half[i]:
             continue
         x = x[:, np.std(x, axis=0) > 1e-9 * log.problem.theta_half]
@@ -151,7 +158,8 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
         rows = np.column_stack([F, (x - x.mean(axis=0)) / np.std(x, axis=0)])
         spread = np.maximum(np.var(y, axis=0), 1e-12 * log.problem.u_half**2)
         found = np.linalg.lstsq(F, y, rcond=None)[0]
-        slope[i], offset[i] = found[0], found[1] - found[0] * a.mean()
+        slope[i] = found[0]
+        offset[i] = found[1] - found[0] * a.mean()
         left[i] = np.mean((y - F @ found) ** 2, axis=0) / spread
         rest = y - rows @ np.linalg.lstsq(rows, y, rcond=1e-9)[0]
         # An F test: p columns that say nothing explain p of N rows.
@@ -178,7 +186,8 @@ def _against_law(
     log: _Log, readings: dict[int, _OnLaw], proven: NDArray[np.bool_]
 ) -> Iterator[str]:
     """Yield where an input is the law's of other rows or columns, or in other units."""
-    logged, names = readings[0], labels_of(log.problem.model)[1]
+    logged = readings[0]
+    names = labels_of(log.problem.model)[1]
     for j in np.flatnonzero(~proven):
         own = logged.left[j, j]
         found = [
@@ -191,7 +200,8 @@ def _against_law(
         if not found:
             continue
         _, s, i = min(found)
-        slope, offset = readings[s].slope[i, j], readings[s].offset[i, j]
+        slope = readings[s].slope[i, j]
+        offset = readings[s].offset[i, j]
         cures = ["move the inputs by a row"] if s else []
         cures += ["exchange the columns"] if i != j else []
         cures += ["change the sign"] if slope < 0 else []
@@ -222,7 +232,8 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
 
     Then the law gives the inputs from the states so changed, or the given model predicts them.
     """
-    row, n = log.coordinates.row, log.problem.model.n_states
+    row = log.coordinates.row
+    n = log.problem.model.n_states
     names = labels_of(log.problem.model)[0]
     x = np.concatenate([each.thetas[:-1] for each in log.episodes])
     u = np.concatenate([each.actions for each in log.episodes])
@@ -260,10 +271,13 @@ def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
     if np.all(proven):
         return
     names = labels_of(log.problem.model)[0]
-    n, unit, law = log.problem.model.n_states, log.coordinates.units, law_of(log.problem)
+    n = log.problem.model.n_states
+    unit = log.coordinates.units
+    law = law_of(log.problem)
     theta, u = _rows(log)
     some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
-    theta, u = theta[some], u[some]
+    theta = theta[some]
+    u = u[some]
     scale = np.maximum(np.std(u, axis=0), 1e-6 * log.problem.u_half)
 
     for i in range(n):
@@ -279,8 +293,10 @@ def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
         moved = abs(np.log(max(abs(factor), 1e-9))) > 2 * SLOPE_TOLERANCE or abs(zero) > 0.2
         if not moved or not np.mean(fit.fun**2) < 0.5 * before:
             continue
-        change, shift = np.eye(n), np.zeros(n)
-        change[i, i], shift[i] = factor, zero * unit[i]
+        change = np.eye(n)
+        shift = np.zeros(n)
+        change[i, i] = factor
+        shift[i] = zero * unit[i]
         on = _on_law(log, 0, (change, shift))
         if np.any(np.diagonal(_is_one(on) & on.alone) & ~proven):
             yield (
@@ -294,15 +310,20 @@ def _other_pace(log: _Log) -> Iterator[str]:
 
     The gains are left open, and the zeros: a plant may have others.
     """
-    row, model, unit = log.coordinates.row, log.problem.model, log.coordinates.units
+    row = log.coordinates.row
+    model = log.problem.model
+    unit = log.coordinates.units
     z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes])
     after = np.concatenate([e.thetas[1:, row.state] for e in log.episodes])
-    x, n, m = z[:, : model.n_states], model.n_states, model.n_inputs
+    x = z[:, : model.n_states]
+    n = model.n_states
+    m = model.n_inputs
     power: Array = np.eye(n)
     driven: Array = np.zeros((n, m))
     left = []
     for _ in PACES:
-        driven, power = driven + power @ model.B, model.A @ power
+        driven = driven + power @ model.B
+        power = model.A @ power
         rest = (after - x @ power.T) / unit
         rest -= rest.mean(axis=0)
         u = (z[:, -m:] - z[:, -m:].mean(axis=0))[:, None] * (driven / unit[:, None])
@@ -322,10 +343,14 @@ def _held(log: _Log) -> NDArray[np.bool_]:
 
     No law of the states makes them.
     """
-    problem, units, state = log.problem.deviations, log.coordinates.units, log.coordinates.row.state
-    held, moves = [], []
+    problem = log.problem.deviations
+    units = log.coordinates.units
+    state = log.coordinates.row.state
+    held = []
+    moves = []
     for each in log.episodes:
-        u, x = each.actions, each.thetas[:-1, state]
+        u = each.actions
+        x = each.thetas[:-1, state]
         still = np.abs(np.diff(u, axis=0)) <= ROUNDING * problem.u_half
         held.append(still & (u[1:] > problem.u_min) & (u[1:] < problem.u_max))
         moves.append(np.any(np.abs(np.diff(x, axis=0)) > MOVING * units, axis=1))
@@ -335,7 +360,9 @@ def _held(log: _Log) -> NDArray[np.bool_]:
 
 def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where inputs that the law does not prove act otherwise than the model says."""
-    fit, B, unit = _Effects.of(log, 0), log.problem.model.B, log.coordinates.units
+    fit = _Effects.of(log, 0)
+    B = log.problem.model.B
+    unit = log.coordinates.units
     if fit is None:
         return
     sizes = np.maximum(np.sum((B / unit[:, None]) ** 2, axis=0), 1e-300)
@@ -364,8 +391,10 @@ def _against_gains(
     log: _Log, fit: _Effects, weights: Array, proven: NDArray[np.bool_]
 ) -> Iterator[str]:
     """Yield where inputs act as others of B do, against its signs, or far otherwise."""
-    names, own = labels_of(log.problem.model)[1], np.arange(len(weights))
-    B, unit = log.problem.model.B, log.coordinates.units[:, None]
+    names = labels_of(log.problem.model)[1]
+    own = np.arange(len(weights))
+    B = log.problem.model.B
+    unit = log.coordinates.units[:, None]
     norms = np.outer(np.linalg.norm(fit.B / unit, axis=0), np.linalg.norm(B / unit, axis=0))
     apart = 1 - ((fit.B / unit).T @ (B / unit) / np.maximum(norms, 1e-300)) ** 2
     columns = linear_sum_assignment(apart)[1]
@@ -400,7 +429,8 @@ def _against_gains(
 
 def _error_of_runs(log: _Log, j: int, gain: float) -> float:
     """Return how far runs of the given model vary from the log, with input j times a gain."""
-    row, errors = log.coordinates.row, []
+    row = log.coordinates.row
+    errors = []
     linear = row.linear.copy()
     linear[:, row.size + j] *= gain
     for each in log.episodes:
@@ -419,7 +449,8 @@ def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
     """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
     if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
         return
-    A, names = log.problem.model.A, labels_of(log.problem.model)[0]
+    A = log.problem.model.A
+    names = labels_of(log.problem.model)[0]
     rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
     x_ss = log.problem.model.x_ss
     shown = log.problem.units.to_plant(rest)
@@ -458,12 +489,14 @@ class _Effects:
 
         Squares of the states count where rows are enough.
         """
-        row, m = log.coordinates.row, log.problem.model.n_inputs
+        row = log.coordinates.row
+        m = log.problem.model.n_inputs
         steps = [(e, np.arange(1, len(e) - 1)) for e in log.episodes]
         z = np.concatenate([row.features(e.thetas[k], e.actions[k + shift]) for e, k in steps])
         z = z / log.coordinates.scale
         y = np.concatenate([e.thetas[k + 1, row.state] for e, k in steps])
-        x, u = z[:, :-m], z[:, -m:]
+        x = z[:, :-m]
+        u = z[:, -m:]
         first, second = np.triu_indices(x.shape[1])
         curved = np.hstack([x, x[:, first] * x[:, second]])
         states = curved if len(z) > 5 * (curved.shape[1] + m + 1) else x

@@ -121,7 +121,8 @@ class Coordinates:
         row = RowLayout(problem, observer)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in episodes])
         half = row.half
-        low, high = seen.min(0), seen.max(0)
+        low = seen.min(0)
+        high = seen.max(0)
         width = np.maximum(high - low, 1e-6 * half)
         scale = np.maximum(np.abs(seen).max(0), 1e-3 * half)
         units = np.maximum(np.std(seen, axis=0), 1e-6 * half)[: problem.model.n_states]
@@ -136,7 +137,9 @@ class Coordinates:
 
     def regression(self, episode: Episode) -> tuple[Array, Array]:
         """Return z (T, k), and what the linear model leaves of the next states (T, n)."""
-        row, rows, u = self.row, episode.thetas, episode.actions
+        row = self.row
+        rows = episode.thetas
+        u = episode.actions
         linear = np.concatenate([rows[:-1], u], axis=1) @ row.linear[row.state].T
         after = self.nearest(rows[1:, row.state], rows[:-1, row.state])
         return self.scaled(row.features(rows[:-1], u)), after - linear
@@ -169,7 +172,8 @@ def _turns(episodes: Sequence[Array]) -> Array | None:
 
 def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
     """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
-    law, m = problem.law(), problem.model.n_inputs
+    law = problem.law()
+    m = problem.model.n_inputs
 
     def act(rows: Array) -> Array:
         finite = np.isfinite(rows).all(axis=1)
@@ -220,7 +224,8 @@ class Dynamics:
 
     def jacobians(self, theta: Array, u: Array) -> tuple[Array, Array]:
         """Return the derivatives of the step by theta and by u, for each member and row."""
-        row, at = self.row, self.row.features(theta, u)
+        row = self.row
+        at = self.row.features(theta, u)
         J = self._stack.jacobian(self._scaled(theta, u))
         inside = (at > self.coordinates.low) & (at < self.coordinates.high)
         J = J * (inside / self.coordinates.scale)[..., None, :]
@@ -268,7 +273,9 @@ class Dynamics:
         The inputs are the logged ones, corrected by what the law makes of the deviation of the
         state: where the law made the log, it acts on its own predictions.
         """
-        row, law, own = self.row, law_of(self.problem), self.problem.deviations
+        row = self.row
+        law = law_of(self.problem)
+        own = self.problem.deviations
         logged = law(row.shown(episode.thetas[:-1]))
 
         def inputs(t: int, rows: Array) -> Array:

@@ -19,7 +19,9 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann_envs.spaces import ProblemBox
 
-AROUND, WIDEST, RARE = 3.0, 2.0, 0.05
+AROUND = 3.0
+WIDEST = 2.0
+RARE = 0.05
 """How many boxes wide starts are drawn at most; how much wider than the log's starts their box is
 at most; how likely a start is, in one coordinate, beyond what the log shows."""
 
@@ -51,8 +53,10 @@ class Starts:
         first = np.array([each.thetas[0] for each in episodes])
         rows = np.concatenate([each.thetas[:-1] for each in episodes])
         n = problem.model.n_states
-        x, k = first[:, :n], len(first)
-        middle, half = (x.max(0) + x.min(0)) / 2, (x.max(0) - x.min(0)) / 2
+        x = first[:, :n]
+        k = len(first)
+        middle = (x.max(0) + x.min(0)) / 2
+        half = (x.max(0) - x.min(0)) / 2
         half = half * _widened(k)
         low = np.maximum(middle - half, problem.deviations.theta_min[:n])
         high = np.minimum(middle + half, problem.deviations.theta_max[:n])
@@ -69,11 +73,15 @@ class Starts:
 
         Beyond the latter, in one coordinate, lies one start in twenty: see :meth:`chance_beyond`.
         """
-        first, rows, k = self.row.shown(self.first), self.row.shown(self.rows), len(self.first)
-        low, high = first.min(0), first.max(0)
+        first = self.row.shown(self.first)
+        rows = self.row.shown(self.rows)
+        k = len(self.first)
+        low = first.min(0)
+        high = first.max(0)
         ranges = 2 * (2 / (k + 1) / RARE) ** (1 / max(k - 1, 1)) - 1
         further = (high - low) / 2 * max(ranges - 1, 0.0)
-        low, high = np.minimum(rows.min(0), low - further), high + further
+        low = np.minimum(rows.min(0), low - further)
+        high = high + further
         return low, np.maximum(rows.max(0), high)
 
     def draw(self, count: int, rng: np.random.Generator, episodes: Any = None) -> Array:
@@ -93,10 +101,12 @@ class Starts:
         Every other one has references and disturbances from the box that the log shows: what
         passes at the few of the log may fail between them.
         """
-        drawn, layout = self.draw(count, rng), self.problem.layout
+        drawn = self.draw(count, rng)
+        layout = self.problem.layout
         if not layout.has_constants:
             return drawn
-        held, some = self.row.given, drawn[::2].copy()
+        held = self.row.given
+        some = drawn[::2].copy()
         low, high = np.clip(
             self.shown, self.problem.deviations.theta_min, self.problem.deviations.theta_max
         )
@@ -116,8 +126,11 @@ class Starts:
         there are in the log, the wider. Those that the law has no solution for are replaced by
         logged ones.
         """
-        drawn, n, k = self.draw_between(count, rng), len(self.low), len(self.first)
-        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        drawn = self.draw_between(count, rng)
+        n = len(self.low)
+        k = len(self.first)
+        middle = (self.high + self.low) / 2
+        half = (self.high - self.low) / 2
         nearest = (1 + _widened(k)) / 2
         ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
         wide = np.maximum(ranges / _widened(k), rng.uniform(1, AROUND, (count, 1)))
@@ -128,7 +141,8 @@ class Starts:
             self.problem.deviations.theta_min,
             self.problem.deviations.theta_max,
         )
-        outside, drawn = ~self.problem.law().in_domain(shown), self.row.begin(shown)
+        outside = ~self.problem.law().in_domain(shown)
+        drawn = self.row.begin(shown)
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
         return drawn
 
@@ -139,9 +153,12 @@ class Starts:
         distribution the next one lies beyond ``rho`` times their range with probability
         ``2 / (k + 1) ((1 + rho) / 2) ** (1 - k)``: spacings are exchangeable.
         """
-        n, k = len(self.low), len(self.first)
-        x, seen = thetas[..., :n], self.first[:, :n]
-        middle, half = (self.high + self.low) / 2, np.ptp(seen, axis=0) / 2
+        n = len(self.low)
+        k = len(self.first)
+        x = thetas[..., :n]
+        seen = self.first[:, :n]
+        middle = (self.high + self.low) / 2
+        half = np.ptp(seen, axis=0) / 2
         rho = (np.abs(x - middle) / np.maximum(half, 1e-300)).max(axis=-1)
         return np.asarray(2 / (k + 1) * ((1 + np.maximum(rho, 1.0)) / 2) ** (1.0 - k))
 
@@ -171,12 +188,15 @@ class Limits:
         With set-points or disturbances also that of where the MPC would take its own model: the log
         of a worn plant, which rests beside its set-points, does not show that.
         """
-        n, soft = problem.model.n_states, problem.soft.x > 0
-        low, high = coordinates.low[:n], coordinates.high[:n]
+        n = problem.model.n_states
+        soft = problem.soft.x > 0
+        low = coordinates.low[:n]
+        high = coordinates.high[:n]
         planned = [_planned(problem, coordinates, starts)] if problem.layout.has_constants else []
         for least, most in [(starts.low, starts.high), *planned]:
             width = MARGIN * (most - least)
-            low, high = np.minimum(low, least - width), np.maximum(high, most + width)
+            low = np.minimum(low, least - width)
+            high = np.maximum(high, most + width)
         room = ROUNDING * problem.theta_half[:n]
         bounded = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min))
         limited = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max))
@@ -191,12 +211,14 @@ class Limits:
 
 def _planned(problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
     """Return the box of the MPC's runs on its own model: as long as the log's, from its starts."""
-    n, steps = problem.model.n_states, len(starts.rows) // len(starts.first)
+    n = problem.model.n_states
+    steps = len(starts.rows) // len(starts.first)
     model = Dynamics(problem, coordinates, (Residual.zero(len(coordinates.scale), n),))
     first = starts.draw(PLANNED, np.random.default_rng(0))
     rows = model.roll_out(law_of(problem), first[None], steps)[0]
     x = rows[..., coordinates.row.state].reshape(-1, n)
-    least, most = problem.deviations.theta_min[:n], problem.deviations.theta_max[:n]
+    least = problem.deviations.theta_min[:n]
+    most = problem.deviations.theta_max[:n]
     return np.clip(x.min(axis=0), least, most), np.clip(x.max(axis=0), least, most)
 
 
@@ -251,8 +273,11 @@ class TwinEnv(gym.Env[Single, Single]):
         members = len(model.dynamics.members)
         if member is not None and check_int("member", member, 0) >= members:
             raise ValueError(f"member = {member} must be below {members}, how many there are.")
-        self.model, self.dynamics, problem = model, model.dynamics, model.problem
-        self.member, self.render_mode = member, None
+        self.model = model
+        self.dynamics = model.dynamics
+        problem = model.problem
+        self.member = member
+        self.render_mode = None
         low, high = (each.astype(np.float32) for each in (problem.theta_min, problem.theta_max))
         self.observation_space = ProblemBox(low, high, problem=problem)
         u_min, u_max = (each.astype(np.float32) for each in (problem.u_min, problem.u_max))
@@ -269,7 +294,8 @@ class TwinEnv(gym.Env[Single, Single]):
     ) -> tuple[Single, dict[str, Any]]:
         """Start an episode, from a random theta or ``options["state"]``, (n,) or (n_theta,)."""
         super().reset(seed=seed)
-        problem, members = self.dynamics.problem, self.dynamics.members
+        problem = self.dynamics.problem
+        members = self.dynamics.members
         acting = int(self.np_random.integers(len(members)))
         if self.member is not None:
             acting = self.member
@@ -290,7 +316,8 @@ class TwinEnv(gym.Env[Single, Single]):
             if not np.all(np.isfinite(given)):
                 raise ValueError(f"options['state'] = {given.tolist()} must be finite numbers.")
             theta[: len(given)] = units.to_deviations(given)
-        self._theta, self._steps = row.begin(theta), 0
+        self._theta = row.begin(theta)
+        self._steps = 0
         shown = units.to_plant(theta)
         return shown.astype(np.float32), {"state": shown.copy(), "member": acting}
 
@@ -302,7 +329,8 @@ class TwinEnv(gym.Env[Single, Single]):
         if u.shape != self.action_space.shape or not np.all(np.isfinite(u)):
             wanted = f"{self.action_space.shape} finite numbers"
             raise ValueError(f"action = {action!r} must be {wanted}.")
-        row, units = self.dynamics.row, self.dynamics.problem.units
+        row = self.dynamics.row
+        units = self.dynamics.problem.units
         problem = self.dynamics.problem.deviations
         u = np.clip(units.input_to_deviations(u), problem.u_min, problem.u_max)
         before = self._theta

@@ -65,9 +65,12 @@ class _Replays:
     """
 
     def __init__(self, judge: Judge, episodes: Sequence[Episode], remembers: bool) -> None:
-        self.dynamics, self.members = judge.dynamics, len(judge.dynamics.members)
-        self.explains, self.units = False, judge.dynamics.coordinates.units
-        row, steps = self.dynamics.row, max(map(len, episodes))
+        self.dynamics = judge.dynamics
+        self.members = len(judge.dynamics.members)
+        self.explains = False
+        self.units = judge.dynamics.coordinates.units
+        row = self.dynamics.row
+        steps = max(map(len, episodes))
         at = [np.minimum(np.arange(steps + 1), len(each)) for each in episodes]
         self.rows = np.stack([e.thetas[k] for e, k in zip(episodes, at, strict=True)], axis=1)
         last = [np.minimum(k[:-1], len(e) - 1) for e, k in zip(episodes, at, strict=True)]
@@ -99,11 +102,14 @@ class _Replays:
 
         Those that go on as episode i does begin at ``starts[i]`` (some, size).
         """
-        problem, row = self.dynamics.problem, self.dynamics.row
-        low, high = problem.deviations.u_min, problem.deviations.u_max
+        problem = self.dynamics.problem
+        row = self.dynamics.row
+        low = problem.deviations.u_min
+        high = problem.deviations.u_max
         count, some, size = starts.shape
         like = np.repeat(np.arange(count), some)
-        steps, shape = len(self.inputs), (self.members, len(like))
+        steps = len(self.inputs)
+        shape = (self.members, len(like))
         rows = np.empty((steps + 1, *shape, size))
         inputs = np.empty((steps, *shape, self.inputs.shape[2]))
         missed = np.zeros((steps, *shape, self.errors.shape[3]))
@@ -153,17 +159,20 @@ class _Replays:
         An actuator that lags, backlash and a load that lasts show in these terms, an ARMAX model's
         (Ljung, *System Identification*, section 4.2).
         """
-        basis, count = self._basis(), self.rows.shape[1]
+        basis = self._basis()
+        count = self.rows.shape[1]
         plain = 1 + self.errors.shape[3] + self.inputs.shape[2]
         if self.alive.sum() < ROWS * basis.shape[-1] or count < 2:
             return None
         known = self.alive.copy()
         known[:LAGS] = False
-        weights, left = [], np.zeros(2)
+        weights = []
+        left = np.zeros(2)
         for k in range(self.members):
             unseen = np.arange(count) % self.members == k
             fit = known & ~unseen if np.any(known & ~unseen) else known
-            z, e = basis[:, k], self.errors[:, k]
+            z = basis[:, k]
+            e = self.errors[:, k]
             weights.append(_ridge(z[fit], e[fit]))
             short = _ridge(z[fit][:, :plain], e[fit])
             rests = e - z @ weights[-1], e - z[..., :plain] @ short
@@ -198,7 +207,8 @@ def forecast(
     judge is the twin's own; ``loosest`` is the input that follows the MPC most closely.
     """
     independent = sum(len(each[::2]) for each in records(episodes))
-    count, rng = len(episodes), np.random.default_rng(0)
+    count = len(episodes)
+    rng = np.random.default_rng(0)
     some = -(-RUNS // count)
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
     begins = [np.stack([each.thetas[:1] for each in episodes]), drawn.reshape(count, some, -1)]
@@ -216,8 +226,10 @@ def forecast(
             for first in begins:
                 mpc, policy = (replays.costs(each, first) for each in (law, act))
                 found.append((*_changed(mpc, policy, independent), says))
-    low, high = [each[1] for each in found], [each[2] for each in found]
-    change, worst = (found[0][0] + found[1][0]) / 2, found[int(np.argmax(high))]
+    low = [each[1] for each in found]
+    high = [each[2] for each in found]
+    change = (found[0][0] + found[1][0]) / 2
+    worst = found[int(np.argmax(high))]
     return Forecast(change, min(low), max(high), _cure(*worst, independent, loosest))
 
 
@@ -235,7 +247,8 @@ def surely_worse(behind: Array) -> NDArray[np.bool_]:
 def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float, float]:
     """Return a change relative to the MPC, and the ends of its interval."""
     with np.errstate(all="ignore"):
-        changes, size = policy - mpc, np.abs(mpc)
+        changes = policy - mpc
+        size = np.abs(mpc)
         ratios = changes.mean(axis=1) / size.mean(axis=1)  # (members,)
     if not np.isfinite(ratios).all() or independent < 2:
         return 0.0, -np.inf, np.inf

@@ -61,7 +61,8 @@ def as_episodes(
     disturbances they are NaN where none are given. Wrong shapes, entries that are not finite and
     inputs beyond their bounds are a ValueError.
     """
-    layout, pairs = problem.layout, _pairs(episodes)
+    layout = problem.layout
+    pairs = _pairs(episodes)
     units = problem.units
     given = {"references": references, "disturbances": disturbances, "previous": previous}
     for name, values in given.items():
@@ -142,7 +143,8 @@ def records(episodes: tuple[Episode, ...]) -> list[range]:
 
 def _lacking(problem: LinearMPC, states: Array) -> str:
     """Return a hint where states (T + 1, k) lack the inputs on their way, empty elsewhere."""
-    model, past = problem.model, list[int]()
+    model = problem.model
+    past = list[int]()
     rows = np.hstack([model.A, model.B])
     taken_over = (np.count_nonzero(rows, axis=1) == 1) & (rows.max(axis=1) == 1.0)
     for _ in range(model.n_states):  # each is an input of the step before, or such a state's value
@@ -201,7 +203,8 @@ def _actions(problem: LinearMPC, i: int, actions: ArrayLike) -> Array:
     beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
     if beyond.any():
         row, k = np.argwhere(beyond)[0]
-        low, high = problem.u_min[k], problem.u_max[k]
+        low = problem.u_min[k]
+        high = problem.u_max[k]
         raise ValueError(
             f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds {low:g} and "
             f"{high:g} of the problem. A log is in plant units where the model has an operating "
@@ -280,11 +283,14 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
 
     An observer moves its estimate by a fixed matrix times what the model does not predict.
     """
-    parts, inside = problem.layout, (problem.deviations.theta_min, problem.deviations.theta_max)
+    parts = problem.layout
+    inside = (problem.deviations.theta_min, problem.deviations.theta_max)
     if not parts.n_disturbances:
         return
     d_min, d_max = (each[parts.disturbance] for each in inside)
-    room, errors, moves = ROUNDED * (d_max - d_min), [], []
+    room = ROUNDED * (d_max - d_min)
+    errors = []
+    moves = []
     for each in episodes:
         d = each.thetas[:, parts.disturbance]
         free = np.all((d > d_min + room) & (d < d_max - room), axis=1)
@@ -292,7 +298,8 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
         left = each.thetas[1:] - problem.deviations.predict(each.thetas[:-1], each.actions)
         errors.append(left[free, parts.state])
         moves.append(np.diff(d, axis=0)[free])
-    e, moved = np.concatenate(errors), np.concatenate(moves)
+    e = np.concatenate(errors)
+    moved = np.concatenate(moves)
     half = problem.theta_half[parts.disturbance]
     if len(e) <= 2 * parts.n_states or not np.any(np.std(moved, axis=0) > 1e-6 * half):
         return

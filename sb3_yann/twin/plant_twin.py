@@ -51,7 +51,8 @@ if TYPE_CHECKING:
 
 BLOCKS = 40  # pieces of a log of few episodes that its members are fitted to some of
 AHEAD = 20  # steps of the windows that networks are fitted to
-ROWS, LACKS = 100, 0.01
+ROWS = 100
+LACKS = 0.01
 """Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
 episodes err by so much of the mean."""
 
@@ -183,7 +184,8 @@ class PlantTwin(LearntModel):
         row = RowLayout(problem, observer)
         if observer is not None and row.observer is None:
             episodes, disturbances = row.estimated(episodes, disturbances)
-        given, observed = (references, disturbances, previous), row.observer is not None
+        given = (references, disturbances, previous)
+        observed = row.observer is not None
         log = as_episodes(problem, episodes, *given, observed=observed)
         log, copied = without_copies(log)
         notes += copied

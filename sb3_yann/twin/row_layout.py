@@ -35,7 +35,8 @@ class RowLayout:
     estimator: StateEstimator | None = None
 
     def __post_init__(self) -> None:
-        estimator, model = self.estimator, self.problem.model
+        estimator = self.estimator
+        model = self.problem.model
         if estimator is None:
             return
         if not isinstance(estimator, StateEstimator):
@@ -56,7 +57,8 @@ class RowLayout:
     @cached_property
     def observer(self) -> DisturbanceObserver | None:
         """The estimator where it determines the plant's state and all disturbances, else None."""
-        found, n = self.estimator, self.problem.model.n_states
+        found = self.estimator
+        n = self.problem.model.n_states
         if not isinstance(found, DisturbanceObserver):
             return None
         square = found.C.shape == (n, n) and found.n_estimated == self._n_disturbances
@@ -113,29 +115,37 @@ class RowLayout:
     @cached_property
     def inputs(self) -> Any:
         """Where in ``[row, u]`` stands what the plant's next state depends on, (k,)."""
-        number, parts = np.arange(self.size + self.problem.model.n_inputs), self.problem.layout
+        number = np.arange(self.size + self.problem.model.n_inputs)
+        parts = self.problem.layout
         d = number[parts.disturbance] if self.observer is None else number[:0]
         return np.concatenate([number[self.state], d, number[self.size :]])
 
     @cached_property
     def linear(self) -> Array:
         """The step without residual and bounds of d, (size, size + m): ``row+ = . [row; u]``."""
-        parts, model = self.problem.layout, self.problem.model
+        parts = self.problem.layout
+        model = self.problem.model
         theta = np.concatenate(self.problem.prediction, axis=1)
         if self.observer is None:
             return np.ascontiguousarray(theta)
-        size, n, observer = parts.size, parts.n_states, self.observer
+        size = parts.size
+        n = parts.n_states
+        observer = self.observer
         found = np.zeros((self.size, self.size + model.n_inputs))
         found[:size, :size], found[:size, self.size :] = np.split(theta, [size], axis=1)
         found[: parts.n_states] = found[parts.disturbance] = 0.0
-        found[self.state, self.state], found[self.state, self.size :] = model.A, model.B
+        found[self.state, self.state] = model.A
+        found[self.state, self.size :] = model.B
         blind = np.eye(len(observer.gain)) - observer.gain @ observer.C_aug
         z = np.zeros((len(blind), found.shape[1]))
         before = blind @ observer.A
-        z[:, parts.state], z[:, self._raw] = before[:, :n], before[:, n:]
+        z[:, parts.state] = before[:, :n]
+        z[:, self._raw] = before[:, n:]
         z[:, self.size :] = blind @ observer.B
         z += observer.gain @ observer.C @ found[self.state]
-        found[parts.state], found[self._raw], found[parts.disturbance] = z[:n], z[n:], z[n:]
+        found[parts.state] = z[:n]
+        found[self._raw] = z[n:]
+        found[parts.disturbance] = z[n:]
         return found
 
     @cached_property
@@ -145,7 +155,8 @@ class RowLayout:
         found = np.zeros((self.size, parts.n_states))
         found[self.state] = np.eye(parts.n_states)
         if self.observer is None and self.estimator is not None:
-            gain, n = self.estimator.gain, parts.n_states
+            gain = self.estimator.gain
+            n = parts.n_states
             found[self._estimated] = gain[n:] @ np.linalg.pinv(gain[:n])
         if self.observer is not None:
             moved = self.observer.gain @ self.observer.C
@@ -169,20 +180,24 @@ class RowLayout:
     def clip(self, rows: Array) -> Array:
         """Clip the shown estimate of d to its bounds, in place; return which is inside of them."""
         if self.observer is None:
-            part, own = self._estimated, self.problem.deviations
+            part = self._estimated
+            own = self.problem.deviations
             if part.start < part.stop:
                 rows[..., part] = np.clip(rows[..., part], own.theta_min[part], own.theta_max[part])
             return np.zeros((*rows.shape[:-1], 0), dtype=bool)
-        (low, high), raw = self._d, rows[..., self._raw]
+        (low, high) = self._d
+        raw = rows[..., self._raw]
         rows[..., self.problem.layout.disturbance] = np.clip(raw, low, high)
         return np.asarray((raw > low) & (raw < high))
 
     def begin(self, thetas: Array) -> Array:
         """Return rows (..., size) of thetas (..., n_theta), or of rows: what is shown is so."""
-        shown, parts = self.shown(thetas), self.problem.layout
+        shown = self.shown(thetas)
+        parts = self.problem.layout
         if self.observer is None:
             return shown.copy()
-        x, d = shown[..., parts.state], shown[..., parts.disturbance]
+        x = shown[..., parts.state]
+        d = shown[..., parts.disturbance]
         return np.concatenate([shown, x, d], axis=-1)
 
     def after(self, row: Array, u: Array, theta: Array) -> Array:
@@ -192,10 +207,14 @@ class RowLayout:
         """
         if self.observer is None:
             return theta.copy()
-        observer, parts, n = self.observer, self.problem.layout, self.problem.layout.n_states
+        observer = self.observer
+        parts = self.problem.layout
+        n = self.problem.layout.n_states
         z = observer.A @ np.concatenate([row[parts.state], row[self._raw]]) + observer.B @ u
         seen = np.linalg.solve(observer.gain[:n], theta[parts.state] - z[:n])
-        d, shown, (low, high) = z[n:] + observer.gain[n:] @ seen, theta[parts.disturbance], self._d
+        d = z[n:] + observer.gain[n:] @ seen
+        shown = theta[parts.disturbance]
+        (low, high) = self._d
         room = ROUNDED * (high - low)  # an observation rounds the bounds to float32
         d = np.where((shown > low + room) & (shown < high - room), shown, d)
         x = np.linalg.solve(observer.C, observer.C @ z[:n] + seen)
@@ -230,7 +249,8 @@ class RowLayout:
         pairs = [*episodes]
         if any(np.ndim(x) == 2 and np.shape(x)[1] == self.problem.n_theta for x, _ in pairs):
             return pairs, None if loads is None else [*loads]
-        found, disturbances = [], []
+        found = []
+        disturbances = []
         for i, (outputs, inputs) in enumerate(pairs):
             y = np.asarray(outputs, np.float64).reshape(len(outputs), -1)
             known: Array = np.zeros((len(y), 0))
@@ -251,7 +271,8 @@ class RowLayout:
         plant units. A reading that is NaN is left out.
         """
         assert self.estimator is not None
-        filtered, model = copy.deepcopy(self.estimator), self.estimator.model
+        filtered = copy.deepcopy(self.estimator)
+        model = self.estimator.model
         y = np.asarray(outputs, np.float64) - filtered.C @ model.x_ss
         u = np.asarray(inputs, np.float64).reshape(len(y) - 1, -1) - model.u_ss
         n_known = filtered.n_known
@@ -260,14 +281,17 @@ class RowLayout:
         for k in range(len(u)):
             found.append(filtered.update(y[k + 1], u[k], None if d is None else d[k]))
         x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
-        bounds, known = self.problem.disturbances, self._n_disturbances - filtered.n_estimated
+        bounds = self.problem.disturbances
+        known = self._n_disturbances - filtered.n_estimated
         d_hat = np.clip(d_hat + model.d_ss[n_known:], bounds.d_min[known:], bounds.d_max[known:])
         return x_hat + model.x_ss, d_hat
 
     def _run(self, thetas: Array, actions: Array) -> Array:
         """Return rows of thetas whose states were measured, and whose d is not known."""
         assert self.observer is not None
-        observer, parts, n = self.observer, self.problem.layout, self.problem.layout.n_states
+        observer = self.observer
+        parts = self.problem.layout
+        n = self.problem.layout.n_states
         x = thetas[:, parts.state]
         z = np.concatenate([x[0], np.zeros(parts.n_disturbances)])
         found = [z]

@@ -70,8 +70,11 @@ class _Networks:
     def __init__(
         self, pairs: list[list[Array]], least: Array, generator: th.Generator, dtype: th.dtype
     ) -> None:
-        self.generator, self.dtype, count = generator, dtype, len(pairs)
-        k, n = pairs[0][0].shape[1], pairs[0][1].shape[1]
+        self.generator = generator
+        self.dtype = dtype
+        count = len(pairs)
+        k = pairs[0][0].shape[1]
+        n = pairs[0][1].shape[1]
         self.center = self.tensor([z.mean(0, keepdims=True) for z, _ in pairs])
         self.width = self.tensor([np.maximum(z.std(0, keepdims=True), 1e-9) for z, _ in pairs])
         linear, units = zip(*(_least_squares(*each) for each in pairs), strict=True)
@@ -137,7 +140,8 @@ class _Networks:
         for _ in self._steps(RATE / 5, updates):
             chosen = th.randint(data.shape[1], (WINDOWS,), generator=self.generator)
             window = data[:, chosen]
-            x, loss = window[..., :n, 0], th.zeros((), dtype=self.dtype)
+            x = window[..., :n, 0]
+            loss = th.zeros((), dtype=self.dtype)
             for t in range(ahead):
                 features = th.cat([x, window[..., n:, t]], dim=-1)
                 x = features @ linear + self(features.clamp(low, high) / scale)
@@ -161,7 +165,8 @@ class _Networks:
         """Return them in scaled coordinates, one by one."""
         with th.no_grad():
             W1, b1, W2, b2, W3, b3, L = self.weights
-            first, L = W1 / self.width.mT, L * self.unit / self.width.mT
+            first = W1 / self.width.mT
+            L = L * self.unit / self.width.mT
             b1 = b1 - self.center @ first
             b3 = b3 * self.unit - self.center @ L
             parts = [first, b1, W2, b2, W3 * self.unit, b3, L]
@@ -172,7 +177,8 @@ class _Networks:
 
 def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
     """Return the linear part (k, n) of y, and the deviation (1, n) of what it leaves."""
-    about, y = z - z.mean(axis=0), y - y.mean(axis=0)
+    about = z - z.mean(axis=0)
+    y = y - y.mean(axis=0)
     ridge = RIDGE * (np.trace(about.T @ about) / z.shape[1] + 1e-300)
     linear = np.linalg.solve(about.T @ about + ridge * np.eye(z.shape[1]), about.T @ y)
     left = y - about @ linear
@@ -195,7 +201,8 @@ LONGEST = 100  # steps of a free run, at most
 RUNS = 20  # free runs in an episode
 FOLDS = 5
 GAINS = (0.6, 1.7)  # times the model's: an input may act so, unless the log refutes it
-LOOSE, FIRM = 1e-3, 1e3
+LOOSE = 1e-3
+FIRM = 1e3
 """Shrinkage of what fits a log around such a gain, and times as much of its inputs."""
 
 
@@ -248,13 +255,17 @@ def ridge(
     else the equilibrium stays where it is.
     """
     z, y = map(np.concatenate, zip(*map(coordinates.regression, episodes), strict=True))
-    problem, (count, k), n = coordinates.row.problem, z.shape, y.shape[1]
+    problem = coordinates.row.problem
+    (count, k) = z.shape
+    n = y.shape[1]
     i, j = np.triu_indices(k)
     quadratic = max(each.degree for each in settings) > 1
     F = np.hstack([z, np.ones((count, int(problem.layout.has_constants)))])
     linear = F.shape[1]
     F = np.hstack([F, z[:, i] * z[:, j]]) if quadratic else F
-    gram, cross, found = F.T @ F, F.T @ y, []
+    gram = F.T @ F
+    cross = F.T @ y
+    found = []
     of_inputs = np.zeros(F.shape[1], dtype=bool)
     of_inputs[k - problem.model.n_inputs : k] = True
     of_inputs[linear:] = (j >= k - problem.model.n_inputs)[: len(of_inputs) - linear]
@@ -281,7 +292,8 @@ def candidates(
 ) -> list[Candidate]:
     """Return the model as it is, and polynomials of some kinds, the least free first."""
     kept = without_each_fold(parts)
-    n, k = coordinates.row.problem.model.n_states, len(coordinates.scale)
+    n = coordinates.row.problem.model.n_states
+    k = len(coordinates.scale)
     degrees = [degree for kind, degree in DEGREES.items() if kind in kinds]
     settings = [Setting(*each) for each in product(degrees, SHRINKAGES, INPUT_FACTORS)]
     settings.sort(key=lambda each: each.freedom)
@@ -386,7 +398,8 @@ def judges(
     """
     problem = coordinates.row.problem
     degree = 1 if chosen.setting is None else chosen.setting.degree
-    names, others = labels_of(problem.model)[1], list[Setting]()
+    names = labels_of(problem.model)[1]
+    others = list[Setting]()
     for gain in product(range(len(names)), GAINS):
         others.append(Setting(degree, LOOSE, FIRM, gain))
     fits = [ridge(coordinates, each, others) for each in without_each_fold(parts)]
@@ -411,11 +424,16 @@ def reidentified(
     if choice.setting is None:
         return problem
     (residual,) = ridge(coordinates, log, [choice.setting])
-    middle, model = np.zeros((1, len(coordinates.scale))), problem.model
-    n, m, d = model.n_states, model.n_inputs, len(middle[0]) - model.n_states - model.n_inputs
+    middle = np.zeros((1, len(coordinates.scale)))
+    model = problem.model
+    n = model.n_states
+    m = model.n_inputs
+    d = len(middle[0]) - model.n_states - model.n_inputs
     slopes = residual.jacobian(middle)[0] / coordinates.scale
     A, E, B = np.split(slopes, [n, n + d], axis=1)
-    A, B, E = model.A + A, model.B + B, model.E + (E if d else 0.0)
+    A = model.A + A
+    B = model.B + B
+    E = model.E + (E if d else 0.0)
     x: Array = np.zeros(n)
     u: Array = np.zeros(m)
     if problem.layout.has_constants:  # else the residual has no constant term

@@ -104,7 +104,8 @@ def costs_of_each(
     """Return predicted and actual costs of episodes, each by the residual without its fold."""
     if not by_fold:
         return np.empty(0), np.empty(0)
-    predicted, problem = [], coordinates.row.problem
+    predicted = []
+    problem = coordinates.row.problem
     for i, episode in enumerate(episodes):
         own = Dynamics(problem, coordinates, (by_fold[i % len(by_fold)],))
         with np.errstate(all="ignore"):
@@ -117,7 +118,8 @@ def persistence_error(
     coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any
 ) -> Array:
     """Return the error (h,) of the prediction, so many steps ahead, that the state stays."""
-    states, found = [e.thetas[:, coordinates.row.state] for e in episodes], []
+    states = [e.thetas[:, coordinates.row.state] for e in episodes]
+    found = []
     for h in horizons:
         moves = [(x[h:] - x[:-h]) / coordinates.units for x in states]
         found.append(np.sqrt(np.mean(np.concatenate(moves) ** 2)))
@@ -151,7 +153,8 @@ def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
     """Return the share of logged rows (n_theta,) where an entry lies beyond the box of theta."""
     theta = np.concatenate([each.thetas[:, : problem.n_theta] for each in episodes])
     room = ROUNDING * problem.theta_half
-    low, high = problem.deviations.theta_min - room, problem.deviations.theta_max + room
+    low = problem.deviations.theta_min - room
+    high = problem.deviations.theta_max + room
     return np.asarray(np.mean((theta < low) | (theta > high), axis=0))
 
 
@@ -184,7 +187,8 @@ def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[
 
 def _frozen(dynamics: Dynamics, episodes: tuple[Episode, ...]) -> list[str]:
     """Return which sensor stands still though the plant moves."""
-    row, model = dynamics.row, dynamics.problem.model
+    row = dynamics.row
+    model = dynamics.problem.model
     driven = [row.features(e.thetas[:-1], e.actions)[:, model.n_states :] for e in episodes]
     states = [each.thetas[:, row.state] for each in episodes]
     found = frozen_rows(states, driven)
@@ -207,7 +211,8 @@ def judge(
     of each is its own, and how much it moves (m,). ``beyond`` is the largest share of logged rows
     beyond the box of theta, and of which entry.
     """
-    problems, advice = [], []
+    problems = []
+    advice = []
     share, moves = inputs
     if n_episodes < 2:
         problems.append("There is one episode: nothing is left to test the twin on.")
@@ -267,7 +272,8 @@ def evidence(
     """
     runs, chosen, costs = found
     problem = dynamics.problem
-    coordinates, row = dynamics.coordinates, dynamics.row
+    coordinates = dynamics.coordinates
+    row = dynamics.row
     standing = persistence_error(coordinates, log, runs.horizons)
     inputs = excitation(problem, log)
     shares = beyond_the_box(problem, log) * (not follows_law(problem, log))
@@ -344,7 +350,8 @@ def _inputs(problem: LinearMPC, trust: Trust) -> Iterator[str]:
         known = "its gain is known from the log"
         if trust.excitation[k] < ALONE:
             known = "its gain rests on the given B"
-        moves, share = 100 * trust.moves[k], 100 * trust.excitation[k]
+        moves = 100 * trust.moves[k]
+        share = 100 * trust.excitation[k]
         name = labels_of(problem.model)[1][k]
         yield f"  {name}: {moves:.3g} % of half the range, {share:.2f} %: {known}"
 

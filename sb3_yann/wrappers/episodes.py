@@ -43,7 +43,8 @@ class TruncateAtTimeLimit(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: Any_Env, steps: int) -> None:
         super().__init__(env)
         hint = "It counts the steps after which the env ends every episode."
-        self.steps, self.taken = check_int("steps", steps, hint=hint), 0
+        self.steps = check_int("steps", steps, hint=hint)
+        self.taken = 0
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""

@@ -86,7 +86,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order, or "
                 "pass observation=AffineObservation(matrix, offset)."
             )
-        self.problem, self.violation_cost = problem, check_number("violation_cost", violation_cost)
+        self.problem = problem
+        self.violation_cost = check_number("violation_cost", violation_cost)
         self.bounds = Bounds.of(problem)
         self.theta: Array = np.zeros(problem.n_theta)
 
@@ -188,7 +189,9 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         if not callable(f):
             raise TypeError(f"f = {f!r} must be a function (x, u) -> dx/dt.")
         check_type("mpc", mpc, LinearMPC, "a LinearMPC")
-        layout, x_ss, n = mpc.layout, mpc.model.x_ss, mpc.model.n_states
+        layout = mpc.layout
+        x_ss = mpc.model.x_ss
+        n = mpc.model.n_states
         if layout.n_disturbances and observer is None:
             raise ValueError(
                 "The MPC has disturbances, and f(x, u) has none. If they are estimated, pass the "
@@ -240,7 +243,8 @@ def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) 
     plant that is not its model is no reason: the model must be far off, by five times at least, and
     nearly right with another unit.
     """
-    model, n = mpc.model, mpc.model.n_states
+    model = mpc.model
+    n = mpc.model.n_states
     point = np.concatenate([model.x_ss, model.u_ss])
     half = np.concatenate([mpc.theta_half[mpc.layout.state], mpc.u_half])
     size = np.where(np.isfinite(half) & (half > 0), half, 1.0)
@@ -270,7 +274,10 @@ class Equations(gym.Env[Array, Array]):
     """A plant that shows its state and takes its inputs."""
 
     def __init__(self, f: Slope, mpc: LinearMPC, start: tuple[Array, Array], substeps: int) -> None:
-        self.f, self.start, self.substeps, self.dt = f, start, substeps, mpc.model.dt
+        self.f = f
+        self.start = start
+        self.substeps = substeps
+        self.dt = mpc.model.dt
         self.observation_space = spaces.Box(-np.inf, np.inf, (mpc.model.n_states,), np.float64)
         self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
         self.state: Array = mpc.model.x_ss
@@ -303,7 +310,8 @@ class Equations(gym.Env[Array, Array]):
 
     def _advance(self, u: Array) -> Array:
         """Return the state one sample later."""
-        x, h = self.state, self.dt / self.substeps
+        x = self.state
+        h = self.dt / self.substeps
         for _ in range(self.substeps):
             k1 = self._slope(x, u)
             k2 = self._slope(x + h / 2 * k1, u)

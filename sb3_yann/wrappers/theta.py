@@ -169,7 +169,8 @@ class PastInputs(Appending):
                 f"delays = {self.delays} must have one entry for each of the {bounds.shape[0]} "
                 "inputs, 0 for one without dead time."
             )
-        low, high = np.repeat(bounds.low, self.delays), np.repeat(bounds.high, self.delays)
+        low = np.repeat(bounds.low, self.delays)
+        high = np.repeat(bounds.high, self.delays)
         super().__init__(env, low, high)
         self.initial = _as_initial(initial, bounds, np.array(self.delays) > 0)
         self.past: list[Array] = []
@@ -243,7 +244,9 @@ class SetPoint(Appending):
             )
         if hold is not None:
             check_int("hold", hold, hint="It counts steps; None is one reference in each episode.")
-        self.hold, self.schedule, self.steps = hold, _as_schedule(schedule), 0
+        self.hold = hold
+        self.schedule = _as_schedule(schedule)
+        self.steps = 0
         self.reference: Array = np.zeros(len(self.low))
         self._last: Array = self.reference
         self._ahead: list[Array] = [self._last]
@@ -275,7 +278,8 @@ class SetPoint(Appending):
 
     def _next(self, step: int) -> Array:
         p = len(self.low) // (self.preview + 1)
-        low, high = self.low[:p], self.high[:p]
+        low = self.low[:p]
+        high = self.high[:p]
         if self.schedule is None:
             generator = self.np_random if self._own is None else self._own
             return np.asarray(generator.uniform(low, high))
@@ -383,7 +387,8 @@ class MeasuredDisturbance(Appending):
 
     def _with_preview(self, given: Array, begins: bool) -> Array:
         """Return d with its preview, (preview + 1) n_loads; the last row stays in an episode."""
-        size, rows = self.n_loads, len(self.low) // self.n_loads
+        size = self.n_loads
+        rows = len(self.low) // self.n_loads
         d = given.reshape(-1, size) if given.ndim == 1 and len(given) % size == 0 else given
         if d.ndim != 2 or d.shape[1] != size or not (rows if begins else 1) <= len(d) <= rows:
             expected = (size,) if rows == 1 else (rows, size)
@@ -406,7 +411,8 @@ def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
 def _require_known(observer: StateEstimator, measured: MeasuredDisturbance | None) -> None:
     """Raise unless an observer knows which disturbances the env measures, and comes after them."""
     shown = 0 if measured is None else measured.n_loads
-    model, n_known = observer.model, observer.n_known
+    model = observer.model
+    n_known = observer.n_known
     if shown != n_known:
         raise ValueError(
             f"The env measures {shown} disturbances (MeasuredDisturbance), but the observer "
@@ -464,7 +470,8 @@ class EstimateState(Appending):
                 "identify_outputs(...).estimator(), or the second of offset_free(mpc)."
             )
         free = np.full(observer.n_estimated, np.inf)
-        low, high = -free if low is None else low, free if high is None else high
+        low = -free if low is None else low
+        high = free if high is None else high
         self.measured: Any = _below(env, MeasuredDisturbance)
         _require_known(observer, self.measured)
         if np.size(low) == np.size(high) == observer.model.n_disturbances:

@@ -36,7 +36,8 @@ def pack(
     outside and whether no regions overlap. The regions are scanned, or a ``walk`` goes from region
     to region: the one beyond each row, where it begins, and at which point (n,).
     """
-    (p, m, n), q = gains.shape, len(rows)
+    (p, m, n) = gains.shape
+    q = len(rows)
     header = [n, m, p, q, *flags, 0]
     neighbors: Integers = np.empty(0, np.int64)
     at_start: Array = np.empty(0)

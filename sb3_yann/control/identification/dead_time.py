@@ -94,13 +94,15 @@ def _left(gram: Array, delays: list[int], n: int) -> Array:
 
     The Gram matrix is that of the targets, followed by the inputs lag after lag.
     """
-    m, total = len(delays), np.diag(gram)[:n]
+    m = len(delays)
+    total = np.diag(gram)[:n]
     taps = [n + lag * m + j for j, delay in enumerate(delays) for lag in range(delay)]
     if not taps:
         return np.asarray(total)
     size = np.sqrt(np.diag(gram)[taps])
     size = np.where(size > 0, size, 1.0)
-    inner, cross = gram[np.ix_(taps, taps)] / np.outer(size, size), gram[taps, :n] / size[:, None]
+    inner = gram[np.ix_(taps, taps)] / np.outer(size, size)
+    cross = gram[taps, :n] / size[:, None]
     explained = np.sum(cross * (np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ cross), axis=0)
     return np.asarray(np.maximum(total - explained, 0.0))
 
@@ -118,7 +120,8 @@ def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]
 
     ``delays`` says how many of each input. Episodes shorter than the longest dead time fall out.
     """
-    longest, extended = max(delays), []
+    longest = max(delays)
+    extended = []
     for episode in episodes:
         rows = len(episode) + 1 - longest
         if rows < 2:
@@ -162,9 +165,12 @@ def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Arr
 
     They were fitted with the n states and, after these, the inputs on their way.
     """
-    A, B, row = A.copy(), B.copy(), n
+    A = A.copy()
+    B = B.copy()
+    row = n
     for j, delay in enumerate(delays):
-        A[row : row + delay], B[row : row + delay] = 0.0, 0.0
+        A[row : row + delay] = 0.0
+        B[row : row + delay] = 0.0
         for lag in range(delay):
             if lag:
                 A[row + lag, row + lag - 1] = 1.0
@@ -185,7 +191,8 @@ def input_notes(
     ``found`` is fitted without dead time to a part of the episodes.
     """
     n, m, d = sizes
-    lags, notes = found_delays(episodes, m + d), []
+    lags = found_delays(episodes, m + d)
+    notes = []
     for column, (name, lag) in enumerate(zip(names(sizes)[n:], lags, strict=True), n):
         idle = _chance(found, n, column) > CHANCE
         if lag:

@@ -56,7 +56,8 @@ def fit_log(
     """Return the least-squares fit to a log; options as of `identify`."""
     log = log.with_all_states()
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
-    episodes, sizes = list(log.episodes), log.sizes
+    episodes = list(log.episodes)
+    sizes = log.sizes
     measured = sizes[2] > 0
     require_moving(episodes, sizes)
     episodes, sizes, delays = _delayed(episodes, sizes, delay)
@@ -72,7 +73,8 @@ def fit_log(
     fitted, tested = split_episodes(episodes, check_range("held_out", held_out, 0, 1, "[)"))
     weight = 0.0 if automatic else check_range("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
-    found, shrunk = regress(fitted, sizes, origin, weight), list[str]()
+    found = regress(fitted, sizes, origin, weight)
+    shrunk = list[str]()
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
@@ -124,7 +126,8 @@ def system_of(
 
 def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
     """Return each state's fit (n,) in percent, predicted so many steps ahead."""
-    errors, targets = [], []
+    errors = []
+    targets = []
     for episode in episodes:
         starts = max(len(episode) - steps + 1, 0)
         x = episode.states[:starts]
@@ -186,7 +189,8 @@ def _memory_notes(delays: list[int], sizes: tuple[int, int, int], u_ss: Array) -
 
 SHARE = 0.05
 """Of all rows: so many repeated readings of one sensor are too many."""
-LEAST, TIMES = 10, 10.0
+LEAST = 10
+TIMES = 10.0
 """Equal readings in a row that a frozen sensor shows at least; how many times as many as usual."""
 
 
@@ -211,7 +215,8 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
     on. None is returned where they are less than 5 % of all rows. ``driven`` (T, k) are the inputs
     and disturbances between the rows.
     """
-    rows, found = sum(map(len, states)), list[Frozen]()
+    rows = sum(map(len, states))
+    found = list[Frozen]()
     for i in range(states[0].shape[1]):
         runs = [*_runs([x[:, i] for x in states], i)]
         usual = float(np.median([*map(len, runs)]))

@@ -137,11 +137,13 @@ def dead_times(episodes: Sequence[Episode], limit: int) -> list[tuple[int, ...]]
     it does not speak against it, at each of the levels ``CHANCES``: among many inputs and outputs
     one that is too strict ends it too early.
     """
-    q, m = episodes[0].states.shape[1], episodes[0].inputs.shape[1]
+    q = episodes[0].states.shape[1]
+    m = episodes[0].inputs.shape[1]
     lags, found = lags_by_criterion(episodes)
     longest = min(limit + 4, max((len(each) for each in episodes), default=0) - 1)
     if lags < longest:
-        lags, found = longest, arx(episodes, longest, longest - 1)
+        lags = longest
+        found = arx(episodes, longest, longest - 1)
     width = episodes[0].regressors.shape[1]
     columns = [[lag * width + q + j for lag in range(lags)] for j in range(m)]
     # What never acts has no dead time.
@@ -175,7 +177,8 @@ class Past:
     def __init__(self, episodes: Sequence[Episode], rare: NDArray[np.bool_] | None = None) -> None:
         self.rare = np.zeros(episodes[0].states.shape[1], bool) if rare is None else rare
         p, self.arx = lags_by_criterion(episodes)
-        q, self.width = episodes[0].states.shape[1], episodes[0].regressors.shape[1]
+        q = episodes[0].states.shape[1]
+        self.width = episodes[0].regressors.shape[1]
         self.rows = with_lags(episodes, p, p - 1)
         past = [each.regressors - self.arx.center for each in self.rows]
         whiten = linalg.inv(linalg.cholesky(self.arx.covariance + FLOOR * np.eye(q), lower=True))
@@ -193,7 +196,8 @@ class Past:
 
     def idle(self) -> list[int]:
         """Return the inputs and disturbances without effect that can be distinguished from zero."""
-        q, lags = len(self.arx.reached), self.arx.center.size // self.width
+        q = len(self.arx.reached)
+        lags = self.arx.center.size // self.width
         return [
             j
             for j in range(self.width - q)
@@ -205,7 +209,8 @@ class Past:
         n = order
         x = np.concatenate([each[:, :n] for each in self.states])
         y = np.concatenate([each.states[1:] for each in self.rows])
-        q, driven = y.shape[1], self.width - y.shape[1]
+        q = y.shape[1]
+        driven = self.width - y.shape[1]
         C = np.linalg.lstsq(x, y - self.arx.reached, rcond=None)[0].T
         moves = [
             Episode(state[:, :n], each.driven[1:, :driven], each.states[1:-1])
@@ -218,7 +223,8 @@ class Past:
         noise = errors.T @ errors / len(errors)
         c = found.predict(np.zeros((1, n + driven + q)))[0] + K @ self.arx.reached
         A = inner + K @ C
-        some, own = ~self.rare, noise + FLOOR * np.eye(q)
+        some = ~self.rare
+        own = noise + FLOOR * np.eye(q)
         K[:, self.rare] = 0.0  # stand-ins tell nothing of it
         if spectral_radius(A - K @ C) >= 1:
             # The gain of the filter for what these states and outputs miss is stable.
@@ -256,9 +262,12 @@ class Chunks:
         self.v = np.zeros((*shape, parts[0][1].shape[1]))
         self.there = np.zeros((*shape, 1))
         for i, (y, v) in enumerate(parts):
-            self.y[i, : len(y)], self.v[i, : len(y)], self.there[i, : len(y)] = y, v, 1.0
+            self.y[i, : len(y)] = y
+            self.v[i, : len(y)] = v
+            self.there[i, : len(y)] = 1.0
         read = np.isfinite(self.y)
-        self.read, self.lost = read * self.there, ~read * self.there
+        self.read = read * self.there
+        self.lost = ~read * self.there
         self.y[~read] = 0.0
         self.gaps = bool(np.any(self.lost))
         self.samples = int(self.there.sum())
@@ -291,7 +300,8 @@ class Chunks:
 
     def gauss_newton(self, model: Innovations) -> tuple[Array, Array]:
         """Return the normal equations of a step: the matrix (p, p) and the right side (p,)."""
-        n, (count, length, q) = model.order, self.y.shape
+        n = model.order
+        (count, length, q) = self.y.shape
         weight = whitening(model.noise, self.readings)
         left, x, basis, inverse = self._simulate(model, weight)
         ones = np.ones((count, length, 1))
@@ -302,7 +312,8 @@ class Chunks:
         blocks = np.einsum("op,sti->stopi", np.eye(q), x).reshape(count, length, q, q * n)
         slopes[..., n * w : n * w + q * n] = blocks
         slopes[..., n * w + q * n :] = np.eye(q)
-        inner, C = model.inner, model.C
+        inner = model.inner
+        C = model.C
         rows = np.arange(n)
         moved: Array = np.zeros((count, n, w, n))
         by_C: Array = np.zeros((count, n, q * n + q))  # what C and y_0 do where y is predicted
@@ -324,8 +335,11 @@ class Chunks:
 
     def _simulate(self, model: Innovations, weight: Array) -> tuple[Array, Array, Array, Array]:
         """Return weighted errors, states, and what first states do to errors, with its inverse."""
-        n, (count, length, q) = model.order, self.y.shape
-        inner, C, K = model.inner, model.C, model.K
+        n = model.order
+        (count, length, q) = self.y.shape
+        inner = model.inner
+        C = model.C
+        K = model.K
         errors = self.read * (self.y - model.y_0)
         fed = self.v @ model.B.T + errors @ K.T + model.c
         free = np.zeros((count, length, n, n))
@@ -333,8 +347,10 @@ class Chunks:
         now: Array = np.zeros((count, n))
         power: Array = np.tile(np.eye(n), (count, 1, 1))
         for k in range(length):
-            x[:, k], free[:, k] = now, power
-            now, power = now @ inner.T + fed[:, k], inner @ power
+            x[:, k] = now
+            free[:, k] = power
+            now = now @ inner.T + fed[:, k]
+            power = inner @ power
             if self.gaps:
                 lost = self.lost[:, k]
                 now = now + (lost * (x[:, k] @ C.T)) @ K.T
@@ -384,12 +400,15 @@ def mean_square(errors: Array, read: NDArray[np.bool_]) -> Array:
 
 def moved_by(model: Innovations, step: Array) -> Innovations:
     """Return the model whose parameters differ by a step of `Chunks.gauss_newton`."""
-    n, q, driven = model.order, len(model.C), model.B.shape[1]
+    n = model.order
+    q = len(model.C)
+    driven = model.B.shape[1]
     w = n + driven + q + 1
     change = step[: n * w].reshape(w, n).T
     inner, B, K, c = np.split(change, [n, n + driven, n + driven + q], axis=1)
     C = model.C + step[n * w : n * w + q * n].reshape(q, n)
-    K, y_0 = model.K + K, step[n * w + q * n :]
+    K = model.K + K
+    y_0 = step[n * w + q * n :]
     return replace(
         model,
         A=model.inner + inner + K @ C,
@@ -405,7 +424,8 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
     """Return the model of least determinant of its prediction errors' covariance near a model."""
     floor = FLOOR * np.eye(len(model.C))
     model = replace(model, noise=chunks.covariance(model) + floor)
-    size, damping = chunks.size(model.noise), 1e-4
+    size = chunks.size(model.noise)
+    damping = 1e-4
     for _ in range(steps):
         matrix, side = chunks.gauss_newton(model)
         scale = np.sqrt(np.diag(matrix)) + 1e-12 * np.sqrt(np.max(np.diag(matrix)))
@@ -417,7 +437,8 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
                 noise = chunks.covariance(trial) + floor
                 now = chunks.size(noise) if np.all(np.isfinite(noise)) else np.inf
                 if now < size:
-                    model, size = replace(trial, noise=noise), now
+                    model = replace(trial, noise=noise)
+                    size = now
                     damping = max(damping / 10, 1e-9)
                     break
             damping *= 10
@@ -433,7 +454,10 @@ def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Arra
     are NaN. ``moved`` (T, n) is ``B v + c`` of each step. Where some outputs are read now and then
     the gain is K throughout.
     """
-    A, C, K, noise = model.A, model.C, model.K, model.noise
+    A = model.A
+    C = model.C
+    K = model.K
+    noise = model.noise
     there: NDArray[np.bool_] = np.isfinite(outputs)
     whole: NDArray[np.bool_] = np.all(there, axis=1)
     x = np.empty((len(outputs), model.order))

@@ -56,7 +56,8 @@ def regress(
     """
     regressors = np.concatenate([episode.regressors for episode in episodes])
     targets = np.concatenate([episode.states[1:] for episode in episodes])
-    steps, unknowns = regressors.shape[0], regressors.shape[1] + (origin is None)
+    steps = regressors.shape[0]
+    unknowns = regressors.shape[1] + (origin is None)
     if steps <= unknowns:
         raise ValueError(
             f"There are {steps} steps to fit {unknowns} parameters for each state: too few. Record "
@@ -99,7 +100,8 @@ def regress(
 
 def _direction(weights: Array, scale: Array, labels: list[str]) -> str:
     """Return a combination of the scaled regressors in words, without terms of small weight."""
-    largest, factors = np.argmax(np.abs(weights)), weights / scale
+    largest = np.argmax(np.abs(weights))
+    factors = weights / scale
     small = np.abs(weights) <= SMALL * np.abs(weights[largest])
     return combination(np.where(small, 0.0, factors / factors[largest]), labels, 4)
 
@@ -164,7 +166,9 @@ def regularized(
 
 def _free_run(found: Regression, episodes: list[Episode]) -> float:
     """Return the error of free runs, root mean square in spreads of the states."""
-    n, total, count = found.reached.size, 0.0, 0
+    n = found.reached.size
+    total = 0.0
+    count = 0
     unit = np.where(found.spread[:n] > 0, found.spread[:n], 1.0)
     for episode in episodes:
         for start in range(0, len(episode), FREE_RUN):
@@ -174,7 +178,8 @@ def _free_run(found: Regression, episodes: list[Episode]) -> float:
                 # One that runs away is as bad as can be, and its size says nothing.
                 error = np.minimum(np.abs(x - episode.states[k + 1]) / unit, 1e3)
                 x = np.clip(x, -1e150, 1e150)
-                total, count = total + float(np.mean(error**2)), count + 1
+                total = total + float(np.mean(error**2))
+                count = count + 1
     return float(np.sqrt(total / max(count, 1)))
 
 
@@ -201,7 +206,8 @@ def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
 def pole_note(found: Regression, n: int) -> str:
     """Return the 95 % intervals of the poles in words, one of each complex pair."""
     values, errors = pole_errors(found, n)
-    words, open_ends = [], 0
+    words = []
+    open_ends = 0
     for value, error in zip(values, errors, strict=True):
         if value.imag < 0:
             continue
@@ -246,7 +252,8 @@ def operating_point(
     moves = (found.coefficients - np.eye(n, scale.size)) * scale / scale[:n, None]
     doubt = found.standard_errors * scale / scale[:n, None]
     drift = (found.predict(start[None])[0] - start[:n]) / scale[:n]
-    states, inputs = slice(0, n), slice(n, n + m)
+    states = slice(0, n)
+    inputs = slice(n, n + m)
     if given[0] is not None:
         start[inputs] += scale[inputs] * _way(moves[:, inputs], drift, doubt[:, inputs])
         return start
@@ -261,7 +268,8 @@ def operating_point(
         states = slice(0, n - sum(delays))
         start[states.stop : n] = np.repeat(start[inputs], delays)
         drift = ((found.predict(start[None])[0] - start[:n]) / scale[:n])[states]
-        moves, doubt = moves[states], doubt[states]
+        moves = moves[states]
+        doubt = doubt[states]
     start[states] += scale[states] * _way(moves[:, states], drift, doubt[:, states])
     return start
 

@@ -117,7 +117,8 @@ def _feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, flo
         [np.hstack([each.inputs[lags - i : len(each) - i] for i in late]) for each in longer]
     )
     m = episodes[0].inputs.shape[1]
-    now, own = u[:, -m:], np.column_stack([np.ones(len(u)), u[:, :-m]])
+    now = u[:, -m:]
+    own = np.column_stack([np.ones(len(u)), u[:, :-m]])
     alone = np.mean(project_out(own, now) ** 2, axis=0)
     left = np.mean(project_out(np.hstack([own, y]), now) ** 2, axis=0) / np.maximum(alone, ROUNDING)
     moves = alone > ROUNDING * np.var(now, axis=0)
@@ -139,8 +140,10 @@ class Search:
         tested: Sequence[Episode],
         delays: tuple[int, ...],
     ) -> None:
-        self.fitted, self.tested = shifted(read, delays), shifted(tested, delays)
-        self.chunks, self.delays = Chunks(self.fitted), delays
+        self.fitted = shifted(read, delays)
+        self.tested = shifted(tested, delays)
+        self.chunks = Chunks(self.fitted)
+        self.delays = delays
         self.past = Past(shifted(fitted, delays), self.chunks.rare)
         self.largest = min(MAX_ORDER, self.past.limit)
         self.tried: list[Structure] = []
@@ -261,7 +264,8 @@ def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Epis
     constants = np.exp2(np.arange(max(3, int(np.log2(longest)) + 1), dtype=np.float64))
     parts = [_filtered(a[:, ~slow], b, constants) for a, b in zip(y, driven, strict=True)]
     rows = np.concatenate(parts)
-    center, scale = rows.mean(axis=0), rows.std(axis=0)
+    center = rows.mean(axis=0)
+    scale = rows.std(axis=0)
     scale[scale == 0] = 1.0
     parts = [(each - center) / scale for each in parts]
     rows = np.concatenate(parts)

@@ -15,7 +15,8 @@ from sb3_yann.log import Episode
 
 ROWS = 4  # steps for each feature, at least: with fewer the features fit anything
 MOST = 12  # main components, at most: a long log with many states must not take minutes
-SHARE, CHANCE = 0.1, 1e-3
+SHARE = 0.1
+CHANCE = 1e-3
 """Least share of the residuals' variance, and its significance, from which curvature is named."""
 
 
@@ -27,7 +28,8 @@ def features(regressors: Array) -> Array:
     k, p = regressors.shape
     spread = np.sqrt(np.mean(regressors**2, axis=0))
     z = regressors / np.where(spread > 0, spread, 1.0)
-    room, kept = k // ROWS - p - 1, 0
+    room = k // ROWS - p - 1
+    kept = 0
     while kept < min(p, MOST) and (kept + 1) * (kept + 4) / 2 <= room:
         kept += 1
     if not kept:
@@ -47,15 +49,19 @@ def curvature_test(found: Regression, episodes: list[Episode]) -> tuple[Array, A
     now = np.concatenate([episode.regressors for episode in episodes]) - found.center
     reached = np.concatenate([episode.states[1:] for episode in episodes])
     residuals = reached - found.predict(now + found.center)
-    known, added = np.column_stack([np.ones(len(now)), now]), features(now)
+    known = np.column_stack([np.ones(len(now)), now])
+    added = features(now)
     before = project_out(known, residuals)
     after = project_out(np.column_stack([known, added]), residuals)
-    q, free = added.shape[1], len(now) - known.shape[1] - added.shape[1]
-    size, rest = np.sum(before**2, axis=0), np.sum(after**2, axis=0)
+    q = added.shape[1]
+    free = len(now) - known.shape[1] - added.shape[1]
+    size = np.sum(before**2, axis=0)
+    rest = np.sum(after**2, axis=0)
     real = size > 1e-20 * np.sum(reached**2, axis=0)
     if not q or free < 1 or not np.any(real):
         return np.zeros(len(size)), residuals
-    size, rest = np.where(real, size, 1.0), np.where(real, rest, 1.0)
+    size = np.where(real, size, 1.0)
+    rest = np.where(real, rest, 1.0)
     share = 1 - (rest / free) / (size / (free + q))
     ratio = ((size - rest) / q) / np.maximum(rest / free, np.finfo(float).tiny)
     sure = real & (np.asarray(fdtrc(q, free, ratio)) < CHANCE)
@@ -121,9 +127,11 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     inputs square to what a hidden state adds. A part of the log that was held out separates them.
     The first `ENOUGH` steps count. ``delays`` are the dead times of the inputs.
     """
-    n, lags = episodes[0].states.shape[1], max(ORDERS[-1], *delays, 0)
+    n = episodes[0].states.shape[1]
+    lags = max(ORDERS[-1], *delays, 0)
     longer = [episode for episode in episodes if len(episode) > lags]
-    steps, none = sum(len(episode) - lags for episode in longer), np.zeros(n)
+    steps = sum(len(episode) - lags for episode in longer)
+    none = np.zeros(n)
     width = episodes[0].regressors.shape[1]
     if steps <= 4 * (2 * width + sum(delays) + 1):
         return Leftover(none, none, none, none, none)
@@ -162,7 +170,8 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
 def _held_out(basis: Array, values: Array, parts: list[NDArray[np.int64]]) -> Array:
     """Return mean squared errors (n,) of a least-squares fit, each part left out once."""
     scale = np.linalg.norm(basis, axis=0)
-    basis, squares = basis / np.where(scale > 0, scale, 1.0), np.zeros(values.shape[1])
+    basis = basis / np.where(scale > 0, scale, 1.0)
+    squares = np.zeros(values.shape[1])
     for part in parts:
         fitted = np.delete(basis, part, axis=0), np.delete(values, part, axis=0)
         coefficients = np.linalg.lstsq(*fitted, rcond=1e-11)[0]
@@ -209,9 +218,11 @@ def quality_notes(
 def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[str]:
     """Return notes on what the residuals hold beside white noise: curvature, or colour."""
     share, rest = curvature_test(found, fitted)
-    share, own = share[:n], found.autocorrelation[:n]
+    share = share[:n]
+    own = found.autocorrelation[:n]
     colored = np.abs(own) > 3 / np.sqrt(found.steps)
-    left, notes = leftover(fitted), list[str]()
+    left = leftover(fitted)
+    notes = list[str]()
     known = bool(np.any(left.linear > 0))
     # What chance squares to is not there on rows that were held out.
     share = np.where(left.may_bend[:n] | (not known), share, 0.0)

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, to_float
 
-LEVELS, RATIO = 6, 4.0
+LEVELS = 6
+RATIO = 4.0
 """Number of steps that approach a point, and how much shorter each is than the one before."""
 NOISE_FLOOR = 100.0
 """Effects below so many times the noise are none. Hundreds of operations of an integrator round
@@ -39,7 +40,8 @@ class NotSmoothError(ValueError):
 
     def __init__(self, column: int, reason: str, no_value: bool = False) -> None:
         super().__init__(reason)
-        self.column, self.no_value = column, no_value
+        self.column = column
+        self.no_value = no_value
 
 
 def jacobian(
@@ -78,22 +80,29 @@ def _column(
     actual: Callable[[Array], Array],
 ) -> tuple[Array, Array, float]:
     """Return the derivatives with respect to coordinate i, their errors, and the change."""
-    ahead, behind, spans = [], [], []
+    ahead = []
+    behind = []
+    spans = []
     for level in range(LEVELS):
         offset = np.zeros(point.size)
         offset[i] = longest / RATIO**level
-        above, below = actual(point + offset), actual(point - offset)
+        above = actual(point + offset)
+        below = actual(point - offset)
         if above[i] <= point[i] or below[i] >= point[i]:
             break  # the step is lost in the rounding of the point
         ahead.append((f(above) - center) / (above[i] - point[i]))
         behind.append((center - f(below)) / (point[i] - below[i]))
         spans.append(above[i] - below[i])
-    one, other, span = np.array(ahead), np.array(behind), np.array(spans)[:, None]
+    one = np.array(ahead)
+    other = np.array(behind)
+    span = np.array(spans)[:, None]
     valid = np.all(np.isfinite(one) & np.isfinite(other), axis=1) if spans else np.zeros(0, bool)
     if np.count_nonzero(valid) < 3:
         raise NotSmoothError(i, "it has no finite value on one of its sides", True)
     far = bool(valid[0])
-    one, other, span = one[valid], other[valid], span[valid]
+    one = one[valid]
+    other = other[valid]
+    span = span[valid]
     slope = (one + other) / 2
     # Unequal sides (a point that is rounded) would leave a first-order error in the mean.
     value, error = _extrapolated(slope, RATIO**2, 2 * noise / span)
@@ -130,12 +139,14 @@ def differences(
     actual: Callable[[Array], Array] = lambda z: z,
 ) -> Jacobian:
     """Return the `jacobian` with shorter steps where f has no value; name a coordinate without."""
-    shortest, steps = steps / SHORTER**2, steps.copy()
+    shortest = steps / SHORTER**2
+    steps = steps.copy()
     while True:
         try:
             return jacobian(f, point, steps, rounding, actual)
         except NotSmoothError as error:
-            i, reason = error.column, str(error)
+            i = error.column
+            reason = str(error)
             if not error.no_value or steps[i] <= shortest[i]:
                 break
             steps[i] /= SHORTER

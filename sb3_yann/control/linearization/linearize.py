@@ -79,7 +79,8 @@ def _without_rounding(point: Array, free: NDArray[np.bool_], scale: Array) -> Ar
 
 def _settled(simulator: Simulator, start: Array, scale: Array) -> Array:
     """Return the point that the plant comes to with its action held, the last one with values."""
-    point, n = start, scale.size - simulator.env.action_space.shape[0]
+    point = start
+    n = scale.size - simulator.env.action_space.shape[0]
     for _ in range(SETTLES):
         reached = simulator.next_state(point[:n], point[n:])
         if not np.all(np.isfinite(reached)):
@@ -195,7 +196,8 @@ def time_limit_fault(env: Any, action: Array) -> str:
     The env is reset and stepped with an action (m,) and another one; pass a copy. What it raises
     meanwhile ends the search.
     """
-    low, high = env.action_space.low, env.action_space.high
+    low = env.action_space.low
+    high = env.action_space.high
     other = np.clip(action + 0.25 * np.minimum(high - low, 4.0), low, high)
     ends = []
     for seed, u in enumerate((action, other)):
@@ -231,7 +233,9 @@ def _termination(env: Any, seed: int, action: Array) -> int | None:
 LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
 LONGEST_SINGLE = 0.05  # the same where states are read in float32
 LONGEST_NOISY = 0.2  # the same where an adaptive integrator leaves noise
-NOISY, LEAST = 10.0, 1e-10  # from where on noise counts: beside rounding, and in scales
+# from where on noise counts: beside rounding, and in scales
+NOISY = 10.0
+LEAST = 1e-10
 
 
 def linearize_env(
@@ -283,7 +287,8 @@ def _linearize(
     found, noise = _differentiate(simulator, point, scales)
     if not np.any(free):
         require_steady_state(simulator, point, found.value, scales)
-    A, B = found.value[:, :n], found.value[:, n:]
+    A = found.value[:, :n]
+    B = found.value[:, n:]
     notes = (
         *idle_inputs(B, 5),
         "Linearized by central differences over one step. The state was set by "
@@ -300,9 +305,11 @@ def _linearize(
 
 def _actions(space: Any) -> tuple[Array, Array]:
     """Return the middle of a Box of actions and half its width; 0 and 1 where it is unbounded."""
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    low = space.low.astype(np.float64)
+    high = space.high.astype(np.float64)
     bounded = (low > -1e6) & (high < 1e6)
-    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    low = np.where(bounded, low, -1.0)
+    high = np.where(bounded, high, 1.0)
     return (low + high) / 2, (high - low) / 2
 
 
@@ -420,13 +427,15 @@ def linearize_dynamics(
     scale: ArrayLike | None = None,
 ) -> LinearSystem:
     """Return the sampled linearization of `LinearModel.from_dynamics`, which documents the rest."""
-    x, u = partly_known("x_ss", x_ss), partly_known("u_ss", u_ss)
+    x = partly_known("x_ss", x_ss)
+    u = partly_known("u_ss", u_ss)
     d = check_array("d_ss", [] if d_ss is None else d_ss, ("d",))
     dt = check_positive("dt", dt)
     labels = ["x", "u"] if d_ss is None else ["x", "u", "d"]
     if not callable(f):
         raise TypeError(f"f = {f!r} must be a function ({', '.join(labels)}) -> dx/dt.")
-    sizes, given = (x.size, u.size, d.size), np.concatenate([x, u, d])
+    sizes = (x.size, u.size, d.size)
+    given = np.concatenate([x, u, d])
     rate = Rate(f, sizes[: len(labels)])
     size = _size(given, x.size, scale)
     free = np.isnan(given)
@@ -445,13 +454,16 @@ def linearize_dynamics(
 
 def _rest_of(rate: Rate, given: Array, scale: Array, dt: float) -> tuple[Array, list[str]]:
     """Return the steady state with the free entries solved for, and notes on how sure it is."""
-    free, n = np.isnan(given), rate.sizes[0]
+    free = np.isnan(given)
+    n = rate.sizes[0]
     found: list[Array] = []
-    best, least = given, np.inf
+    best = given
+    least = np.inf
     for start in STARTS:
         point, moved = _solved_from(rate, np.where(free, start * scale, given), free, scale, dt)
         if moved < least:
-            best, least = point, moved
+            best = point
+            least = moved
         apart = [np.max(np.abs(point - other) / scale) > ANOTHER for other in found]
         if moved <= AT_REST and all(apart):
             found.append(point)
@@ -508,7 +520,8 @@ def _solved_from(
 def _require_steady(rate: Rate, point: Array, size: Array, dt: float, scaled: bool) -> None:
     """Raise if the operating point moves too far in one sample; warn if that is not certain."""
     parts = np.split(point, np.cumsum(rate.sizes[:-1]))
-    x, moved = parts[0], dt * np.abs(rate(point))
+    x = parts[0]
+    moved = dt * np.abs(rate(point))
     if np.any(moved > STEADY * size[: x.size]):
         at = ", ".join(f"{k}_ss = {part.tolist()}" for k, part in zip("xud", parts, strict=False))
         raise ValueError(

@@ -138,8 +138,11 @@ class Simulator:
         set_state: Callable[[Any, Array], object] | None,
         get_state: Callable[[Any], ArrayLike] | None,
     ) -> None:
-        self.env, self.origin = borrowed.env, borrowed.note
-        self.refusal, self.ended, self.over = "", False, False
+        self.env = borrowed.env
+        self.origin = borrowed.note
+        self.refusal = ""
+        self.ended = False
+        self.over = False
         self.observation, self.info = self.env.reset(seed=0 if borrowed.private else None)
         self.readers = dict(READERS)
         if get_state is not None:
@@ -153,7 +156,8 @@ class Simulator:
                 self.setters[f"{ATTRIBUTE} = x"] = self._assign
             if _positions_and_velocities(self.env.unwrapped) is not None:
                 self.setters["env.unwrapped.set_state(qpos, qvel)"] = self._set_mujoco
-        self.setter, self.reader = next(iter(self.setters)), next(iter(self.readers))
+        self.setter = next(iter(self.setters))
+        self.reader = next(iter(self.readers))
 
     def read(self, reader: str | None = None) -> Array | None:
         """Return the state of shape (n,) where `reader` has it, None if it is not there."""
@@ -198,7 +202,8 @@ class Simulator:
         """Return the state one step later, from wherever the environment is."""
         action = self.actual(u).astype(self.env.action_space.dtype)
         self.observation, _, terminated, truncated, self.info = self.env.step(action)
-        self.over, self.ended = bool(terminated or truncated), bool(terminated)
+        self.over = bool(terminated or truncated)
+        self.ended = bool(terminated)
         reached = self.read()
         if reached is None:
             raise ValueError(f"{self.reader} holds no state after a step.")
@@ -237,7 +242,8 @@ def to_vector(value: Any) -> Array | None:
 
 SPACINGS = (1e-3, 1e-4, 1e-5)
 """Distances of the points at which noise is measured, relative to the scale."""
-POINTS, ORDER = 10, 6
+POINTS = 10
+ORDER = 6
 """Points on a line, and the order of the differences that leave nothing of a smooth function."""
 UNLIKE = 4.0  # ratio of what two spacings show from which it is a kink rather than noise
 MOST = 1e-3  # largest noise, relative to the scale, that differences can cope with
@@ -290,7 +296,8 @@ def connect(
     for setter, (reader, start) in product(simulator.setters, begun.items()):
         if start is None or (x is not None and start.size != x.size):
             continue
-        simulator.setter, simulator.reader = setter, reader
+        simulator.setter = setter
+        simulator.reader = reader
         trial = start if x is None else np.where(np.isnan(x), start, x)
         size = _scale(simulator, trial, scale)
         failure = _failure(simulator, trial, u, size)
@@ -356,7 +363,8 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | No
 def _room(simulator: Simulator, u: Array) -> Array:
     """Return the way from u to the farther bound of the actions, signed, and at most 1000."""
     space = simulator.env.action_space
-    up, down = space.high - u, u - space.low
+    up = space.high - u
+    down = u - space.low
     return np.asarray(np.where(up >= down, np.minimum(up, 1e3), -np.minimum(down, 1e3)))
 
 

@@ -61,7 +61,9 @@ class Identified(ReadOnlyArrays):
     ten_step_fit: Array
     excitation: float
     delays: tuple[int, ...]
-    __eq__, __hash__ = object.__eq__, object.__hash__  # fits may be NaN
+    # fits may be NaN
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
 
     def __str__(self) -> str:
         """Return the report of the model."""
@@ -71,7 +73,8 @@ class Identified(ReadOnlyArrays):
         """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E"."""
         name = check_choice("name", name, ("A", "B", "E"))
         level = check_range("level", level, 0, 1, "()")
-        value, error = getattr(self.model, name), getattr(self, f"standard_error_{name}")
+        value = getattr(self.model, name)
+        error = getattr(self, f"standard_error_{name}")
         width = stdtrit(self.degrees_of_freedom, (1 + level) / 2) * error
         return value - width, value + width
 

@@ -91,7 +91,9 @@ class IdentifiedOutputs(ReadOnlyArrays):
     start: tuple[Array, Array]
     drift: Array
     every: tuple[int, ...] = ()
-    __eq__, __hash__ = object.__eq__, object.__hash__  # fits may be NaN
+    # fits may be NaN
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
 
     def __str__(self) -> str:
         """Return the report."""
@@ -158,7 +160,8 @@ class IdentifiedOutputs(ReadOnlyArrays):
         rest = model.x_ss - model.A @ model.x_ss - driven @ np.append(model.u_ss, model.d_ss)
         none = np.zeros(len(self.noise))
         C = model.shown
-        sparse, c = any(each > 1 for each in self.every), rest + self.drift
+        sparse = any(each > 1 for each in self.every)
+        c = rest + self.drift
         return Innovations(model.A, driven, self.gain, C, c, none, self.noise, sparse)
 
 
@@ -225,7 +228,9 @@ def identify_outputs(
     else:
         log = Log.with_gaps(outputs, inputs, dt, disturbances)
     wanted = None if isinstance(order, str) and order == "auto" else check_int("order", order, 1)
-    (q, m, d), read, every = log.sizes, list(log.episodes), log.every
+    (q, m, d) = log.sizes
+    read = list(log.episodes)
+    every = log.every
     slow = np.array(every) > 1
     episodes = stand_ins(read, slow) if slow.any() else read
     require_moving(episodes, log.sizes)
@@ -234,7 +239,8 @@ def identify_outputs(
     except ValueError as error:
         raise ValueError(str(error).replace("x[", "y[")) from None
     share = check_range("held_out", held_out, 0, 0.5, "[]")
-    center, scale = plain.center, np.where(plain.spread > 0, plain.spread, 1.0)
+    center = plain.center
+    scale = np.where(plain.spread > 0, plain.spread, 1.0)
     scaled = [_scaled(each, center, scale, q, m) for each in episodes]
     known = [_scaled(each, center, scale, q, m) for each in read]
     found = fit_structure(scaled, wanted, as_delays(delay, m), share, known)
@@ -303,9 +309,12 @@ def _in_plant_units(
     The first states are the outputs, where C can be inverted for that. Outputs count from zero:
     ``y = C x + e``.
     """
-    model, n = found.model, found.model.order
-    unit, driven = scale[:q], scale[q:]
-    C, rest = unit[:, None] * model.C, center[:q] + unit * model.y_0
+    model = found.model
+    n = found.model.order
+    unit = scale[:q]
+    driven = scale[q:]
+    C = unit[:, None] * model.C
+    rest = center[:q] + unit * model.y_0
     sizes = np.linalg.svd(model.C, compute_uv=False)
     T = np.eye(n)
     if n >= q and sizes[-1] * APART > sizes[0]:
@@ -315,15 +324,22 @@ def _in_plant_units(
     if not np.array_equal(T, np.eye(n)):
         C = np.eye(q, n)
     shift = np.linalg.lstsq(C, rest, rcond=None)[0]
-    A, B, K = T @ model.A @ back, T @ model.B / driven, T @ model.K / unit
+    A = T @ model.A @ back
+    B = T @ model.B / driven
+    K = T @ model.K / unit
     c = T @ model.c + shift - A @ shift - B @ center[q:]
-    mean, spread = T @ found.start[0] + shift, T @ found.start[1] @ T.T
+    mean = T @ found.start[0] + shift
+    spread = T @ found.start[1] @ T.T
     left = rest - C @ shift
     if np.any(np.abs(left) > 1e-9 * (np.abs(rest) + unit)):
         # Fewer states than outputs: a state that is always 1 holds what C x leaves of the outputs.
-        A, B = linalg.block_diag(A, 0.0), np.vstack([B, np.zeros((1, B.shape[1]))])
-        K, C = np.vstack([K, np.zeros((1, q))]), np.column_stack([C, left])
-        c, mean, spread = np.append(c, 1.0), np.append(mean, 1.0), linalg.block_diag(spread, 0.0)
+        A = linalg.block_diag(A, 0.0)
+        B = np.vstack([B, np.zeros((1, B.shape[1]))])
+        K = np.vstack([K, np.zeros((1, q))])
+        C = np.column_stack([C, left])
+        c = np.append(c, 1.0)
+        mean = np.append(mean, 1.0)
+        spread = linalg.block_diag(spread, 0.0)
     noise = unit[:, None] * model.noise * unit
     plain = Innovations(A, B, K, C, c, np.zeros(q), noise, model.sparse)
     return plain, (mean, spread)
@@ -333,7 +349,9 @@ def _with_memory(
     model: Innovations, m: int, delays: Sequence[int]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return A, B, E, C and K with the inputs on their way as the last states."""
-    n, late, q = model.order, sum(delays), len(model.C)
+    n = model.order
+    late = sum(delays)
+    q = len(model.C)
     A: Array = linalg.block_diag(model.A, np.zeros((late, late)))
     B: Array = np.zeros((n + late, m))
     last = n - 1
@@ -371,7 +389,8 @@ def _notes(
     log: Log, found: Structure, plain: Regression, step: Regression, noise: Array
 ) -> list[str]:
     """Return notes on the fit, dead time, weak excitation, feedback, curvature and poles."""
-    m, n = log.sizes[1], found.model.order
+    m = log.sizes[1]
+    n = found.model.order
     driven = [*(log.input_names or names((0, m))), *names((0, 0, log.sizes[2]))]
     notes = [
         f"From outputs: order {n}, fitted to {sum(map(len, log.episodes))} steps; one step differs "

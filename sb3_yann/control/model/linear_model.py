@@ -120,15 +120,18 @@ class LinearModel(LinearSystem):
         E = check_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
         if d_ss is not None and to_float("d_ss", d_ss).size and not E.size:
             raise ValueError(f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E.")
-        x, u = check_vector("x_ss", x_ss, n), check_vector("u_ss", u_ss, B.shape[1])
-        d, moved = check_vector("d_ss", d_ss, E.shape[1]), check_vector("drift", drift, n)
+        x = check_vector("x_ss", x_ss, n)
+        u = check_vector("u_ss", u_ss, B.shape[1])
+        d = check_vector("d_ss", d_ss, E.shape[1])
+        moved = check_vector("drift", drift, n)
         named = (
             as_names("state_names", state_names, n),
             as_names("input_names", input_names, u.size),
         )
         labels = [*(named[0] or names((n,))), *(named[1] or names((0, u.size)))]
         require_different(labels)
-        step, kept = check_positive("dt", dt), as_units(units, labels)
+        step = check_positive("dt", dt)
+        kept = as_units(units, labels)
         seen = check_indices("estimated", estimated, E.shape[1])
         shown = None if C is None else check_array("C", C, ("q", n))
         super().__init__(

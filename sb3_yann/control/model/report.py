@@ -9,11 +9,13 @@ from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
-UNREACHED, HARDLY_REACHED = 1e-6, 1e-3
+UNREACHED = 1e-6
+HARDLY_REACHED = 1e-3
 """Motions of a direction by the inputs, relative to the largest."""
 DOUBLINGS = 16  # doublings of the Gramian's horizon: 65,536 samples
 GONE = 0.1  # time constant, in samples, below which a mode counts as a delay
-SLOW_SAMPLING, FAST_SAMPLING = 1.0, 50.0
+SLOW_SAMPLING = 1.0
+FAST_SAMPLING = 50.0
 """Time constants, in samples, below which sampling is too slow, and above too fast.
 
 Åström and Wittenmark (*Computer-Controlled Systems*) advise 4 to 10 samples per rise time."""
@@ -97,14 +99,17 @@ def reach(model: LinearSystem) -> tuple[Array, Array]:
     The directions, in rows, are the principal axes of the scaled controllability Gramian. In short
     samples ``B, AB, ...`` are nearly parallel: the rank of ``control.ctrb`` would mislead.
     """
-    A, B = model.A, model.B / np.maximum(np.linalg.norm(model.B, axis=0), np.finfo(float).tiny)
+    A = model.A
+    B = model.B / np.maximum(np.linalg.norm(model.B, axis=0), np.finfo(float).tiny)
     radius = np.max(np.abs(np.linalg.eigvals(A)))
     if radius > 0.999:  # a smaller A has the same reachable subspace
         A = A * (0.999 / radius)
-    gramian, power = B @ B.T, A
+    gramian = B @ B.T
+    power = A
     # Smith's doubling sums positive terms: bad scaling does not spoil it as it does an equation.
     for _ in range(DOUBLINGS):
-        gramian, power = gramian + power @ gramian @ power.T, power @ power
+        gramian = gramian + power @ gramian @ power.T
+        power = power @ power
     moved = np.sqrt(np.maximum(np.diag(gramian), 0))
     # A state that no input moves must not be scaled up from its rounding.
     still = moved <= 1e-12 * np.max(moved, initial=0)
@@ -149,9 +154,11 @@ def _scaling(model: LinearSystem) -> list[str]:
         # An unstable plant has this steady state but does not approach it.
         stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
         verb = "moves the state to" if stable else "would balance the state at"
-        held, away = "Held at 1", ""
+        held = "Held at 1"
+        away = ""
         if np.any(model.x_ss) or np.any(model.u_ss):  # what follows are deviations
-            held, away = "Held at u_ss + 1", "x_ss + "
+            held = "Held at u_ss + 1"
+            away = "x_ss + "
         lines += [
             f"  {held}, {labels_of(model)[1][j]} {verb} {away}{_vector(g)}."
             for j, g in enumerate(gain.T)

@@ -13,7 +13,8 @@ from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.coordinates import ThetaLayout
 
-DRIFT, BEYOND = 1e-3, 0.5
+DRIFT = 1e-3
+BEYOND = 0.5
 """In widths: the drift in a sample that warns; how far theta's box reaches beyond soft bounds."""
 
 Bounds = tuple[Array, Array]
@@ -86,7 +87,9 @@ def constant_box(layout: ThetaLayout, r: Bounds, d: Bounds) -> list[Bounds]:
 
 def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
     """Return the unit of violation (size,) of soft bounds; one number is for all that are there."""
-    size, bounded, units = len(bounds[0]), np.isfinite(bounds).any(axis=0), given
+    size = len(bounds[0])
+    bounded = np.isfinite(bounds).any(axis=0)
+    units = given
     if given.ndim == 0:
         units = np.where(bounded, given, 0.0) if np.any(bounded) else np.full(size, float(given))
     units = check_array(name, units, (size,))
@@ -110,7 +113,8 @@ def theta_box(
     ``states`` (n,) stand in for them. ``others`` are the boxes of r, d, bounds and the previous
     input, from which those given must not differ.
     """
-    n, parts = layout.n_states, []
+    n = layout.n_states
+    parts = []
     for value, fallback in zip(given, states, strict=True):
         part = fallback if value is None else to_float("theta", value)
         parts.append(part[:n] if part.shape == (layout.size,) else part)
@@ -161,7 +165,8 @@ def warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
 
 def warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> None:
     """Warn of soft bounds of states that no theta of the box breaks."""
-    (lower, upper), (low, high) = bounds, box
+    (lower, upper) = bounds
+    (low, high) = box
     unused = (softness > 0) & (low >= lower) & (high <= upper)
     if np.any(unused):
         i = int(np.argmax(unused))
@@ -184,7 +189,9 @@ def warn_of_misread_bounds(
     left_out = {name: (low > point) | (high < point) for name, (low, high, point) in ranges.items()}
     for name, (lower, upper, points) in ranges.items():
         for i in np.flatnonzero(left_out[name] & (lower < 0) & (upper > 0))[:1]:
-            low, high, point = lower[i], upper[i], points[i]
+            low = lower[i]
+            high = upper[i]
+            point = points[i]
             warnings.warn(
                 f"{name}_min = {low:g} and {name}_max = {high:g} of entry {i} leave out the "
                 f"operating point, {point:g}, and hold 0. Bounds are what the plant shows. If "

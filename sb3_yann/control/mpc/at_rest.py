@@ -28,7 +28,8 @@ def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
 def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return the room to the upper and lower bounds of x, u, y and mixed ones, negative beyond."""
     constant = _constants(problem, r, d)
-    x, u = constant @ problem.steady_states.x.T, constant @ problem.steady_states.u.T
+    x = constant @ problem.steady_states.x.T
+    u = constant @ problem.steady_states.u.T
     own = problem.deviations
     mixed = x @ own.mixed.F.T + u @ own.mixed.G.T
     value = np.concatenate([x, u, x @ own.outputs.C.T, mixed], axis=-1)
@@ -69,7 +70,8 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
 
 def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return [r; d] in deviations, of shape (p + d,) or (batch, p + d)."""
-    p, n_d = len(problem.tracking.C), problem.model.n_disturbances
+    p = len(problem.tracking.C)
+    n_d = problem.model.n_disturbances
     rests = np.split(problem.theta_ss[problem.layout.now], [p])
     parts = []
     for name, value, size, rest in zip("rd", (r, d), (p, n_d), rests, strict=True):
@@ -106,7 +108,8 @@ def value(problem: MPCProblem, law: Law, gamma: float) -> Value:
     """Return what :meth:`LinearMPC.value_terms` does; without a price it is solved for in z."""
     if problem.price.counts:
         return _priced_value(problem, law, gamma)
-    errors, K = problem.error_system, gain_at_rest(problem, law)
+    errors = problem.error_system
+    K = gain_at_rest(problem, law)
     P = lqr.policy_value(errors.model, errors.Q, errors.R, K, gamma, errors.cross)
     P = np.asarray(errors.to_error.T @ P @ errors.to_error)
     return Value(P, np.zeros(len(P)), 0.0)
@@ -114,7 +117,8 @@ def value(problem: MPCProblem, law: Law, gamma: float) -> Value:
 
 def state_action_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
     """Return the same of ``[theta; u]``: the cost of u now, the law ever after."""
-    after, AB = value(problem, law, gamma), np.hstack(problem.prediction)
+    after = value(problem, law, gamma)
+    AB = np.hstack(problem.prediction)
     return Value(
         np.asarray(problem.stage_matrix + gamma * AB.T @ after.P @ AB),
         problem.stage_slope + gamma * AB.T @ after.slope,
@@ -136,7 +140,8 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
     theta = problem.theta_rest
     for _ in range(REST_STEPS):
         u = law(theta)
-        before, theta = theta, A @ theta + B @ u
+        before = theta
+        theta = A @ theta + B @ u
         if np.all(np.abs(theta - before) <= 1e-13 * problem.theta_half):
             break
     else:
@@ -148,7 +153,8 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
     K = law.gain(theta)
     held = law(theta) - K @ theta
     # On [theta; 1]: a price is a quadratic form of it.
-    n, one = problem.n_theta, np.ones((1, 1))
+    n = problem.n_theta
+    one = np.ones((1, 1))
     stage = Value(problem.stage_matrix, problem.stage_slope, problem.price.constant).form
     play = np.block([[np.eye(n), np.zeros((n, 1))], [K, held[:, None]], [np.zeros((1, n)), one]])
     closed = linalg.block_diag(A + B @ K, one)
@@ -163,7 +169,8 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
 def gain_at_rest(problem: MPCProblem, law: Law) -> Array:
     """Return K (m, n_z) with ``v = -K z`` near rest, where the law must rest."""
     errors = problem.error_system
-    rest, unit = problem.theta_rest, 2 * problem.u_half
+    rest = problem.theta_rest
+    unit = 2 * problem.u_half
     if not law.in_domain(rest) or np.any(np.abs(law(rest)) > 1e-9 * unit):
         raise ValueError(
             "The law does not rest at the origin: theta = 0 must be feasible with u = 0. "

@@ -71,14 +71,16 @@ def offset_free(
     (8,)
     """
     check_type("mpc", mpc, LinearMPC, "a LinearMPC")
-    old, n = mpc.model, mpc.model.n_states
+    old = mpc.model
+    n = mpc.model.n_states
     if old.estimated:
         raise ValueError(
             f"The MPC has {len(old.estimated)} estimated disturbances already: their observer is "
             "DisturbanceObserver(mpc.model)."
         )
     C = old.shown if measured is None else check_outputs("measured", measured, n)
-    q, tracked = len(C), mpc.tracking.C
+    q = len(C)
+    tracked = mpc.tracking.C
     if np.any(np.abs(tracked - tracked @ np.linalg.pinv(C) @ C) > 1e-9 * (1 + np.abs(tracked))):
         raise ValueError(
             "A tracked output is no combination of the measured ones: its offset is not known. "
@@ -88,7 +90,8 @@ def offset_free(
     shown = np.abs(C) @ unit
     largest = SHARE * shown if d_max is None else d_max
     bound = check_positive_vector("d_max", largest, q, "In units of the measured states.")
-    known, of_both = mpc.disturbances, old.n_disturbances + q
+    known = mpc.disturbances
+    of_both = old.n_disturbances + q
     own: dict[str, Any] = {
         "E": np.hstack([old.E, np.linalg.pinv(C)]),
         "d_ss": np.concatenate([old.d_ss, np.zeros(q)]),
@@ -146,7 +149,9 @@ def with_extra(mpc: LinearMPC, low: ArrayLike, high: ArrayLike) -> LinearMPC:
     top = check_array("high", np.atleast_1d(high), (len(bottom),))
     if not np.all(bottom < top):
         raise ValueError(f"low = {bottom.tolist()} must lie below high = {top.tolist()}.")
-    old, known, k = mpc.model, mpc.disturbances, len(bottom)
+    old = mpc.model
+    known = mpc.disturbances
+    k = len(bottom)
     if known.preview:
         raise ValueError(
             f"Disturbances have a preview of {known.preview} samples, extra signals have none: "
@@ -163,7 +168,8 @@ def with_extra(mpc: LinearMPC, low: ArrayLike, high: ArrayLike) -> LinearMPC:
         "estimated": [i + k for i in old.estimated],
     }
     F, g = mpc.terminal.set
-    start, states = mpc.layout.disturbance.start + first, mpc.layout.state
+    start = mpc.layout.disturbance.start + first
+    states = mpc.layout.state
     found = replace(
         mpc,
         model=LinearModel(**{**vars(old), **own}),

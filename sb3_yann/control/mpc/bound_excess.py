@@ -41,7 +41,8 @@ class Bounds:
     def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
         """Return those of a problem, and of its states (n,) besides, in deviations."""
         problem = problem.deviations
-        outputs, n = problem.outputs, problem.model.n_states
+        outputs = problem.outputs
+        n = problem.model.n_states
         size = (problem.theta_max - problem.theta_min)[:n] / 2
         # Without a box the size of a bound is the unit: one that is fixed would be hidden.
         ends = np.abs([problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]])
@@ -72,7 +73,8 @@ class Bounds:
         Room and result are in half-widths; below a lower bound it is negative.
         """
         y = thetas[..., self.states] @ self.C.T
-        low, high = self.low, self.high
+        low = self.low
+        high = self.high
         own_low, own_high, L, H = self.moving
         if np.any(L) or np.any(H):
             low = np.maximum(low, own_low + thetas @ L.T)
@@ -83,7 +85,8 @@ class Bounds:
 
 def mixed_half(problem: MPCProblem) -> Array:
     """Return what the rows (k,) of MixedBounds come to in half-widths of states and inputs."""
-    mixed, size = problem.mixed, problem.theta_half[problem.layout.state]
+    mixed = problem.mixed
+    size = problem.theta_half[problem.layout.state]
     return np.asarray(np.abs(mixed.F) @ size + np.abs(mixed.G) @ problem.u_half)
 
 
@@ -92,7 +95,8 @@ def mixed_beyond(problem: MPCProblem, thetas: Array, inputs: Array, room: float 
 
     As `Bounds.beyond`, at thetas (..., n_theta) and inputs (..., m) of the same samples.
     """
-    mixed, half = problem.mixed, mixed_half(problem)
+    mixed = problem.mixed
+    half = mixed_half(problem)
     low, high = problem.limits_at("mixed", thetas)
     made = thetas[..., problem.layout.state] @ mixed.F.T + inputs @ mixed.G.T
     above = np.maximum((made - high) / half - room, 0)
@@ -110,7 +114,8 @@ class BoundNames(NamedTuple):
     @classmethod
     def of(cls, problem: MPCProblem) -> BoundNames:
         """Return those of a problem."""
-        model, bounds = problem.model, Bounds.of(problem)
+        model = problem.model
+        bounds = Bounds.of(problem)
         states, inputs = labels_of(model)
         units = [*(model.units or [""] * (len(states) + len(inputs)))]
         of_states = [*zip(states, units, strict=False)]
@@ -198,12 +203,18 @@ def bound_excess(
     over = np.where(counts, np.where(np.isnan(over), np.inf, over), 0.0)
     first = len(bounds.half)
     count = over.shape[-1]
-    softness, half, own = np.zeros(count), np.ones(count), np.zeros((3, count), dtype=bool)
-    softness[:first], half[:first] = bounds.softness, bounds.half
-    own[0, :first], own[1, :first] = bounds.of_states, ~bounds.of_states
+    softness = np.zeros(count)
+    half = np.ones(count)
+    own = np.zeros((3, count), dtype=bool)
+    softness[:first] = bounds.softness
+    half[:first] = bounds.half
+    own[0, :first] = bounds.of_states
+    own[1, :first] = ~bounds.of_states
     if len(problem.mixed.F):
         last = np.arange(count - len(problem.mixed.F), count)
-        softness[last], half[last], own[2, last] = problem.mixed.soft, mixed_half(problem), True
+        softness[last] = problem.mixed.soft
+        half[last] = mixed_half(problem)
+        own[2, last] = True
     hard = softness <= 0
     penalty = nothing
     for part in own:  # each of them shares a slack
@@ -213,7 +224,8 @@ def bound_excess(
             penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
     of_any = np.max(over, axis=0)
     of_hard = np.where(hard, of_any, 0.0)
-    largest, any_bound = of_hard.max(axis=-1), of_any.max(axis=-1)
+    largest = of_hard.max(axis=-1)
+    any_bound = of_any.max(axis=-1)
     worst = np.argmax(np.where(largest[..., None] > 0, of_hard, of_any), axis=-1)
     return BoundExcess(
         largest=largest,

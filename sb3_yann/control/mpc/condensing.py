@@ -33,7 +33,8 @@ class _Prediction:
 
     def __init__(self, problem: MPCProblem, feedback: Array | None) -> None:
         A, B = problem.prediction
-        n, m = problem.n_theta, problem.model.n_inputs
+        n = problem.n_theta
+        m = problem.model.n_inputs
         K = np.zeros((m, n)) if feedback is None else feedback
         self.powers: list[Array] = [np.eye(n)]
         self.forced: list[Array] = [np.zeros((n, len(problem.blocks) * m))]
@@ -94,7 +95,8 @@ class _Rows:
         Limits are low and high, and how these change with theta.
         """
         upper, lower = ([f"{name} at its {k} bound" for name in names] for k in ("upper", "lower"))
-        (G, S), (low, high, low_moves, high_moves) = made, limits
+        (G, S) = made
+        (low, high, low_moves, high_moves) = limits
         self.add(upper, G, high, high_moves - S, *softness)
         self.add(lower, -G, -low, S - low_moves, *softness)
 
@@ -149,8 +151,10 @@ def _stabilizing_feedback(problem: MPCProblem) -> Array:
     weights, where Q leaves a mode on the unit circle without one. Where no gain stabilizes, as a
     mode grows that no input reaches, it is the one whose loop grows least.
     """
-    errors, box = problem.settled.error_system, problem.theta_half[problem.layout.state]
-    model, gamma = errors.model, problem.gamma
+    errors = problem.settled.error_system
+    box = problem.theta_half[problem.layout.state]
+    model = errors.model
+    gamma = problem.gamma
     unit = np.concatenate([box, problem.u_half])[: len(errors.Q)] ** -2.0
     plain = np.diag(unit), np.diag(problem.u_half**-2.0), None
     own = errors.Q, errors.R, errors.cross
@@ -173,13 +177,15 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     as many times more is rounding. It is nan where the program has no unique minimum: the laws say
     so.
     """
-    errors, gamma = problem.settled.error_system, problem.gamma
+    errors = problem.settled.error_system
+    gamma = problem.gamma
     A = errors.model.A
     B = errors.model.B
     P = problem.terminal.cost
     cross = np.zeros(B.shape) if errors.cross is None else errors.cross
     weight = np.block([[errors.Q, cross], [cross.T, errors.R]])
-    count, m = len(program.c) - program.n_slacks, problem.model.n_inputs
+    count = len(program.c) - program.n_slacks
+    m = problem.model.n_inputs
     try:
         for length in reversed(problem.blocks):
             if length > 1:
@@ -227,7 +233,8 @@ def _condensed(problem: MPCProblem, feedback: Array | None) -> tuple[ParametricQ
     slacks = [kind for kind, units in softness.items() if np.any(units)]
     H, F, c = _cost(problem, prediction)
     G, w, S, names = _constraints(problem, prediction, slacks, softness)
-    penalty, H = np.full(len(slacks), problem.soft.penalty), (H + H.T) / 2
+    penalty = np.full(len(slacks), problem.soft.penalty)
+    H = (H + H.T) / 2
     c = np.concatenate([c, penalty])
     if slacks:
         H = linalg.block_diag(H, np.diag(2 * penalty))
@@ -242,11 +249,15 @@ def _condensed(problem: MPCProblem, feedback: Array | None) -> tuple[ParametricQ
 
 def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array, Array]:
     """Return H, F and c of ``1/2 V'HV + (F theta + c)'V``, whence the factors 2."""
-    N, gamma, steady = problem.horizon, problem.gamma, problem.steady_states
-    layout, settled = problem.layout, problem.settled
+    N = problem.horizon
+    gamma = problem.gamma
+    steady = problem.steady_states
+    layout = problem.layout
+    settled = problem.settled
     every = np.eye(problem.n_theta)
     state = every[layout.state]
-    to_input, states = steady.u @ every[layout.now], state - steady.x @ every[layout.now]
+    to_input = steady.u @ every[layout.now]
+    states = state - steady.x @ every[layout.now]
     to_error = settled.error_system.to_error @ every[layout.settles]
     price = problem.price
     size = len(problem.blocks) * problem.model.n_inputs
@@ -256,16 +267,19 @@ def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array, A
     for k in range(N):
         inputs, start = prediction.inputs[k]
         weighted = 2 * gamma**k * inputs.T @ problem.R
-        H, F = H + weighted @ inputs, F + weighted @ (start - to_input @ prediction.powers[k])
+        H = H + weighted @ inputs
+        F = F + weighted @ (start - to_input @ prediction.powers[k])
     for k in range(1, N + 1):
         weight = gamma**k * (problem.terminal.cost if k == N else problem.Q)
         forced, free = prediction.of(to_error if k == N else states, k)
         weighted = 2 * forced.T @ weight
-        H, F = H + weighted @ forced, F + weighted @ free
+        H = H + weighted @ forced
+        F = F + weighted @ free
     for k in prediction.starts if np.any(problem.rate.R_du) else ():
         inputs, start = prediction.rate(k)
         weighted = 2 * gamma**k * inputs.T @ problem.rate.R_du
-        H, F = H + weighted @ inputs, F + weighted @ start
+        H = H + weighted @ inputs
+        F = F + weighted @ start
     for k in range(N) if price.counts else ():
         spent = price.u @ prediction.inputs[k][0] + price.x @ (state @ prediction.forced[k])
         c = c + gamma**k * spent
@@ -278,7 +292,8 @@ def _constraints(
     slacks: list[str],
     softness: dict[str, Array],
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    N, blocks = problem.horizon, len(problem.blocks)
+    N = problem.horizon
+    blocks = len(problem.blocks)
     rows = _Rows(slacks)
     called, inputs = labels_of(problem.model)
     limits = {kind: problem.limit_rows(kind) for kind in problem.limits}
@@ -308,7 +323,8 @@ def _constraints(
         G, S = prediction.of((mixed.F @ state)[used], k)
         if k < N:
             inputs_k, start = prediction.inputs[k]
-            G, S = G + mixed.G[used] @ inputs_k, S + mixed.G[used] @ start
+            G = G + mixed.G[used] @ inputs_k
+            S = S + mixed.G[used] @ start
         names = [f"mixed[{i}]" for i in np.flatnonzero(used)]
         low, high, low_moves, high_moves = (each[used] for each in limits["mixed"])
         own = low, high, low_moves, high_moves

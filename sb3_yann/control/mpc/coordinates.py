@@ -260,7 +260,8 @@ def error_system(
     """
     n, m = model.B.shape
     every = np.eye(layout.size)
-    x, previous = every[layout.state], every[layout.previous]
+    x = every[layout.state]
+    previous = every[layout.previous]
     is_rated = bool(np.any(weights[2]))
     from_now = np.block([[x - steady.x @ every[layout.now], np.zeros((n, m))],
                          [-steady.u @ every[layout.now], np.eye(m)]])  # fmt: skip
@@ -279,7 +280,8 @@ def error_system(
         to_theta.append(previous)
     to_error.append((every - final)[changes])
     to_theta.append(every[changes])
-    E, T = np.vstack(to_error), np.vstack(to_theta).T
+    E = np.vstack(to_error)
+    T = np.vstack(to_theta).T
     A, B = prediction
     cross = T.T @ W[: layout.size, layout.size :]
     return ErrorSystem(

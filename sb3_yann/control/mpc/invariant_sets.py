@@ -14,7 +14,8 @@ from sb3_yann.control.polyhedra import bounded_region, farthest_points
 
 MARGIN = 0.01
 """How far inside the bounds steady states must lie, relative to the bounds."""
-MAX_ROWS, MAX_STEPS = 200, 500
+MAX_ROWS = 200
+MAX_STEPS = 500
 Rows = tuple[Array, Array]  # half-spaces F theta <= g
 
 
@@ -31,7 +32,8 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     does not stabilize the model, the origin is not inside all bounds, or 500 steps or 200 rows are
     not enough.
     """
-    errors, parts = problem.error_system, problem.layout
+    errors = problem.error_system
+    parts = problem.layout
     K = lqr.gain(errors.model, errors.R, cost, problem.gamma, errors.cross)
     radius = lqr.spectral_radius(errors.model.A - errors.model.B @ K)
     if radius >= 1:
@@ -39,13 +41,15 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
             "Terminal(set='invariant') needs a terminal gain that stabilizes the model, but the "
             f"spectral radius of A - BK is {radius:.6g}. Use gamma=1, or the default terminal cost."
         )
-    gain, half = errors.to_input - K @ errors.to_error, problem.theta_half
+    gain = errors.to_input - K @ errors.to_error
+    half = problem.theta_half
     rows, bounds = hard_rows(problem)
     rows = rows @ np.vstack([np.eye(problem.n_theta), gain])
     rest = problem.theta_rest  # which the law keeps: all of it counts from there
     bounds = bounds - rows @ rest
     A, B = problem.prediction
-    rows, closed = rows * half, (A + B @ gain) * half / half[:, None]
+    rows = rows * half
+    closed = (A + B @ gain) * half / half[:, None]
     steady = rows @ _steady_projection(problem, half)
     if np.any(bounds <= 0):
         raise ValueError(
@@ -65,14 +69,17 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
 
 def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -> Rows:
     """Add the bounds of later steps until those of one step say nothing new."""
-    (F, g), (later, bounds) = found, ahead
+    (F, g) = found
+    (later, bounds) = ahead
     for _ in range(MAX_STEPS):
         later = later @ closed
-        A, b = np.vstack([F, granted[0]]), np.concatenate([g, granted[1]])
+        A = np.vstack([F, granted[0]])
+        b = np.concatenate([g, granted[1]])
         new = [i for i, row in enumerate(later) if not _is_redundant(row, float(bounds[i]), A, b)]
         if not new:
             return F, g
-        F, g = np.vstack([F, later[new]]), np.concatenate([g, bounds[new]])
+        F = np.vstack([F, later[new]])
+        g = np.concatenate([g, bounds[new]])
         if len(g) > MAX_ROWS:
             raise ValueError(
                 f"The invariant terminal set has more than {MAX_ROWS} half-spaces. Give the "
@@ -89,14 +96,17 @@ def hard_rows(problem: MPCProblem, kinds: tuple[str, ...] = ("u", "x", "y", "du"
 
     They are of one sample. Bounds that change at run time are entries of theta.
     """
-    n, m = problem.n_theta, problem.model.n_inputs
+    n = problem.n_theta
+    m = problem.model.n_inputs
     theta, u = np.split(np.eye(n + m), [n])
-    x, mixed = theta[problem.layout.state], problem.mixed
+    x = theta[problem.layout.state]
+    mixed = problem.mixed
     values = {"u": u, "x": x, "y": problem.outputs.C @ x, "mixed": mixed.F @ x + mixed.G @ u}
     if problem.layout.n_previous:
         values["du"] = u - theta[problem.layout.previous]
     softness = {"x": problem.soft.x, "y": problem.soft.y, "mixed": mixed.soft}
-    rows, ends = [np.zeros((0, n + m))], [np.zeros(0)]
+    rows = [np.zeros((0, n + m))]
+    ends = [np.zeros(0)]
     for kind in kinds:
         if kind in values:
             value = values[kind]
@@ -104,14 +114,16 @@ def hard_rows(problem: MPCProblem, kinds: tuple[str, ...] = ("u", "x", "y", "du"
             low, high, L, H = problem.limit_rows(kind)
             rows += [(value - H @ theta)[hard], (L @ theta - value)[hard]]
             ends += [high[hard], -low[hard]]
-    found, bounds = np.concatenate(rows), np.concatenate(ends)
+    found = np.concatenate(rows)
+    bounds = np.concatenate(ends)
     bounded = np.isfinite(bounds)
     return found[bounded], bounds[bounded]
 
 
 def _steady_projection(problem: MPCProblem, half: Array) -> Array:
     """Return the map from theta to the theta at rest under the same r and d, in units of half."""
-    parts, steady = problem.layout, problem.steady_states
+    parts = problem.layout
+    steady = problem.steady_states
     at_rest = np.zeros((problem.n_theta, problem.n_theta))
     at_rest[parts.state, parts.now] = steady.x
     at_rest[parts.constant, parts.constant] = np.eye(parts.constant.stop - parts.constant.start)
@@ -132,7 +144,8 @@ def _granted(problem: MPCProblem, half: Array) -> Rows:
 
 def _remove_redundant(found: Rows, granted: Rows) -> Rows:
     """Return the half-spaces that the others and the granted ones do not imply."""
-    (rows, bounds), kept = found, list(range(len(found[1])))
+    (rows, bounds) = found
+    kept = list(range(len(found[1])))
     for i in range(len(bounds)):
         others = [j for j in kept if j != i]
         A = np.vstack([rows[others], granted[0]])
@@ -147,9 +160,11 @@ def _is_redundant(row: Array, bound: float, A: Array, b: Array) -> bool:
     length = float(np.linalg.norm(row))
     if length < 1e-12:
         return True
-    row, bound = row / length, bound / length
+    row = row / length
+    bound = bound / length
     # The row itself, one further out, keeps the program bounded.
-    A, b = np.vstack([A, row]), np.append(b, bound + 1)
+    A = np.vstack([A, row])
+    b = np.append(b, bound + 1)
     best = optimize.linprog(-row, A_ub=A, b_ub=b, bounds=[(None, None)] * len(row))
     return bool(best.status == 0 and -best.fun <= bound + 1e-9)
 
@@ -188,11 +203,15 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     which looks fewer steps ahead.
     """
     problem = problem.deviations
-    half, u_half = problem.theta_half, problem.u_half
+    half = problem.theta_half
+    u_half = problem.u_half
     A, B = problem.prediction
-    own, forced = A * half / half[:, None], B * u_half / half[:, None]
-    n, unit = len(half), np.concatenate([half, u_half])
-    box, inputs = _around(problem, half), _scaled(hard_rows(problem, ("u", "du", "mixed")), unit)
+    own = A * half / half[:, None]
+    forced = B * u_half / half[:, None]
+    n = len(half)
+    unit = np.concatenate([half, u_half])
+    box = _around(problem, half)
+    inputs = _scaled(hard_rows(problem, ("u", "du", "mixed")), unit)
     bounds = _scaled(hard_rows(problem, ("x", "y")), unit)
     bounds = bounds[0][:, :n], bounds[1]
 
@@ -202,7 +221,9 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
 
     last, upper = problem.terminal.set
     end = _reduced(_joined(bounds, (last * half, upper)), box)
-    steps, found, settled = 0, bounds if end is None else end, False
+    steps = 0
+    found = bounds if end is None else end
+    settled = False
     nothing = end is None or not len(bounds[1])
     ends = not nothing and not _implies(bounds, (last * half, upper), box)
     if ends:  # a terminal set that inputs cannot stay in promises nothing
@@ -221,7 +242,8 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     F, g = found
     size = np.abs(F[:, problem.layout.state]).sum(1)
     size = np.where(size > 0, size, 1.0)
-    F, g = F / size[:, None] / half, g / size
+    F = F / size[:, None] / half
+    g = g / size
     # Inputs and rates within fixed bounds, and inputs within those of theta, are clipped anyway.
     rate_moves = any(name.startswith("du") for name in problem.layout.bounds)
     now = hard_rows(problem, ("du", "mixed") if rate_moves else ("mixed",))
@@ -231,11 +253,14 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
 
 def _around(problem: MPCProblem, half: Array) -> Rows:
     """Return the box of theta, ten times as large in the states, in half-widths."""
-    low, high = problem.theta_min / half, problem.theta_max / half
-    low, high = np.where(np.isfinite(low), low, -1), np.where(np.isfinite(high), high, 1)
+    low = problem.theta_min / half
+    high = problem.theta_max / half
+    low = np.where(np.isfinite(low), low, -1)
+    high = np.where(np.isfinite(high), high, 1)
     far = np.ones(len(half))
     far[problem.layout.state] = 10
-    middle, reach = (low + high) / 2, far * (high - low) / 2
+    middle = (low + high) / 2
+    reach = far * (high - low) / 2
     eye = np.eye(len(half))
     return np.vstack([eye, -eye]), np.concatenate([middle + reach, reach - middle])
 
@@ -257,10 +282,12 @@ def _without_inputs(ahead: Rows, inputs: Rows, box: Rows, most: int = 3000) -> R
     n = box[0].shape[1]
     while F.shape[1] > n:
         last = F[:, -1]
-        above, below = last > FEW, last < -FEW
+        above = last > FEW
+        below = last < -FEW
         if above.sum() * below.sum() > most:
             return None
-        up, down = F[above] / last[above, None], F[below] / last[below, None]
+        up = F[above] / last[above, None]
+        down = F[below] / last[below, None]
         pairs = (up[:, None] - down[None]).reshape(-1, F.shape[1])
         ends = ((g[above] / last[above])[:, None] - (g[below] / last[below])[None]).ravel()
         free = ~(above | below)
@@ -284,11 +311,13 @@ def _reduced(rows: Rows, box: Rows) -> Rows | None:
     some = length > FEW
     if np.any(g[~some] < -FEW):
         return None
-    F, g = F[some] / length[some, None], g[some] / length[some]
+    F = F[some] / length[some, None]
+    g = g[some] / length[some]
     order = np.argsort(g, kind="stable")  # of parallel rows the first, which is the nearest
     _, first = np.unique(np.round(F[order], 9), axis=0, return_index=True)
     kept = order[np.sort(first)]
-    F, g = F[kept], g[kept]
+    F = F[kept]
+    g = g[kept]
     A, b = _joined((F, g), box)
     _, radius, facets, _ = bounded_region(A, b, FEW)
     if radius <= FEW:

@@ -176,17 +176,22 @@ class LinearMPC(MPCProblem):
             model = model.model
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        n, m = model.n_states, model.n_inputs
-        horizon, gamma = arguments.as_horizon(horizon), check.check_discount(gamma)
+        n = model.n_states
+        m = model.n_inputs
+        horizon = arguments.as_horizon(horizon)
+        gamma = check.check_discount(gamma)
         infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE)
-        Q, R = check_symmetric("Q", Q, n), check_symmetric("R", R, m)
-        x, u = check_bounds("x", x_min, x_max, n), check_bounds("u", u_min, u_max, m)
+        Q = check_symmetric("Q", Q, n)
+        R = check_symmetric("R", R, m)
+        x = check_bounds("x", x_min, x_max, n)
+        u = check_bounds("u", u_min, u_max, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
         d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
         rate = _as_group("rate", rate, RateLimits).sized(m)
         outputs = _as_group("outputs", outputs, OutputBounds).sized(n)
         mixed = _as_group("mixed", mixed, MixedBounds).sized(n, m)
-        y, du = (outputs.y_min, outputs.y_max), (rate.du_min, rate.du_max)
+        y = (outputs.y_min, outputs.y_max)
+        du = (rate.du_min, rate.du_max)
         soft = _as_group("soft", soft, SoftBounds).sized(x, y, mixed.soft)
         price = _as_group("price", price, LinearCost).sized(n, m)
         terminal = _as_group("terminal", terminal, Terminal)
@@ -549,7 +554,8 @@ def _completed(problem: MPCProblem) -> Terminal:
         F, g = invariant_set(problem.deviations.settled, cost)
         F = F @ np.eye(problem.n_theta)[problem.layout.settles]
         half_spaces = F, g + F @ problem.theta_ss
-    n, size = problem.model.n_states, problem.n_theta
+    n = problem.model.n_states
+    size = problem.n_theta
     F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
     if F.shape[1] != size:
         F = np.pad(check_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))

@@ -183,8 +183,10 @@ class MPCProblem(ReadOnlyArrays):
 
         Bounds that change at run time count from what they bound: those of u from u_ss.
         """
-        x, u = self.model.x_ss, self.model.u_ss
-        y, mixed = self.outputs.C @ x, self.mixed.F @ x + self.mixed.G @ u
+        x = self.model.x_ss
+        u = self.model.u_ss
+        y = self.outputs.C @ x
+        mixed = self.mixed.F @ x + self.mixed.G @ u
         bounded = {"x": x, "u": u, "y": y, "du": np.zeros_like(u), "mixed": mixed}
         entries = map(bound_entry, self.parametric_bounds)
         bounds = np.array([bounded[kind][i] for kind, i, _ in entries])
@@ -194,7 +196,8 @@ class MPCProblem(ReadOnlyArrays):
     @cached_property
     def theta_rest(self) -> Array:
         """Theta at rest in deviations (n_theta,): zero, and the widest of bounds that change."""
-        rest, limits = np.zeros(self.n_theta), self.deviations.limits
+        rest = np.zeros(self.n_theta)
+        limits = self.deviations.limits
         entries = map(bound_entry, self.parametric_bounds)
         rest[self.layout.limits] = [limits[kind][upper][i] for kind, i, upper in entries]
         return rest
@@ -219,7 +222,8 @@ class MPCProblem(ReadOnlyArrays):
 
         A set-point is called after the state that it is for. Units stand in parentheses.
         """
-        model, found = self.model, list(self.layout.names)
+        model = self.model
+        found = list(self.layout.names)
         states, inputs = with_units(model) if units else labels_of(model)
         if model.state_names or (units and model.units):
             found[self.layout.state] = states
@@ -239,13 +243,16 @@ class MPCProblem(ReadOnlyArrays):
         Nearly all rows lie outside the box of the law, and inside with the operating point put on.
         All states must say so together, and lie nearer to zero than to the operating point.
         """
-        rows, point = np.asarray(shown, np.float64), self.theta_ss
+        rows = np.asarray(shown, np.float64)
+        point = self.theta_ss
         if not len(rows) or not np.any(point):
             return ""
         reach = self.theta_half
-        low, high = self.theta_min - 1e-6 * reach, self.theta_max + 1e-6 * reach
+        low = self.theta_min - 1e-6 * reach
+        high = self.theta_max + 1e-6 * reach
         within = [(low <= each) & (each <= high) for each in (rows, rows + point)]
-        n, end = self.model.n_states, self.layout.previous.start
+        n = self.model.n_states
+        end = self.layout.previous.start
         for first, last in ((0, n), *((i, i + 1) for i in range(n, end) if point[i])):
             is_in, would_be = (np.mean(each[:, first:last].all(axis=1)) for each in within)
             # By how much nearer to zero than to the operating point, in half-widths.
@@ -275,8 +282,10 @@ class MPCProblem(ReadOnlyArrays):
 
         In deviations.
         """
-        parts, model = self.layout, self.model
-        A, B = np.eye(parts.size)[parts.next], np.zeros((parts.size, model.n_inputs))
+        parts = self.layout
+        model = self.model
+        A = np.eye(parts.size)[parts.next]
+        B = np.zeros((parts.size, model.n_inputs))
         A[parts.state, parts.state] = model.A
         A[parts.state, parts.now[parts.n_references :]] = model.E
         A[parts.previous, parts.previous] = 0.0
@@ -324,7 +333,9 @@ class MPCProblem(ReadOnlyArrays):
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
         if self.control_horizon is not None:
             options += f", control_horizon={self.control_horizon}"
-        tracking, d, limits = self.tracking, self.disturbances, self.limits
+        tracking = self.tracking
+        d = self.disturbances
+        limits = self.limits
         r = (tracking.r_min, tracking.r_max), (d.d_min, d.d_max)
         bounds = {"x": limits["x"], "u": limits["u"], "r": r[0], "d": r[1], **limits}
         shown = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]

@@ -39,12 +39,15 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
         "d": "disturbance, constant over the horizon",
         "u_prev": "input of the step before",
     }
-    points, rests = problem.units.to_plant(problem.theta_rest), problem.units.shifted
+    points = problem.units.to_plant(problem.theta_rest)
+    rests = problem.units.shifted
     how = "in plant units; the operating point is in brackets" if rests else "in theta"
     yield f"Parameters of the law, {problem.n_theta}, {how}:"
-    labels, names = problem.labels(units=True), problem.layout.names
+    labels = problem.labels(units=True)
+    names = problem.layout.names
     width = max(10, *map(len, labels))
-    low, high = problem.theta_min, problem.theta_max
+    low = problem.theta_min
+    high = problem.theta_max
     shown = [f"[{each:.4g}]" if rests else "" for each in points]
     room = max(10, *(len(each) + 1 for each in shown)) if rests else 0
     for i, (label, name) in enumerate(zip(labels, names, strict=True)):
@@ -73,7 +76,8 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
     rows = len(problem.terminal.set[1])
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
     if problem.soft.penalty:
-        states, outputs = labels_of(problem.model)[0], range(len(problem.soft.y))
+        states = labels_of(problem.model)[0]
+        outputs = range(len(problem.soft.y))
         mixed = problem.mixed.soft
         names = [
             *states,
@@ -107,7 +111,8 @@ def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> It
 
 def _stay_feasible(problem: MPCProblem, law: Law, theta: Array) -> Array:
     """Tell which rows of theta (batch, n_theta) the closed loop keeps in the domain."""
-    (A, B), kept = problem.prediction, np.ones(len(theta), dtype=bool)
+    (A, B) = problem.prediction
+    kept = np.ones(len(theta), dtype=bool)
     for _ in range(LOOP_STEPS):
         theta = theta @ A.T + law(theta) @ B.T
         kept &= law.in_domain(theta)
@@ -119,7 +124,8 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
     """Yield which constraints act in the optimal plan, anywhere in the horizon."""
     program, names = condense(problem)
     units = ProgramUnits(program, problem.u_min, problem.u_max)
-    scaled, counts = units.scaled, dict.fromkeys(names, 0)
+    scaled = units.scaled
+    counts = dict.fromkeys(names, 0)
     for theta in (feasible - units.center) / units.half:
         U = scaled.solve(theta)
         if U is None:  # on the border of the domain

@@ -60,7 +60,9 @@ def _forms(
     total, y, z, x, hidden : ndarray
         What is written; total and z are zero before.
     """
-    batch, n, m = len(points), len(M), len(W) - len(M)
+    batch = len(points)
+    n = len(M)
+    m = len(W) - len(M)
     matrices, zero = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
     for row in range(batch):
         for j in range(n):
@@ -105,7 +107,8 @@ def _output(
     """
     batch, h = hidden.shape
     matrices, zeros = _matrices(second, pinned)
-    bias, zero = matrices[0, -1], zeros[0]
+    bias = matrices[0, -1]
+    zero = zeros[0]
     for row in range(batch):
         for a in range(h):
             hidden[row, a] = tanh(hidden[row, a] + bias[a]) - zero[a]
@@ -137,7 +140,8 @@ def _output_backward(
     before.
     """
     batch, h = hidden.shape
-    one, all_back = np.float32(1), np.float32(0)
+    one = np.float32(1)
+    all_back = np.float32(0)
     zero = _matrices(second, pinned)[1][0]
     for row in range(batch):
         back = np.float32(-factor * gradient[row, 0])
@@ -180,11 +184,15 @@ def _forms_backward(
     ``back`` (batch, h1) is the gradient by the first hidden layer. Those by points, or by nodes
     and M, are zeros unless they are asked for.
     """
-    batch, n, m = len(y), len(M), len(W) - len(M)
-    k, h = nodes.shape[1], nodes.shape[2]
+    batch = len(y)
+    n = len(M)
+    m = len(W) - len(M)
+    k = nodes.shape[1]
+    h = nodes.shape[2]
     one = np.float32(1)
     matrices, zeros = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
-    matrix, zero = matrices[0], zeros[0]
+    matrix = matrices[0]
+    zero = zeros[0]
     by_matrix = np.zeros((n + 1, h), np.float32)
     through = np.empty(h, np.float32)
     for row in range(batch):
@@ -261,14 +269,20 @@ class _Pass:
         W, AB, self.roots, scaling, pinned, self.factor = constants
         self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)
         array = to_numpy(points, np.float64)
-        (batch, size), n, h = array.shape, len(entries), nodes.shape[2]
-        total, y, z = np.zeros(batch), np.empty((batch, size)), np.zeros((batch, n))
-        x, hidden = np.empty((batch, n), np.float32), np.empty((batch, h), np.float32)
+        (batch, size) = array.shape
+        n = len(entries)
+        h = nodes.shape[2]
+        total = np.zeros(batch)
+        y = np.empty((batch, size))
+        z = np.zeros((batch, n))
+        x = np.empty((batch, n), np.float32)
+        hidden = np.empty((batch, h), np.float32)
         self.forms: tuple[Any, ...] = (y, z, x, hidden)
         _forms(array, *self.first, total, *self.forms)
         self.matrix = th.from_numpy(second)[0, :, :-1]
         product = th.mm(th.from_numpy(hidden), self.matrix.T)
-        self.hidden, self.layers = product.numpy(), (second, last, pinned)
+        self.hidden = product.numpy()
+        self.layers = (second, last, pinned)
         self.q: Single = np.empty((batch, 1), np.float32)
         _output(total, self.hidden, *self.layers, self.factor, self.q)
 
@@ -276,14 +290,20 @@ class _Pass:
         self, gradient: Single, of_points: bool, of_weights: bool
     ) -> tuple[th.Tensor | None, ...]:
         """Return the gradients by the points and the weights, as far as they are asked for."""
-        last, hidden = self.layers[1], self.hidden
-        through, by_bias = np.empty_like(hidden), np.zeros(hidden.shape[1], np.float32)
+        last = self.layers[1]
+        hidden = self.hidden
+        through = np.empty_like(hidden)
+        by_bias = np.zeros(hidden.shape[1], np.float32)
         by_last = np.zeros(last.shape, np.float32)
         _output_backward(gradient, self.factor, hidden, *self.layers, through, by_bias, by_last)
         product = th.from_numpy(through)
         back = th.mm(product, self.matrix)
-        y, M, nodes = self.forms[0], self.first[2], self.first[4]
-        by_nodes, found, by_M = np.zeros_like(nodes), np.zeros_like(y), np.zeros_like(M)
+        y = self.forms[0]
+        M = self.first[2]
+        nodes = self.first[4]
+        by_nodes = np.zeros_like(nodes)
+        found = np.zeros_like(y)
+        by_M = np.zeros_like(M)
         given = (*self.forms, *self.first, by_nodes, found, by_M)
         _forms_backward(gradient, back.numpy(), of_points, of_weights, *given)
         by_points = th.from_numpy(found) if of_points else None
@@ -305,7 +325,8 @@ class _Value(th.autograd.Function):
     ) -> th.Tensor:
         # torch notices weights that change before the backward pass
         ctx.save_for_backward(*weights)
-        ctx.done, ctx.dtype = _Pass(constants, points, weights), points.dtype
+        ctx.done = _Pass(constants, points, weights)
+        ctx.dtype = points.dtype
         return th.from_numpy(ctx.done.q)
 
     @staticmethod

@@ -33,7 +33,8 @@ def tanh(x: Any) -> Any:
     With t = tanh(x / 2) from the eighth convergent of Lambert's continued fraction
     ``t = h / (1 + h^2 / (3 + h^2 / (5 + ...)))`` at h = x / 2, it is ``2 t / (1 + t^2)``.
     """
-    one, five = np.float32(1), np.float32(5)
+    one = np.float32(1)
+    five = np.float32(5)
     h = np.float32(0.5) * x
     h = five if h > five else h  # NaN stays what it is
     h = -five if h < -five else h
@@ -95,7 +96,8 @@ def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, ou
 
     The matrix, (inputs + 1, outputs), and s(b) are number s of several: slices would be slow.
     """
-    inputs, outputs = matrices.shape[1] - 1, matrices.shape[2]
+    inputs = matrices.shape[1] - 1
+    outputs = matrices.shape[2]
     for a in range(outputs):
         out[row, a] = matrices[s, inputs, a]
     for j in range(inputs):
@@ -143,7 +145,9 @@ def network(
     hidden1, hidden2, out : ndarray
         What is written.
     """
-    batch, m, h2 = len(x), last.shape[1], last.shape[2] - 1
+    batch = len(x)
+    m = last.shape[1]
+    h2 = last.shape[2] - 1
     matrices1, matrices2, zero1, zero2 = ready
     for row in range(batch):
         s = slot[row]
@@ -213,10 +217,14 @@ def network_backward(
     (batch, m) is the gradient by the output; the others are as in :func:`network`.
     """
     batch, n = x.shape
-    k, m, h1, h2 = nodes.shape[1], last.shape[1], second.shape[2] - 1, last.shape[2] - 1
+    k = nodes.shape[1]
+    m = last.shape[1]
+    h1 = second.shape[2] - 1
+    h2 = last.shape[2] - 1
     rows = len(pinned) if dense else len(used)
     by_first = np.zeros((rows, h1, n + 1), np.float32)
-    by_x, by_1 = np.empty((batch, n), np.float32), np.empty((batch, h1), np.float32)
+    by_x = np.empty((batch, n), np.float32)
+    by_1 = np.empty((batch, h1), np.float32)
     by_2 = np.zeros((batch, h2), np.float32)
     first = first_layers(nodes, used)
     matrices1 = transposed(first, np.arange(len(used)))
