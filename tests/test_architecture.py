@@ -208,16 +208,17 @@ def _packed(tree: ast.AST) -> list[int]:
         node.lineno
         for node in ast.walk(tree)
         if isinstance(node, ast.Assign)
+        and len(node.targets) == 1
         and isinstance(node.targets[0], ast.Tuple)
         and isinstance(node.value, ast.Tuple)
         and not any(isinstance(each, ast.Starred) for each in node.value.elts)
-        and not {ast.dump(each) for each in ast.walk(node.targets[0])} & _read(node.value)
+        and not {ast.unparse(each) for each in node.targets[0].elts} & _read(node.value)
     ]
 
 
-def _read(node: ast.AST) -> set[str]:
-    """Return what is read, as it would look where it is written."""
-    return {ast.dump(each).replace("Load()", "Store()") for each in ast.walk(node)}
+def _read(value: ast.AST) -> set[str]:
+    """Return all names, attributes and entries that an expression reads."""
+    return {ast.unparse(each) for each in ast.walk(value) if isinstance(each, ast.expr)}
 
 
 def test_a_statement_assigns_one_thing_but_for_swaps() -> None:
