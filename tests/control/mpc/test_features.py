@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import linalg
 from stable_baselines3 import DDPG
 
 from sb3_yann import (
@@ -28,7 +29,7 @@ from sb3_yann import (
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
 from sb3_yann.deployment.controller import Controller
 from sb3_yann.wrappers import PlantEnv
-from sparse_qp import FEATURES, draw, problem, worst_difference
+from sparse_qp import FEATURES, SparseQP, Spec, draw, problem, worst_difference
 
 CART = LinearModel([[1, 1], [0, 1]], [[0], [1]], dt=1.0)
 BOUNDS: dict[str, Any] = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 1}
@@ -258,3 +259,47 @@ def test_what_makes_no_sense_is_named(
 ) -> None:
     with pytest.raises(error, match=message):
         cart(**changes)
+
+
+def test_four_states_and_a_horizon_of_twenty_have_few_regions_with_a_control_horizon() -> None:
+    A = linalg.expm(
+        np.array([[0, 1, 0, 0], [-1, -0.2, 1, 0.1], [0, 0, 0, 1], [1, 0.1, -1, -0.2]]) * 0.3
+    )
+    B = np.array([[0.05, 0], [0.3, 0], [0, 0.05], [0, 0.3]])
+    mpc = LinearMPC(
+        LinearModel(A, B, 0.3), Q=np.diag([1, 0.1, 1, 0.1]), R=0.1 * np.eye(2), horizon=20,
+        u_min=-1, u_max=1, theta_min=-2, theta_max=2, control_horizon=3,
+        tracking=Tracking([0, 2], -0.5, 0.5),
+    )  # fmt: skip
+    regions = mpc.explicit().n_regions
+    assert regions < 2000, regions
+
+
+def test_a_preview_makes_up_for_a_dead_time_as_well_as_a_sparse_program() -> None:
+    n = 6
+    A, B = np.eye(n, k=-1), np.eye(n, 1, k=-1)
+    A[0, 0], A[1, 0], A[0, 5] = 0.9, 0, 0.1  # the input acts five samples later
+    wide = np.full(n, 4.0)
+    spec = Spec(
+        A, B, np.zeros((n, 0)), np.zeros(n), np.zeros(1), np.zeros(0), Q=np.diag([1.0] + [0] * 5),
+        R=np.array([[0.01]]), N=12, gamma=1.0, x=(-wide, wide), u=(-wide[:1], wide[:1]),
+        C=np.eye(1, n), r=(-wide[:1], wide[:1]), d=(np.zeros(0), np.zeros(0)),
+        R_du=np.zeros((1, 1)), du=(-wide[:1], wide[:1]), blocks=[1] * 12, ahead=(12, 0),
+    )  # fmt: skip
+    references = np.repeat([0.0, 1.0, -0.5], 12)
+
+    def cost(act: Any, preview: int) -> float:
+        x, total = np.zeros(n), 0.0
+        for k in range(len(references)):
+            known = references[np.minimum(np.arange(k, k + preview + 1), len(references) - 1)]
+            u = act(np.concatenate([x, known]))
+            total += (x[0] - references[k]) ** 2 + 0.01 * (u[0] - references[k]) ** 2
+            x = A @ x + B @ u
+        return total
+
+    best = cost(SparseQP(spec), 12)
+    costs = []
+    for preview in (9, 0):
+        tracking = Tracking([0], -4, 4, preview=preview)
+        costs.append(cost(problem(spec, tracking=tracking).online(), preview))
+    assert costs[0] < 1.02 * best < 0.3 * costs[1]

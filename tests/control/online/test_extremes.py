@@ -96,3 +96,12 @@ def solved_in_fractions(program, theta: np.ndarray, active: np.ndarray) -> list[
     slack = [b - sum(map(mul, row, U)) for b, row in zip(limit, G, strict=True)]
     assert all(float(x) >= 0 for k, x in enumerate(slack) if k not in active)
     return [float(x) for x in U]
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_a_law_is_the_same_whatever_the_unit_of_the_states(unit: float) -> None:
+    points = np.random.default_rng(0).uniform(-1.4, 1.4, (200, 2)) * [1, 0.5]
+    one, other = cart(), cart(unit, soft=SoftBounds(x=unit, penalty=1e3))
+    for solve in (LinearMPC.online, LinearMPC.explicit):
+        expected = solve(one)(points)
+        np.testing.assert_allclose(solve(other)(unit * points), expected, rtol=0, atol=1e-9)

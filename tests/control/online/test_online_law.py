@@ -178,3 +178,11 @@ def test_what_a_law_remembers_does_not_travel() -> None:
     law = solved("servo").online()
     law([[0.1, 0.2, 0.3]])
     assert np.any(law.known._keys) and not np.any(pickle.loads(pickle.dumps(law)).known._keys)
+
+
+def test_inputs_do_not_depend_on_what_was_asked_before() -> None:
+    mpc = three_masses()
+    theta, fresh = points(mpc, 300), three_masses().online()
+    together = mpc.online()(theta)
+    assert np.array_equal(together, mpc.online()(theta))  # now they are known
+    assert np.array_equal(together, [fresh(each) for each in theta[::-1]][::-1])
