@@ -312,6 +312,7 @@ class ImprovementGuard(BaseCallback):
         restore = self._leave_accepted
         self._handler = InterruptHandler.install(self.model, restore, sys._getframe())
         player.policy.actor_step = self.state.step
+        player.policy.guarded = True
         self._has_begun = True
         self._record = None if self.log_path is None else Record(self.log_path, self.decisions)
         for each in refusals:
@@ -408,6 +409,7 @@ class ImprovementGuard(BaseCallback):
     def _leave_accepted(self) -> None:
         """Restore the accepted policy where Ctrl-C is about to end `learn`, also in a trial."""
         self.player.interrupted = True
+        self.player.policy.guarded = False
         restore_accepted(self.model)
 
     def _folder_of_accepted(self) -> Path | None:
@@ -465,6 +467,7 @@ class ImprovementGuard(BaseCallback):
         try:
             self._end()
         finally:
+            self.player.policy.guarded = False
             restore_accepted(self.model)
             self._save_accepted()
             self.player.close()

@@ -143,8 +143,8 @@ class Explores(StartsAsMPC):
         algorithm = None if self._algorithm is None else self._algorithm()
         if self.explored or algorithm is None or algorithm.policy is not self:
             return
-        self.explored = True
-        if not self.simulator and getattr(algorithm, "guard_state", None) is None:
+        if not self.simulator and not self.guarded:
+            self.explored = True
             name = type(algorithm).__name__
             warnings.warn(
                 f"{name} explores: it draws its actions, {100 * self.initial_std:.3g} % of the "
@@ -176,8 +176,9 @@ class MaximumEntropy(Explores):
         if algorithm is not None and algorithm.ent_coef == "auto":
             algorithm.ent_coef = f"auto_{self.balanced_entropy_coefficient():.6e}"
         if algorithm is not None and algorithm.target_entropy == "auto":
-            m = self.problem.model.n_inputs
-            algorithm.target_entropy = m * (0.5 + math.log(2 * self.initial_std * math.tau**0.5))
+            center = th.zeros(1, self.problem.model.n_inputs, dtype=th.float64)
+            drawn = TruncatedNormal(center, th.full_like(center[0], math.log(2 * self.initial_std)))
+            algorithm.target_entropy = float(drawn.entropy())
 
     def balanced_entropy_coefficient(self) -> float:
         """Return the coefficient for which the initial spread is best on the linear model.

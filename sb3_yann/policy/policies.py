@@ -73,6 +73,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
     OWN: ClassVar[tuple[str, ...]] = ()  # keywords beside those of `YannPolicy`
     THEIRS: ClassVar[tuple[str, ...]] = ()  # keywords of its SB3 policy that others have not
     CRITIC: ClassVar[type[YannCritic]] = YannCritic
+    guarded = False  # while an `ImprovementGuard` is at work
     actor: YannActor
     actor_target: YannActor
     critic: YannCritic

@@ -206,6 +206,23 @@ def test_exploring_without_a_guard_on_what_may_be_a_plant_warns_once(algorithm) 
         build(algorithm).learn(32)
 
 
+def test_a_guard_of_before_does_not_silence_that_nobody_confirms_now() -> None:
+    make = lambda: gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)  # noqa: E731
+    model = build(SAC, make(), problem=scalar_mpc(), simulator=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(32, callback=ImprovementGuard(make, n_eval_episodes=5, n_new_starts=2))
+    with pytest.warns(UserWarning, match="That belongs into a simulator"):
+        model.learn(8)
+
+
+@pytest.mark.parametrize("std", [0.02, 0.4])
+def test_the_target_is_the_entropy_of_the_cut_distribution(std: float) -> None:
+    model = build(SAC, initial_std=std)
+    entropy = model.policy.actor.distribution(th.zeros(1, 1)).entropy()
+    assert model.target_entropy == pytest.approx(entropy.item(), abs=1e-5)
+
+
 def test_entropy_starts_in_balance_and_what_the_user_gives_stays() -> None:
     model = build(SAC, initial_std=0.05)
     entropy = model.policy.actor.distribution(th.zeros(1, 1)).entropy()
