@@ -22,8 +22,8 @@ from sb3_yann.improvement.confirmation import RULE
 from sb3_yann.twin.plant_twin import PlantTwin
 
 PAIRS_TO_GIVE_UP = 10  # so many that show no gain end a trial
-MOST = 0.05  # what a policy may cost more than the MPC in any case, as a fraction of the MPC's cost
-OWN = 0.95  # share of the episodes' rewards that the stage cost explains where they are the same
+MOST_ABOVE_MPC = 0.05  # of the MPC's cost: what a policy may cost more in any case
+SAME_REWARD = 0.95  # share of the episodes' rewards that the same stage cost explains
 ALARMS = 0.25
 """Share of a policy's episodes with an alarm from which on it is taken back, two at least."""
 
@@ -100,7 +100,7 @@ def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
     if not spread > 1e-9 * np.abs(rewards).max() * np.abs(costs).max():
         return False
     correlation = -float(np.mean((rewards - rewards.mean()) * (costs - costs.mean()))) / spread
-    return not (correlation > 0 and correlation**2 >= OWN)
+    return not (correlation > 0 and correlation**2 >= SAME_REWARD)
 
 
 def why_taken_back(journal: Journal, costs: Costs) -> str:
@@ -121,7 +121,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
         return "no pair of episodes shows what it costs"
     more = costs.difference.mean
     room = costs.difference.room(RULE.significance)
-    if not more <= min(room, MOST * abs(costs.mpc)):  # nor does NaN pass
+    if not more <= min(room, MOST_ABOVE_MPC * abs(costs.mpc)):  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
     if is_hopeless(costs):
