@@ -92,7 +92,7 @@ def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> 
 
 
 SB3_KWARGS = (
-    "n_critics features_extractor_class features_extractor_kwargs normalize_images "
+    "features_extractor_class features_extractor_kwargs normalize_images "
     "share_features_extractor optimizer_class optimizer_kwargs"
 ).split()
 
@@ -128,8 +128,8 @@ def refuse_another_gamma(algorithm: BaseAlgorithm, gamma: float) -> NoReturn:
     name = type(algorithm).__name__
     raise ValueError(
         f"gamma of the {name} was set to {now} after its policy was built for {gamma}: the critic "
-        f"is exact for that one alone. Build the {name} with gamma={now}, or load it with "
-        f"custom_objects={{'gamma': {now}}}."
+        f"is exact for that one alone. Build the {name} with gamma={now}, or go on from the old "
+        f"critic: load the model with custom_objects={{'gamma': {now}}}."
     )
 
 
@@ -138,10 +138,11 @@ def require_sb3_kwargs(given: dict[str, Any], own: list[str], theirs: tuple[str,
 
     ``theirs`` are those of SB3's policy that others have not.
     """
-    if unknown := [name for name in given if name not in (*SB3_KWARGS, *theirs)]:
+    known = [*SB3_KWARGS, *theirs]
+    if unknown := [name for name in given if name not in known]:
         raise TypeError(
             f"YannPolicy takes no {', '.join(map(repr, unknown))}. Its own policy_kwargs are "
-            f"{', '.join(own)}; of SB3's it takes {', '.join(SB3_KWARGS)}. Options of the critic "
+            f"{', '.join(own)}; of SB3's it takes {', '.join(known)}. Options of the critic "
             "go into policy_kwargs={'critic': CriticOptions(...)}."
         )
     if given.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:

@@ -286,6 +286,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
     """
 
     ALGORITHMS = (PPO,)
+    THEIRS = ()
 
     def __init__(
         self, *args: Any, initial_std: float = 0.1, actor_lr_mult: float = 1.0, **kwargs: Any

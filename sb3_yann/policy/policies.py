@@ -71,7 +71,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
 
     ALGORITHMS: ClassVar[tuple[type[BaseAlgorithm], ...]] = ()  # which train it
     OWN: ClassVar[tuple[str, ...]] = ()  # keywords beside those of `YannPolicy`
-    THEIRS: ClassVar[tuple[str, ...]] = ()  # keywords of its SB3 policy that others have not
+    THEIRS: ClassVar[tuple[str, ...]] = ("n_critics",)  # not all SB3 policies have
     CRITIC: ClassVar[type[YannCritic]] = YannCritic
     guarded = False  # while an `ImprovementGuard` is at work
     actor: YannActor
@@ -218,7 +218,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         if finite_gradient(optimizer):
             return False
         self.refused[name] += 1
-        warn_of_refused_step(name, optimizer, self.refused[name])
+        algorithm = None if self._algorithm is None else self._algorithm()
+        warn_of_refused_step(name, optimizer, self.refused[name], algorithm)
         optimizer.zero_grad()
         return True
 

@@ -188,11 +188,16 @@ def _weights(optimizer: th.optim.Optimizer) -> list[th.Tensor]:
     return [each for group in optimizer.param_groups for each in group["params"]]
 
 
-def warn_of_refused_step(name: str, optimizer: th.optim.Optimizer, refused: int) -> None:
+def warn_of_refused_step(
+    name: str, optimizer: th.optim.Optimizer, refused: int, algorithm: Any
+) -> None:
     """Name a step that is not taken: the first, the tenth, the hundredth, ..."""
     if str(refused).strip("0") != "1":
         return
     advice = "Look for rewards or values that are huge, and bound or scale them."
+    paid = getattr(getattr(algorithm, "rollout_buffer", None), "rewards", np.zeros(1))
+    if not np.isfinite(paid).all():
+        advice = "The env has paid rewards that are not finite: mend it."
     if not all(bool(each.isfinite().all()) for each in _weights(optimizer)):
         advice = f"The weights of the {name} are not finite any more: load an earlier save."
     warnings.warn(

@@ -29,7 +29,7 @@ class YannTQCPolicy(MaximumEntropy, TQCPolicy):  # type: ignore[misc]
 
     ALGORITHMS = (TQC,)
     CRITIC = QuantileCritic
-    THEIRS = ("n_quantiles",)
+    THEIRS = "n_critics", "n_quantiles"
 
 
 TQC.policy_aliases["YannPolicy"] = YannTQCPolicy

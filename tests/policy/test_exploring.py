@@ -245,6 +245,9 @@ def test_the_policy_of_td3_and_state_dependent_noise_are_refused(algorithm) -> N
         algorithm("YannPolicy", env, policy_kwargs=kwargs, use_sde=True)
     with pytest.raises(ValueError, match="initial_std = 0"):
         build(algorithm, initial_std=0.0)
+    if algorithm is PPO:
+        with pytest.raises(TypeError, match="YannPolicy takes no 'n_critics'"):
+            build(PPO, n_critics=2)
 
 
 @pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])

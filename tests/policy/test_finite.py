@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import DDPG, TD3
+from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -160,6 +160,14 @@ def test_a_reward_too_large_for_float32_is_no_step_of_training(algorithm) -> Non
     assert all(bool(each.isfinite().all()) for state in moments for each in state.values())
     assert model.policy.refused["critic"] > 0
     assert int(model.policy.critic_updates) == 350 - model.policy.refused["critic"]
+
+
+def test_a_reward_that_is_not_finite_is_named_where_steps_of_ppo_are_refused() -> None:
+    env = pendulum([20])
+    model = PPO("YannPolicy", env, n_steps=64, policy_kwargs={"simulator": True}, device="cpu")
+    with pytest.warns(NonFiniteWarning, match="paid rewards that are not finite"):
+        model.learn(64)
+    assert is_finite(model)
 
 
 LOST = np.float32([[np.nan, 0.3], [0.2, np.inf], [np.nan, -np.inf], [0.1, 0.2]])
