@@ -19,10 +19,8 @@ from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import (
     MILD,
     ParametricQP,
-    SteepQP,
-    as_bits,
+    moderated,
     slack_costs,
-    solvable,
 )
 from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine, PlantLaw, as_points, bounds_of
 
@@ -171,7 +169,7 @@ class OnlineLaw(PlantLaw):
         _, feasible, found, softened = self._answers(rows)
         gains = np.zeros((len(rows), self.n_inputs, self.n_theta))
         for i in np.flatnonzero(feasible):
-            gains[i] = self._gain(found.active[i, : found.sizes[i]])
+            gains[i] = self.dual.gain(found.active[i, : found.sizes[i]])
         if softened is not None:
             for k, i in enumerate(np.flatnonzero(~feasible)):
                 gains[i] = self.dual.gain(softened.active[k, : softened.sizes[k]], soft=True)
@@ -235,13 +233,9 @@ class OnlineLaw(PlantLaw):
             found = self.dual.solve(rows)
         u = self.dual.inputs(rows, found)
         feasible = found.status == kernels.SOLVED
-        steep = self.scaled[0].steep
-        if feasible.all() and not steep and not len(self.dual.fixed[1]):
+        if feasible.all() and not len(self.dual.fixed[1]):
             return u, feasible, found, None  # mostly: the rest takes microseconds
-        uncertain = found.status == kernels.UNKNOWN
-        if steep:  # what was solved is a milder program
-            uncertain |= feasible
-        for i in np.flatnonzero(uncertain):
+        for i in np.flatnonzero(found.status == kernels.UNKNOWN):
             feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
         feasible &= self.dual.meets_fixed(rows)
         softened = None
@@ -261,19 +255,10 @@ class OnlineLaw(PlantLaw):
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
         """Write the input and active set where the compiled method has no certificate."""
         program, reach = self.scaled
-        place = theta / self.half
-        conditions = None
-        if isinstance(program, SteepQP):
-            start = self.dual.rows[found.active[at, : found.sizes[at]]]
-            conditions = program.conditions_at(place, as_bits(start))
-        if conditions is not None:
-            U: Array | None = conditions.law @ np.append(place, 1.0)
-            members = np.flatnonzero(np.isin(self.dual.rows, conditions.active))
-        else:
-            U, multipliers = program.solve_with_multipliers(place)
-            members = np.flatnonzero(multipliers[self.dual.rows] > 0)
+        U, multipliers = program.solve_with_multipliers(theta / self.half)
         if U is None:
             return False
+        members = np.flatnonzero(multipliers[self.dual.rows] > 0)
         members = members[: found.active.shape[1]]
         found.sizes[at] = len(members)
         found.active[at, : len(members)] = members
@@ -294,17 +279,6 @@ class OnlineLaw(PlantLaw):
         K = np.asarray(self.feedback)
         still = [np.all(self.S[row] == S, axis=1) for row, S in zip(rows, (-K, K), strict=True)]
         return np.where(still, rows, -1)  # not those that change at run time
-
-    def _gain(self, active: Integers) -> Array:
-        """Return the gain (m, n) of an active set; of a steep program from its KKT equations."""
-        program, reach = self.scaled
-        m = self.n_inputs
-        if isinstance(program, SteepQP):
-            found = program.conditions_of(as_bits(self.dual.rows[active]))
-            if found is not None:
-                own = reach[:m, None] * found.law[:m, :-1] / self.half
-                return np.asarray(own + np.asarray(self.feedback))
-        return self.dual.gain(active)
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
@@ -366,8 +340,6 @@ class DualProgram:
         """Return the dual form of a program whose first variables are the inputs (m,)."""
         scaled, reach = _scaled(program, u_min, u_max)
         half = half_widths(program.theta_min, program.theta_max)
-        if isinstance(scaled, SteepQP):
-            scaled = scaled.mild
         # Rows are of unit length in these units; theta itself comes in those of the plant.
         scaled = replace(scaled, F=scaled.F / half, S=scaled.S / half)
         m = len(u_min)
@@ -485,7 +457,7 @@ class KnownPoints:
 def _scaled(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[ParametricQP, Array]:
     """Return the program in units of the input range and theta's box, and those of U (v,)."""
     in_units, reach = _in_units(program, u_min, u_max)
-    return solvable(in_units), reach
+    return moderated(in_units), reach
 
 
 def _in_units(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[ParametricQP, Array]:

@@ -353,15 +353,9 @@ def _with_regions(law: Any) -> tuple[PiecewiseAffine, dict[str, Any]]:
     """Return an explicit law, and the program of one that is solved online.
 
     That is then a law of one region: the law without constraints, from which these take something.
-    ValueError where a controller cannot solve it: soft bounds that cost too much for a dual method.
     """
     if isinstance(law, PiecewiseAffine):
         return law, {}
-    if law.scaled[0].steep:
-        raise ValueError(
-            "The law is solved online, and its soft bounds cost so much that a controller cannot "
-            "solve it. Pass a smaller SoftBounds(penalty=...), or solve problem.explicit() before."
-        )
     dual = law.dual
     free = PiecewiseAffine(
         gains=dual.K[None],

@@ -273,13 +273,10 @@ class Certificate:
 
     def _fail(self, what: str, theta: Array) -> NoReturn:
         place = theta * self.half + self.center
-        advice = "shorten the horizon"
-        if self.program.steep:
-            advice = "give SoftBounds larger units or a smaller penalty"
         raise ExplicitSolutionError(
             f"The explicit solution failed its check: {what}, at theta = {place.tolist()}. The "
-            f"problem is likely to be badly conditioned: {advice}, or bring states and weights to "
-            "similar magnitudes."
+            f"problem is likely to be badly conditioned: shorten the horizon, or bring states and "
+            "weights to similar magnitudes."
         )
 
 

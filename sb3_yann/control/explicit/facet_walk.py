@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,8 @@ from sb3_yann.control.explicit.budget import (
 from sb3_yann.control.explicit.parametric_qp import (
     DEPENDENT,
     ParametricQP,
-    SteepQP,
     as_bits,
     batches,
-    kkt_solution,
     members_of,
     row_units,
 )
@@ -219,9 +217,6 @@ class Conditions:
         self.units = row_units(self.N)
         v = len(self.back)
         self.least_distance = np.eye(v), np.zeros(v), self.N * self.units[:, None]
-        # What is solved in place of all this where slacks are too costly for it.
-        own = {name: getattr(program, name)[self.kept] for name in "GwS"}
-        self.steep = replace(program, **own) if isinstance(program, SteepQP) else None
 
     def _bound_feasible_set(self, program: ParametricQP, moving: NDArray[np.intp]) -> None:
         """Set a point and the corners of the feasible theta, and the constraints that bound it."""
@@ -262,9 +257,6 @@ class Conditions:
         if rows == 0:
             return 0
         self.timer.tick(effort_of_qp(*self.N.shape))
-        if self.steep is not None:
-            U, found = self.steep.solve_with_multipliers(theta)
-            return None if U is None else as_bits(np.flatnonzero(found > 0))
         import daqp
 
         n = len(theta)
@@ -342,8 +334,6 @@ class Conditions:
     def _rows(self, factors: _Factors) -> tuple[Array, Array, Array]:
         """Return laws; slacks, or multipliers of active rows, as [S w]; the size of their terms."""
         index = factors.index
-        if self.steep is not None:
-            return kkt_solution(self.steep, index)[:3]
         W = factors.right @ self.D[index]
         rows = self.D - factors.NQ @ W
         width = np.linalg.norm(W, axis=(1, 2))[:, None]

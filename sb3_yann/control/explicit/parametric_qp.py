@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +64,6 @@ class ParametricQP:
     n_slacks: int = 0
     n_input_rows: int = 0
     feedback: Array | None = None
-    steep: ClassVar[bool] = False
 
     def first_input(self, U: Array, theta: Array, m: int) -> Array:
         """Return the first input (m,) of a solution U (v,) at theta (n,)."""
@@ -155,103 +153,28 @@ class ParametricQP:
         )
 
 
-class SteepQP(ParametricQP):
-    """A program whose slacks cost so much more than inputs that a dual method has too few digits.
+def moderated(program: ParametricQP) -> ParametricQP:
+    """Return a program in units of its input range and its box, with slacks of a bounded cost.
 
     In a dual method a slack is what is left when large numbers cancel: its digits are those of
-    float64 less those of the penalty. In the KKT equations as they stand nothing cancels. So DAQP
-    solves a milder program, for an active set to begin with. That set is changed until its KKT
-    conditions hold, and the answer is that of their equations.
+    float64 less those of the penalty. The linear part, which makes the penalty exact, and the
+    quadratic one are `MILD` times the inputs' own cost at most, with slacks in units of the largest
+    that each may be.
     """
-
-    steep = True
-
-    @cached_property
-    def mild(self) -> ParametricQP:
-        """The program with slacks that cost what a dual method can take, in units of the largest.
-
-        Its rows are those of this program, at most of length one.
-        """
-        ratio, largest = slack_costs(self)
-        inputs = len(self.c) - self.n_slacks
-        less = 1 / np.maximum(1.0, ratio / MILD)
-        H = self.H.copy()
-        c = self.c.copy()
-        G = self.G.copy()
-        H[inputs:, inputs:] *= np.sqrt(np.outer(less, less)) * np.outer(largest, largest)
-        c[inputs:] *= less * largest
-        G[:, inputs:] *= largest
-        # "No violation" is far longer than all other rows, which count as zero then.
-        units = 1 / np.maximum(1.0, np.linalg.norm(G, axis=1))
-        parts = {each.name: getattr(self, each.name) for each in fields(ParametricQP)}
-        parts |= {"H": H, "c": c}
-        parts |= {"G": G * units[:, None], "S": self.S * units[:, None], "w": self.w * units}
-        return ParametricQP(**parts)
-
-    def solve_with_multipliers(self, theta: Array) -> tuple[Array | None, Array]:
-        """Return the optimal U (v,), or None, and 1 for each active row (rows,), else 0."""
-        U, multipliers = self.mild.solve_with_multipliers(theta)
-        if U is None:
-            return None, multipliers
-        start = np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max(initial=0.0)))
-        found = self.conditions_at(theta, as_bits(start))
-        if found is None:
-            return super().solve_with_multipliers(theta)
-        active = np.zeros(len(self.w))
-        active[list(found.active)] = 1.0
-        return found.law @ np.append(theta, 1.0), active
-
-    def conditions_at(self, theta: Array, active: int) -> Optimality | None:
-        """Return the KKT conditions that hold at theta, from an active set on; None: none do.
-
-        They hold up to 1e-9, in half-widths of the box. At most 100 active sets are tried.
-        """
-        tried: set[int] = set()
-        ahead = [active]
-        while ahead and len(tried) < 100:
-            active = ahead.pop()
-            if active in tried:
-                continue
-            tried.add(active)
-            conditions = self.conditions_of(active)
-            if conditions is None:
-                continue
-            beyond = conditions.rows[:, :-1] @ theta - conditions.rows[:, -1]
-            if np.max(beyond, initial=-np.inf) <= 1e-9:
-                return conditions
-            ahead += reversed(conditions.across(int(np.argmax(beyond))))
-        return None
-
-    def conditions_of(self, active: int) -> Optimality | None:
-        """Return the KKT conditions of an active set, None where its constraints depend."""
-        if active not in self._known:
-            if len(self._known) >= 4096:
-                self._known.clear()
-            self._known[active] = None
-            with suppress(np.linalg.LinAlgError):
-                self._known[active] = optimality(self, [members_of(active)], everywhere=True)[0]
-        return self._known[active]
-
-    @cached_property
-    def _known(self) -> dict[int, Optimality | None]:
-        return {}
-
-
-def solvable(program: ParametricQP) -> ParametricQP:
-    """Return a program in units of its input range and its box as a SteepQP, if it is one.
-
-    A slack costs at most 1e15 times what inputs do: a larger penalty moves the law by less than
-    1e-15 of it, and the KKT equations become singular.
-    """
-    ratio, _ = slack_costs(program)
+    ratio, largest = slack_costs(program)
     if np.all(ratio <= MILD):
         return program
-    parts = {each.name: getattr(program, each.name) for each in fields(ParametricQP)}
-    less = np.ones(len(program.c))
-    less[len(less) - program.n_slacks :] = np.minimum(1.0, 1e15 / ratio)
-    parts["H"] = program.H * np.sqrt(np.outer(less, less))
-    parts["c"] = program.c * less
-    return SteepQP(**parts)
+    inputs = len(program.c) - program.n_slacks
+    most = MILD * np.mean(np.diag(program.H)[:inputs])
+    H = program.H.copy()
+    c = program.c.copy()
+    G = program.G.copy()
+    H[inputs:, inputs:] = np.diag(np.minimum(np.diag(H)[inputs:] * largest**2, most))
+    c[inputs:] = np.minimum(c[inputs:] * largest, most)
+    G[:, inputs:] *= largest
+    length = _row_norms(np.hstack([G, program.S]))
+    rows = {"G": G / length[:, None], "S": program.S / length[:, None], "w": program.w / length}
+    return replace(program, H=H, c=c, **rows)
 
 
 def slack_costs(program: ParametricQP) -> tuple[Array, Array]:
@@ -305,13 +228,11 @@ class Optimality:
         return as_bits(self.active)
 
 
-def optimality(
-    program: ParametricQP, members: Sequence[tuple[int, ...]], everywhere: bool = False
-) -> list[Optimality]:
+def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> list[Optimality]:
     """Return the KKT conditions of active sets of one size, from LU factors of the KKT matrices.
 
-    Those that hold in all of the unit box are left out, unless ``everywhere``. LinAlgError of numpy
-    where the constraints of an active set depend on each other.
+    Those that hold in all of the unit box are left out. LinAlgError of numpy where the constraints
+    of an active set depend on each other.
     """
     n = program.F.shape[1]
     active = np.array(members, dtype=int).reshape(len(members), len(members[0]))
@@ -324,7 +245,7 @@ def optimality(
     rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
     rows[constant, :n] = 0.0
     reach = np.abs(rows[:, :, :n]).sum(axis=2)
-    binding = rows[:, :, n] < (np.where(reach > 0, np.inf, 0.0) if everywhere else reach)
+    binding = rows[:, :, n] < reach
     return [
         Optimality(
             active=members[i],
@@ -372,10 +293,6 @@ def kkt_solution(
     depends[each, active] = False
     rows[each, active] = multipliers
     noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
-    if program.steep:  # slacks and their multipliers are far larger than all the rest
-        terms = np.abs(np.linalg.inv(K)) @ np.abs(right[:, :, : n + 1])
-        noise = np.linalg.norm(np.abs(limit) + np.abs(G) @ np.abs(laws), axis=2)
-        noise[each, active] = np.linalg.norm(terms[:, v:], axis=2)
     return np.asarray(laws), np.asarray(rows), np.asarray(noise), factors, np.asarray(depends)
 
 

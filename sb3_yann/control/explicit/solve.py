@@ -18,7 +18,7 @@ from sb3_yann._validation import Array, check_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
 from sb3_yann.control.explicit.facet_walk import walk
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, solvable
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, moderated
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
 
@@ -117,7 +117,7 @@ class ProgramUnits:
         if self.equalities is not None:
             scaled = self.equalities.eliminated(scaled)
             self.to_inputs = self.to_inputs @ self.equalities.free
-        self.scaled = solvable(scaled)
+        self.scaled = moderated(scaled)
 
     def law(self, regions: list[Region], infeasible: str) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""
