@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import stat
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -24,12 +23,6 @@ import numpy as np
 DIGEST = "digest"
 MOST = 2**32
 """Bytes of a file. What is larger is refused: a reader holds all of it in memory."""
-# What numpy writes before numbers, truth values and text; anything else is not read.
-HEADER = re.compile(
-    rb"\x93NUMPY\x01\x00..\{'descr': '([<>|][biufU]\d{1,9})', 'fortran_order': (False|True), "
-    rb"'shape': \(((?:\d{1,18}, )*\d{1,18},?|)\), \} *\n",
-    re.DOTALL,
-)
 
 
 def digest_of(arrays: Mapping[str, Any]) -> str:
@@ -125,18 +118,12 @@ def _entries(content: bytes) -> dict[str, Any]:
 
 def _array(name: str, content: bytes) -> Any:
     """Return the array of an entry; its header must fit what follows."""
-    header = HEADER.match(content)
-    if header is None:
+    file = BytesIO(content)
+    np.lib.format.read_magic(file)
+    shape, by_columns, kind = np.lib.format.read_array_header_1_0(file)
+    if kind.kind not in "biufU":
         raise ValueError(f"{name} is no array of numbers, truth values or text")
-    kind = np.dtype(header[1].decode())
-    shape = tuple(int(each) for each in header[3].replace(b",", b" ").split())
-    # An empty array may not be a large one in disguise: its other sides count, beyond 64 kB.
-    if math.prod(max(each, 1) for each in shape) * kind.itemsize > max(len(content), 1 << 16):
+    if len(content) - file.tell() != math.prod(shape) * kind.itemsize or not kind.itemsize:
         raise ValueError(f"{name} is not as large as its header says")
-    count = math.prod(shape)
-    if len(content) - header.end() != count * kind.itemsize or kind.itemsize == 0:
-        raise ValueError(f"{name} is not as large as its header says")
-    array = np.frombuffer(content, kind, count, header.end()).copy()
-    if header[2] == b"True":
-        return array.reshape(shape[::-1]).T
-    return array.reshape(shape)
+    array = np.frombuffer(content, kind, math.prod(shape), file.tell()).copy()
+    return array.reshape(shape, order="F" if by_columns else "C")

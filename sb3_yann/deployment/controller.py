@@ -48,108 +48,6 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 }
 
 
-def _shapes_of_program(
-    data: Mapping[str, Any], n: int, m: int
-) -> list[tuple[str, tuple[int, ...]]]:
-    """Return names and shapes of the program of a law that is solved online; none of others."""
-    if "qp_gram" not in data:
-        return []
-    rows = len(data["qp_d0"])
-    fixed = len(data["qp_fixed"])
-    shapes: dict[str, tuple[int, ...]] = {"D": (n, rows), "d0": (rows,), "gram": (rows, rows)}
-    shapes |= {"E": (rows, m), "softness": (rows,), "fixed": (fixed, n + 1), "most": ()}
-    return [(f"qp_{name}", shape) for name, shape in shapes.items()]
-
-
-def _shapes_of_estimator(
-    data: Mapping[str, Any], n_read: int, n_obs: int, m: int
-) -> list[tuple[str, tuple[int, ...]]]:
-    """Return names and shapes of an estimator's arrays; none where there is none.
-
-    ValueError where an entry of what the policy sees has no place that it comes from.
-    """
-    size = q = k = 0
-    if "est_gain" in data:
-        (size, q) = data["est_gain"].shape
-        k = len(data["est_loads"])
-    places = data["source"]
-    for name, most in (("source", n_read + size + m), ("est_loads", n_read)):
-        at = data[name] if name in data else places[:0]
-        if at.dtype.kind != "i" or (at < 0).any() or (at >= most).any():
-            raise ValueError(f"{name} holds what is no place of a reading or an estimate")
-    shapes: dict[str, tuple[int, ...]] = {
-        "source": (n_obs,),
-        "seen_rest": (n_obs,),
-        "missing": (n_read,),
-    }
-    if size:
-        shapes |= {"est_next": (size, size + m + k + 1), "est_rest": (size, q + m + k + 1)}
-        shapes |= {"est_first": (size, q + 1), "est_C": (q, size), "est_gain": (size, q)}
-        shapes |= {"est_input": (2, m), "est_loads": (k,), "est_box": (2, size)}
-    return [*shapes.items()]
-
-
-def _check_arrays(data: Mapping[str, Any]) -> None:
-    """Raise ValueError where arrays do not fit together, or a step cannot use them."""
-    (p, m, n) = data["gains"].shape
-    (q,) = data["b"].shape
-    n_obs = data["obs_matrix"].shape[-1]
-    n_read = len(data["obs_rest"])
-    counts = "hold recover transfer frozen_after n_layers"
-    shapes: list[tuple[tuple[int, ...], str]] = [
-        ((p, m, n), "gains"),
-        ((p, m), "offsets"),
-        ((q, n), "A"),
-        ((q,), "b"),
-        ((p,), "starts network_of"),
-        ((2, n), "confines box"),
-        ((len(data["kept"]), n + m + 2), "kept"),
-        ((2,), "tolerances fades"),
-        ((n, n_obs), "obs_matrix"),
-        ((n,), "obs_offset per_theta"),
-        ((n_read,), "obs_rest obs_min obs_max watched obs_names"),
-        ((2, m), "bounds"),
-        ((2 if len(data["change"]) else 0, m), "change"),
-        ((2 if len(data["moving"]) else 0, m), "moving"),
-        ((m,), "action_scale action_shift resting per_input middle action_names"),
-        ((), f"{counts} late_after reach zero_input"),
-    ]
-    wanted = [(name, shape) for shape, names in shapes for name in names.split()]
-    size = n
-    k = len(data["pinned"])
-    n_layers = int(data["n_layers"])
-    for i in range(n_layers):
-        width = m if i == n_layers - 1 else data[f"layer{i}"].shape[1]
-        wanted.append((f"layer{i}", (k, width, size + 1)))
-        size = width
-    wanted += _shapes_of_program(data, n, m)
-    wanted += _shapes_of_estimator(data, n_read, n_obs, m)
-    may_be_infinite = "bounds change obs_min obs_max late_after reach confines est_box".split()
-    for name, shape in wanted:
-        if data[name].shape != shape:
-            raise ValueError(f"{name} has shape {data[name].shape}, expected {shape}")
-        if name.startswith("layer") or name.endswith("names"):
-            continue  # a network that overflows is met by a step
-        if np.isnan(data[name]).any():
-            raise ValueError(f"{name} holds NaN")
-        if name not in may_be_infinite and np.isinf(data[name]).any():
-            raise ValueError(f"{name} holds infinite entries")
-    starts = data["starts"]
-    used = data["network_of"]
-    whole = all(data[name].dtype.kind == "i" for name in ("starts", "network_of", *counts.split()))
-    if not whole or any(int(data[name]) < 0 for name in counts.split()):
-        raise ValueError("a count or an index is no whole number")
-    if p == 0 or starts[0] != 0 or (np.diff([*starts, q]) < 1).any():
-        raise ValueError(f"starts are not the first rows of {p} regions in {q} half-spaces")
-    if (used < -1).any() or (used >= k).any() or (k > 0) != (n_layers > 0):
-        raise ValueError(f"network_of does not fit {k} networks")
-    low, high = data["bounds"]
-    if (low > high).any() or (data["action_scale"] <= 0).any():
-        raise ValueError("its bounds are crossed, or its scale is not above 0")
-    if str(data["activation"]) not in ACTIVATIONS:
-        raise ValueError(f"the activation is {data['activation']}")
-
-
 def _as_readings(name: str, value: Any) -> Array:
     """Return numbers as float64, NaN where they are masked; raise TypeError if they are none."""
     try:
@@ -226,17 +124,20 @@ class Controller:
                     f"The controller has format {version}, this reader takes {FORMAT}. Export the "
                     "model again, or take the reader of the version that wrote it."
                 )
-            _check_arrays(self.data)
             self.name = str(self.data["name"])
             self.activation = str(self.data["activation"])
             self.note = str(self.data.get("note", ""))
             self.obs_names = tuple(map(str, self.data["obs_names"]))
             self.action_names = tuple(map(str, self.data["action_names"]))
+            self.reset()
+            self(self.data["obs_rest"])  # arrays that do not fit together fail in a step
+            self.reset()
         except KeyError as error:
             raise ValueError(
                 f"data has no {error}: take all arrays that export wrote, by Controller.load(path)."
             ) from None
-        self.reset()
+        except (IndexError, TypeError) as error:
+            raise ValueError(f"The arrays do not fit together: {error}.") from None
 
     def __repr__(self) -> str:
         """Name the entries, who acted last, and what it lacks."""

@@ -134,13 +134,8 @@ def _arrays(kind: str) -> Callable[[Path], Target]:
                     del changed[name]
             write_arrays(path, changed)
             act = load(path)
-            n = len(act.obs_names) if kind == "controller" else act.n_theta
-            for theta in rng.uniform(-6, 6, (4, n)):
-                if kind == "controller" and not np.isfinite(act(theta)).all():
-                    raise Wrong("an action is no number")
-                if not np.isfinite(
-                    act.evaluate(theta) if kind == "controller" else act(theta)
-                ).all():
+            for theta in rng.uniform(-6, 6, (4, act.n_theta)):
+                if not np.isfinite(act(theta)).all():
                     raise Wrong("an input is no number")
             return "of use"
 
@@ -193,7 +188,7 @@ def _record(folder: Path) -> Target:
 
 TARGETS: dict[str, Callable[[Path], Target]] = {
     **{kind: _bytes(kind) for kind in ("law", "online", "controller")},
-    **{f"{kind}, signed": _arrays(kind) for kind in ("law", "online", "controller")},
+    **{f"{kind}, signed": _arrays(kind) for kind in ("law", "online")},
     "record": _record,
 }
 
