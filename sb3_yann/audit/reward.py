@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
@@ -37,16 +34,17 @@ _EFFECTS = {
     "it out",
     "NormalizeObservation": "changes observations: pass policy_kwargs={'observation': ...}",
     "RescaleObservation": "changes observations: pass policy_kwargs={'observation': ...}",
-    "FlattenObservation": "",
     "TransformObservation": "changes observations: pass policy_kwargs={'observation': ...}",
     "MaxAndSkipObservation": "repeats actions",
     "StickyAction": "does not always take the action: leave it out",
     "RepeatAction": "repeats actions: the MPC needs the sampling time and weights of all of them",
     "RescaleAction": "changes actions: build the LinearMPC for the inputs that the env takes",
-    "ClipAction": "",
     "TransformAction": "changes actions",
 }
 """What Gymnasium's wrappers do; special classes come before those that they derive from."""
+
+
+_NAMES = ("observation", "following", "action", "reward", "counted")
 
 
 @dataclass(frozen=True)
@@ -86,61 +84,7 @@ class CostFinding:
     wrappers: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Steps:
-    """The first steps of training whose rewards should be ``scale * (-cost) + offset``.
-
-    All are in deviations: theta before and after the step (steps, n), u (steps, m). Theta may err
-    by ``rounding``, of float32 observations.
-    """
-
-    theta: Array
-    following: Array
-    u: Array
-    rewards: Array
-    rounding: Array
-    scale: float
-    offset: float
-    stage_cost: Callable[[Array, Array], Array]
-
-    @cached_property
-    def cost(self) -> Array:
-        """The problem's cost of each step, (steps,)."""
-        return self.stage_cost(self.theta, self.u)
-
-    @cached_property
-    def implied(self) -> Array:
-        """The cost of each step that the reward stands for, (steps,)."""
-        return (self.offset - self.rewards) / self.scale
-
-    @cached_property
-    def rounded(self) -> Array:
-        """By how much the cost of each step may err because observations are float32, (steps,)."""
-        total: Array = np.zeros(len(self.cost))
-        for i, unit in enumerate(np.eye(self.theta.shape[1])):
-            nearby = self.theta + self.rounding[:, i : i + 1] * unit
-            total = total + np.abs(self.stage_cost(nearby, self.u) - self.cost)
-        return 2 * total
-
-    def match(self, tolerance: float) -> bool:
-        """Tell whether every reward is what the problem says."""
-        cost = np.abs(self.cost)
-        allowed = tolerance * np.maximum(cost, cost.mean()) + self.rounded
-        at_rest = 1e-9 * np.abs(self.rewards).max() + 1e-12
-        return bool(np.all(np.abs(self.implied - self.cost) <= allowed + at_rest))
-
-    def agree(self, predicted: Array, tolerance: float) -> bool:
-        """Tell whether nearly all rewards are minus a predicted cost (steps,).
-
-        Errors are relative to how much it varies: a large constant explains nothing.
-        """
-        spread = np.abs(predicted - np.median(predicted))
-        allowed = tolerance * np.maximum(spread, spread.mean()) + self.rounded
-        return bool(np.mean(np.abs(self.implied - predicted) <= allowed) >= 0.98)
-
-
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """The line nearest to ``reward = scale * (-cost) + offset``, and its share of the variance."""
 
     scale: float
@@ -148,10 +92,8 @@ class Line:
     r2: float
 
     @classmethod
-    def through(cls, steps: Steps) -> Line:
+    def through(cls, x: Array, y: Array) -> Line:
         """Return the line by least squares, through the origin where that does as well."""
-        x = -steps.cost
-        y = steps.rewards
         if not len(y):
             return cls(np.nan, np.nan, np.nan)
         if np.ptp(x) <= 1e-12 * np.abs(x).max() or np.ptp(y) <= 1e-12 * np.abs(y).max():
@@ -167,80 +109,70 @@ class Line:
         residual = y - scale * x - offset
         return cls(scale, offset, float(1 - residual @ residual / (dy @ dy)))
 
-
-def likely_cause(steps: Steps, line: Line, tolerance: float) -> tuple[str, str]:
-    """Return the name of what explains the rewards, and a sentence.
-
-    Near a steady state many explanations are nearly right, hence exact ones go first.
-    """
-    if np.ptp(steps.rewards) <= 1e-9 * np.abs(steps.rewards).max():
-        return "constant", f"every reward is {steps.rewards[0]:g}, whatever happens."
-    on_line = (steps.offset - line.scale * -steps.cost - line.offset) / steps.scale
-    after = steps.stage_cost(steps.following, steps.u)
-    for width in (EXACT, tolerance):
-        if line.scale != 0 and steps.agree(on_line, width):
-            return _scaled(line)
-        if steps.agree(after, width):
-            return "next state", (
-                "the cost is c(s', u), of the state after the step, where the problem has c(s, u). "
-                "Compute it before the env steps; where observations are late, leave the delay out."
+    @property
+    def cause(self) -> tuple[str, str]:
+        """The name of what makes such rewards, and a sentence."""
+        if self.scale < 0:
+            return "sign flipped", (
+                f"the env returns the cost itself, times {-self.scale:.6g}, as its reward. The "
+                "learner would maximize it: return minus the cost."
             )
-    return "unknown", (
-        "none that the audit knows. Compare the env's reward with problem.stage_cost(theta, u) "
-        "step by step: weights, units, what an observation means, whether actions are repeated."
-    )
+        found = f"the reward is {self.scale:.6g} times minus the cost"
+        if self.offset == 0:
+            return "scaled", f"{found}: another unit, a factor dt, or an action that is repeated."
+        why = "a bonus for each step, or a cost of what is not zero at the origin."
+        return "scaled and shifted", f"{found}, plus {self.offset:.6g}: {why}"
 
 
-def _scaled(line: Line) -> tuple[str, str]:
-    if line.scale < 0:
-        size = "" if abs(line.scale + 1) < 1e-3 else f" (times {-line.scale:.6g})"
-        return "sign flipped", (
-            f"the env returns the cost itself{size} as its reward. The learner would maximize it: "
-            "return minus the cost."
+class Rewards(NamedTuple):
+    """Costs (steps,) that rewards stand for, beside those of the state before and after a step.
+
+    Costs may err by what is ``rounded``, of float32 observations.
+    """
+
+    rewards: Array
+    implied: Array
+    cost: Array
+    after: Array
+    rounded: Array
+
+    def match(self, tolerance: float) -> bool:
+        """Tell whether every reward is what the problem says."""
+        cost = np.abs(self.cost)
+        allowed = tolerance * np.maximum(cost, cost.mean()) + self.rounded
+        at_rest = 1e-9 * np.abs(self.rewards).max() + 1e-12
+        return bool(np.all(np.abs(self.implied - self.cost) <= allowed + at_rest))
+
+    def agree(self, costs: Array, predicted: Array, tolerance: float) -> bool:
+        """Tell whether nearly all costs (steps,) are those predicted.
+
+        Errors are relative to how much it varies: a large constant explains nothing.
+        """
+        spread = np.abs(predicted - np.median(predicted))
+        allowed = tolerance * np.maximum(spread, spread.mean()) + self.rounded
+        return bool(np.mean(np.abs(costs - predicted) <= allowed) >= 0.98)
+
+    def likely_cause(self, line: Line, tolerance: float) -> tuple[str, str]:
+        """Return the name of what explains the rewards, and a sentence.
+
+        Near a steady state many explanations are nearly right, hence exact ones go first.
+        """
+        if np.ptp(self.rewards) <= 1e-9 * np.abs(self.rewards).max():
+            return "constant", f"every reward is {self.rewards[0]:g}, whatever happens."
+        for width in (EXACT, tolerance):
+            if line.scale != 0:
+                of_line = (line.offset - self.rewards) / line.scale
+                if self.agree(of_line, self.cost, width):
+                    return line.cause
+            if self.agree(self.implied, self.after, width):
+                return "next state", (
+                    "the cost is c(s', u), of the state after the step, where the problem has "
+                    "c(s, u). Compute it before the env steps; leave a delay out."
+                )
+        return "unknown", (
+            "none that the audit knows. Compare the env's reward with problem.stage_cost(theta, u) "
+            "step by step: weights, units, what an observation means, whether actions are repeated."
         )
-    found = f"the reward is {line.scale:.6g} times minus the cost"
-    if line.offset == 0:
-        why = "another unit, a factor dt, or an action that is repeated."
-        return "scaled", f"{found}: {why}"
-    why = "a bonus for each step, or a cost of what is not zero at the origin."
-    return "scaled and shifted", f"{found}, plus {line.offset:.6g}: {why}"
-
-
-def mismatch_in_words(
-    steps: Steps, line: Line, explanation: str, wrappers: tuple[str, ...]
-) -> Iterator[str]:
-    """Yield what is said of rewards that are not the problem's, sentence by sentence."""
-    expected = "minus the cost of the problem"
-    if (steps.scale, steps.offset) != (1, 0):
-        expected = f"{steps.scale:g} * (-cost) {steps.offset:+g}, as the policy assumes"
-    error = np.abs(steps.implied - steps.cost)
-    yield (
-        f"The reward is not {expected}: over {len(error)} steps the two differ by "
-        f"{error.mean():.3g} on average, where the cost is {np.abs(steps.cost).mean():.3g}."
-    )
-    yield f"Likely cause: {explanation}"
-    if wrappers:
-        named = [f"{name} {_EFFECTS.get(name, _EFFECTS['RepeatAction'])}" for name in wrappers]
-        yield f"Wrappers of the env that may do this: {'; '.join(named)}."
-    yield (
-        f"The nearest straight line is reward = {line.scale:.6g} * (-cost) {line.offset:+.6g}, "
-        f"R² = {line.r2:.6f}."
-    )
-    if line.scale > 0 and line.r2 > 0.99:
-        numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
-        yield f'Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.'
-
-
-def not_finite(lost: NDArray[np.bool_], rewards: Array, n_envs: int) -> str:
-    """Return which of the steps (steps,), those of several envs in turns, are lost, in words."""
-    first = int(np.argmax(lost))
-    reward = rewards[first]
-    what = "an observation" if np.isfinite(reward) else f"the reward, {reward:g},"
-    return (
-        f"in {lost.sum()} of {len(lost)} steps a reward or an observation is not a finite number, "
-        f"first {what} of step {first // n_envs + 1}: the env or a sensor fails. The steps are "
-        "left out."
-    )
 
 
 def wrappers_of(venv: VecEnv) -> tuple[str, ...]:
@@ -251,7 +183,7 @@ def wrappers_of(venv: VecEnv) -> tuple[str, ...]:
             continue  # not in this version of Gymnasium, or named already
         if any(venv.env_is_wrapped(each)):  # in other processes too
             found.append(each)
-    return tuple(each.__name__ for each in found if _EFFECTS.get(each.__name__, "else"))
+    return tuple(each.__name__ for each in found)
 
 
 class CostAudit(BaseCallback):
@@ -339,53 +271,40 @@ class CostAudit(BaseCallback):
             )
 
     def _judge(self) -> None:
-        names = self._records[0]
-        records = {name: np.array([each[name] for each in self._records]) for name in names}
+        records = {name: np.array([each[name] for each in self._records]) for name in _NAMES}
         shown = records["observation"], records["following"]
         finite = np.isfinite(records["reward"])
         for each in shown:
             finite &= np.isfinite(each.reshape(len(finite), -1)).all(axis=1)
-        lost = ~finite
         theta, following = (self._theta(each[finite]) for each in shown)
         u = self.policy.inputs(records["action"][finite])
         counted = records["counted"][finite]
-        steps = self._steps(
+        compared = self._compared(
             theta[counted],
             following[counted],
             u[counted],
             records["reward"][finite][counted],
-            shown[0][finite][counted],
+            self._rounding(shown[0][finite][counted]),
         )
-        enough = len(steps.rewards) >= MIN_STEPS
-        if not enough and not lost.any():
+        count = len(compared.rewards)
+        if count < MIN_STEPS and finite.all():
             return
         if not self.order_checked:
             warn_of_order(self.policy.problem, theta, u, following, stacklevel=2)
-        line = Line.through(steps)
+        line = Line.through(-compared.cost, compared.rewards)
         cause, explanation = self._vec_normalize_switched_on()
-        if not cause and enough and not steps.match(self.tolerance):
-            cause, explanation = likely_cause(steps, line, self.tolerance)
-        wrappers: tuple[str, ...] = ()
-        message = f"The reward is the cost of the problem in all of {len(steps.rewards)} steps."
+        if not cause and count >= MIN_STEPS and not compared.match(self.tolerance):
+            cause, explanation = compared.likely_cause(line, self.tolerance)
+        wrappers = wrappers_of(self.training_env) if cause else ()
+        message = f"The reward is the cost of the problem in all of {count} steps."
         if cause:
-            wrappers = wrappers_of(self.training_env)
-            message = " ".join(mismatch_in_words(steps, line, explanation, wrappers))
-        if lost.any():
-            fault = not_finite(lost, records["reward"], self.training_env.num_envs)
+            message = self._in_words(compared, line, explanation, wrappers)
+        if not finite.all():
             rest = f" In the others, {cause}: {explanation}" if cause else ""
             cause = "not finite"
-            message = f"The rewards cannot all be compared: {fault}{rest}"
+            message = f"{self._not_finite(finite, records['reward'])}{rest}"
         self._records = []
-        self.finding = CostFinding(
-            matches=not cause,
-            cause=cause,
-            message=message,
-            scale=line.scale,
-            offset=line.offset,
-            r2=line.r2,
-            steps=len(steps.rewards),
-            wrappers=wrappers,
-        )
+        self.finding = CostFinding(not cause, cause, message, *line, count, wrappers)
         if not cause:
             if self.verbose:
                 print(f"Cost audit: {message}")
@@ -399,19 +318,56 @@ class CostAudit(BaseCallback):
             return np.zeros((0, self.policy.problem.n_theta))
         return np.asarray(self.policy.theta(observations).double().cpu().numpy())
 
-    def _steps(
-        self, theta: Array, following: Array, u: Array, rewards: Array, observations: Array
-    ) -> Steps:
+    def _compared(
+        self, theta: Array, following: Array, u: Array, rewards: Array, rounding: Array
+    ) -> Rewards:
+        """Return what rewards should be, in deviations; theta may err by a ``rounding``."""
         options = self.policy.critic_options
-        return Steps(
-            theta=theta,
-            following=following,
-            u=u,
-            rewards=rewards,
-            rounding=self._rounding(observations),
-            scale=options.reward_scale,
-            offset=options.reward_offset,
-            stage_cost=self.policy.problem.deviations.stage_cost,
+        stage_cost = self.policy.problem.deviations.stage_cost
+        cost = stage_cost(theta, u)
+        rounded: Array = np.zeros(len(cost))
+        for i, unit in enumerate(np.eye(theta.shape[1])):
+            rounded += 2 * np.abs(stage_cost(theta + rounding[:, i : i + 1] * unit, u) - cost)
+        implied = (options.reward_offset - rewards) / options.reward_scale
+        return Rewards(rewards, implied, cost, stage_cost(following, u), rounded)
+
+    def _in_words(
+        self, compared: Rewards, line: Line, explanation: str, wrappers: tuple[str, ...]
+    ) -> str:
+        """Return what is said of rewards that are not the problem's."""
+        options = self.policy.critic_options
+        scale = options.reward_scale
+        offset = options.reward_offset
+        expected = "minus the cost of the problem"
+        if (scale, offset) != (1, 0):
+            expected = f"{scale:g} * (-cost) {offset:+g}, as the policy assumes"
+        error = np.abs(compared.implied - compared.cost)
+        said = [
+            f"The reward is not {expected}: over {len(error)} steps the two differ by "
+            f"{error.mean():.3g} on average, where the cost is {np.abs(compared.cost).mean():.3g}.",
+            f"Likely cause: {explanation}",
+        ]
+        if wrappers:
+            named = [f"{name} {_EFFECTS.get(name, _EFFECTS['RepeatAction'])}" for name in wrappers]
+            said.append(f"Wrappers of the env that may do this: {'; '.join(named)}.")
+        said.append(
+            f"The nearest straight line is reward = {line.scale:.6g} * (-cost) {line.offset:+.6g}, "
+            f"R² = {line.r2:.6f}."
+        )
+        if line.scale > 0 and line.r2 > 0.99:
+            numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
+            said.append(f'Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.')
+        return " ".join(said)
+
+    def _not_finite(self, finite: Array, rewards: Array) -> str:
+        """Return which steps (steps,), those of several envs in turns, are lost, in words."""
+        first = int(np.argmin(finite))
+        what = "an observation" if np.isfinite(rewards[first]) else f"the reward, {rewards[first]},"
+        return (
+            f"The rewards cannot all be compared: in {np.sum(~finite)} of {len(finite)} steps a "
+            f"reward or an observation is not a finite number, first {what} of step "
+            f"{first // self.training_env.num_envs + 1}: the env or a sensor fails. The steps are "
+            "left out."
         )
 
     def _rounding(self, observations: Array) -> Array:

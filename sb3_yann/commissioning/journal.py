@@ -25,70 +25,59 @@ from sb3_yann.twin.log import SHORTEST
 Event = dict[str, Any]
 NAME = "commissioning.jsonl"
 BEGIN = b'{"event": "begin"'
-ENDING = ', "digest": "{:0>16}"}}'
 
 
 class Record:
     """Events in their order, in a file if there is a path; ``events`` are those that it held.
 
     In a folder, a path without a suffix, it is ``commissioning.jsonl``. A last line that a kill cut
-    off is left out, and overwritten by the next event. Each line ends with a digest of all up to
-    it: a record that was changed is refused, and so is one of before there were digests.
+    off is left out, and overwritten by the next event.
     """
 
     def __init__(self, path: Path | None) -> None:
         is_folder = path is not None and (path.is_dir() or not path.suffix)
         self.path = path / NAME if path is not None and is_folder else path
         self.events: list[Event] = []
-        self._digest = ""
+        self._size = 0  # of the whole lines, in bytes
+        self._seen = 0
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.exists():
-            read = self.path.read_bytes()
-            whole, _, rest = read.rpartition(b"\n")
-            if rest and not whole and not rest.startswith(BEGIN[: len(rest)]):
-                raise ValueError(f"{self.path} is no record of a commissioning. Name another file.")
-            for number, line in enumerate(whole.split(b"\n") if whole else [], start=1):
-                try:
-                    self.events.append(self._event(line.decode("utf-8")))
-                except ValueError as error:
-                    raise ValueError(
-                        f"{self.path}, line {number}: no event of a commissioning ({error}). Name "
-                        "another file, or the one that was begun."
-                    ) from error
-            if self._is_whole(rest[:-1]):  # a kill never leaves more than the line
+        read = self.path.read_bytes() if self.path.exists() else b""
+        *lines, rest = read.split(b"\n")
+        if not lines and not rest.startswith(BEGIN[: len(rest)]):
+            raise ValueError(f"{self.path} is no record of a commissioning. Name another file.")
+        for number, line in enumerate(lines, start=1):
+            try:
+                self.events.append(dict(json.loads(line)))
+            except (TypeError, ValueError, RecursionError) as error:
                 raise ValueError(
-                    f"{self.path} has changed since it was written: its last line does not end. "
-                    "Name another file, or the one that was begun."
-                )
-            self._size = len(whole) + (len(whole) > 0)
-            self._seen = len(read)
-        else:
-            self._size = self._seen = 0
+                    f"{self.path}, line {number}: no event of a commissioning ({error}). Name "
+                    "another file, or the one that was begun."
+                ) from error
+        self._size = len(read) - len(rest)
+        self._seen = len(read)
 
     def append(self, event: Event) -> None:
         """Add an event; when this returns it is on the disk."""
         if self.path is None:
             return
-        text, digest = _with_digest(json.dumps(event, allow_nan=False), self._digest)
-        line = f"{text}\n".encode()
-        if (self.path.stat().st_size if self.path.exists() else 0) != self._seen:
+        line = f"{json.dumps(event, allow_nan=False)}\n".encode()
+        self.path.touch()
+        if self.path.stat().st_size != self._seen:
             raise RuntimeError(
                 f"{self.path} was changed by somebody else. One record belongs to one run."
             )
-        try:
-            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+        try:  # after a full disk, or Ctrl-C, the next event overwrites what is there
+            with self.path.open("r+b") as file:
                 file.truncate(self._size)
                 file.seek(self._size)
                 file.write(line)
                 file.flush()
                 os.fsync(file.fileno())
-        except BaseException:  # a full disk, or Ctrl-C: the next event overwrites what is there
-            self._seen = self.path.stat().st_size if self.path.exists() else 0
-            raise
-        self._size = self._seen = self._size + len(line)
-        self._digest = digest
+            self._size += len(line)
+        finally:
+            self._seen = self.path.stat().st_size
 
     def save(self, model: OffPolicyAlgorithm, batch: int) -> str | None:
         """Save a model beside the record, all of it or nothing; return its name."""
@@ -115,57 +104,31 @@ class Record:
             )
         model.set_parameters(str(self.path.with_name(name)), device=model.device)
 
-    def _is_whole(self, line: bytes) -> bool:
-        before = self._digest
-        try:
-            self._event(line.decode("utf-8"))
-        except ValueError:
-            return False
-        finally:
-            self._digest = before
-        return True
 
-    def _event(self, line: str) -> Event:
-        """Return the event of the next line, whose digest must follow from the lines before."""
-        text = f"{line[: -len(ENDING.format(0))]}}}"
-        signed, digest = _with_digest(text, self._digest)
-        if signed != line:
-            raise ValueError("it has changed since it was written, or has no digest")
-        event = json.loads(text)
-        if not isinstance(event, dict) or "event" not in event:
-            raise ValueError("it has no key 'event'")
-        self._digest = digest
-        return event
+def _as_event(data: Any) -> Event:
+    """Return a dataclass as JSON has it, where NaN is null."""
+    return {name: _plain(each) for name, each in asdict(data).items()}
 
 
-def _with_digest(text: str, before: str) -> tuple[str, str]:
-    """Return the text of an event with its digest as the last key, and the digest."""
-    digest = sha256(f"{before}{text}".encode()).hexdigest()[:16]
-    return text[:-1] + ENDING.format(digest), digest
+def _plain(each: Any) -> Any:
+    if isinstance(each, float) and not math.isfinite(each):
+        return None
+    return each.tolist() if isinstance(each, np.ndarray) else each
 
 
-def as_event(episode: PlantEpisode) -> Event:
-    """Return an episode as numbers and text."""
-    alarm = episode.alarm
-    return {
-        "reward": episode.reward if math.isfinite(episode.reward) else None,
-        "violations": episode.violations,
-        "alarm": None if alarm is None else [alarm.kind, alarm.message],
-        "step": episode.step,
-        "apart": episode.apart,
-        "excited": episode.excited,
-        "thetas": episode.thetas.tolist(),
-        "actions": episode.actions.tolist(),
-    }
+def _named(kind: type, event: Event) -> Event:
+    """Return the fields of a dataclass that an event holds; null stands for NaN."""
+    named = {each.name: event[each.name] for each in fields(kind)}
+    return {name: math.nan if each is None else each for name, each in named.items()}
 
 
-def as_episode(event: Event) -> PlantEpisode:
+def _as_episode(event: Event) -> PlantEpisode:
     """Return the episode of an event."""
-    alarm = None if event["alarm"] is None else Alarm(*event["alarm"])
-    reward = math.nan if event["reward"] is None else event["reward"]
-    numbers = reward, event["violations"]
-    played = np.array(event["thetas"], float), np.array(event["actions"], float)
-    return PlantEpisode(*played, *numbers, alarm, event["step"], event["apart"], event["excited"])
+    named = _named(PlantEpisode, event)
+    for name in ("thetas", "actions"):
+        named[name] = np.array(named[name], float)
+    named["alarm"] = None if event["alarm"] is None else Alarm(**event["alarm"])
+    return PlantEpisode(**named)
 
 
 Verdict = Literal["accepted", "stays", "the MPC acts", "begins anew"]
@@ -375,63 +338,49 @@ class Journal:
 
     def begin(self, by_policy: bool) -> None:
         """Note that an episode begins: if it never ends, that is evidence too."""
-        acts = self.state.policy if by_policy else "MPC"
-        self.record.append({"event": "start", "number": len(self.episodes), "acts": acts})
-        self._begin(acts)
+        self._note("start", number=len(self.episodes), acts=self._acting(by_policy))
 
     def interrupt(self) -> None:
         """Note that Ctrl-C has ended the episode: that says nothing of the policy."""
-        self.record.append({"event": "interrupted", "number": len(self.episodes)})
-        self._open = ""
+        self._note("interrupted", number=len(self.episodes))
 
     def add(self, played: PlantEpisode, by_policy: bool) -> None:
         """Add an episode."""
-        about = {
-            "event": "episode",
-            "number": len(self.episodes),
-            "acts": self.state.policy if by_policy else "MPC",
-            "max_correction": self.state.max_correction if by_policy else 0.0,
-        }
-        self.record.append({**about, **as_event(played)})
-        self._add(played, by_policy)
+        within = self.state.max_correction if by_policy else 0.0
+        about = {"number": len(self.episodes), "acts": self._acting(by_policy)}
+        self._note("episode", **about, max_correction=within, **_as_event(played))
 
     def close(self, batch: Batch, state: CommissioningState) -> None:
         """Add the decision that ends a batch."""
-        said = {  # NaN is not JSON
-            k: None if isinstance(v, float) and not math.isfinite(v) else v
-            for k, v in asdict(batch).items()
-        }
-        self.record.append({"event": "batch", **said, "from_here": asdict(state)})
-        self._close(batch, state)
+        self._note("batch", **_as_event(batch), from_here=asdict(state))
+
+    def _acting(self, by_policy: bool) -> str:
+        return self.state.policy if by_policy else "MPC"
+
+    def _note(self, kind: str, **about: Any) -> None:
+        """Write an event down, then do what it says."""
+        event = {"event": kind, **about}
+        self.record.append(event)
+        self._take(event)
 
     def _take(self, event: Event) -> None:
-        """Do again what an event of the record says."""
+        """Do what an event says: as it happens, and again from the record."""
         if event["event"] == "start":
-            self._begin(event["acts"])
+            self._cut_off = self.cut_off
+            self._open = event["acts"]
         elif event["event"] == "interrupted":
             self._open = ""
         elif event["event"] == "episode":
-            self._add(as_episode(event), event["acts"] != "MPC")
+            if event["number"] != len(self.episodes):
+                raise ValueError("the episode before it is missing")
+            self.episodes.append(_as_episode(event))
+            self.by_policy.append(event["acts"] != "MPC")
+            self._open = ""
         else:
-            named = {each.name: event[each.name] for each in fields(Batch)}
-            costs = {k: math.nan for k, each in named.items() if each is None}
-            state = CommissioningState(**event["from_here"])
-            self._close(Batch(**{**named, **costs}), state)
-
-    def _begin(self, acts: str) -> None:
-        self._cut_off = self.cut_off
-        self._open = acts
-
-    def _add(self, played: PlantEpisode, by_policy: bool) -> None:
-        self._open = ""
-        self.episodes.append(played)
-        self.by_policy.append(by_policy)
-
-    def _close(self, batch: Batch, state: CommissioningState) -> None:
-        self.batches.append(batch)
-        self.state = state
-        self._first_of_batch = len(self.episodes)
-        self._cut_off = 0
+            self.batches.append(Batch(**_named(Batch, event)))
+            self.state = CommissioningState(**event["from_here"])
+            self._first_of_batch = len(self.episodes)
+            self._cut_off = 0
 
     def report(self) -> str:
         """Return the batches as a table."""

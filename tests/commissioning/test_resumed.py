@@ -76,7 +76,6 @@ def events(path: Any) -> list[dict[str, Any]]:
     """Return a record but for digests: a saved model holds the time."""
     found = [json.loads(line) for line in (path / "plant.jsonl").read_text().splitlines()]
     for each in found:
-        del each["digest"]
         each.get("from_here", {}).pop("model_digest", None)
     return found
 
