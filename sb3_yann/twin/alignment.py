@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.optimize import linear_sum_assignment
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
@@ -39,8 +39,7 @@ LEAST_GAIN = 0.6
 RUN = 10
 MUCH_BETTER = 0.8
 """Steps of a run of the model; share of its squared error that a unit's factor leaves at most."""
-ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
-MOVING = 1e-3  # of a standard deviation: a state that moves by more in a step moves
+ROUNDING = 1e-9  # of what a state moves: an error that is smaller is rounding
 PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
 LEAST_ROWS = 20  # rows of a regression on the law, at least
 CONFIRM = (
@@ -81,8 +80,6 @@ def objections(
     if np.all(proven & (logged < EXACT_SHARE)):
         return found
     found += [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
-    if not found and not units_confirmed:
-        found += _other_units(log, proven)
     return found or [*_against_plant(log, proven)]
 
 
@@ -126,16 +123,16 @@ def _rows(log: _Log, shift: int = 0) -> tuple[Array, Array]:
     return np.concatenate(thetas), np.concatenate(inputs)
 
 
-def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) -> _OnLaw:
+def _on_law(log: _Log, shift: int, change: Array | None = None) -> _OnLaw:
     """Return the regressions on the law at the rows ``shift`` away.
 
-    With ``change`` = (M, v) the law sees M x + v in place of the logged states x.
+    With a ``change`` M the law sees M x in place of the logged states x.
     """
     m = log.problem.model.n_inputs
     theta, u = _rows(log, shift)
     if change is not None:
         state = log.problem.layout.state
-        theta[:, state] = theta[:, state] @ change[0].T + change[1]
+        theta[:, state] = theta[:, state] @ change.T
     answer = law_of(log.problem)(theta)
     known = np.isfinite(answer).all(axis=1)
     theta = theta[known]
@@ -252,56 +249,15 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
         ratio = error(change) / (np.abs(change) @ before)
         fits = ratio.min() < CLEARLY_BETTER and ratio.max() < 1.5
         if not fits and not np.all(proven):
-            on = _on_law(log, 0, (change, np.zeros(n)))
+            on = _on_law(log, 0, change)
             better = np.diagonal(on.left) < CLEARLY_BETTER * logged - 1e-9
             fits = np.any(np.diagonal(_is_one(on) & on.alone) & better & ~proven)
         if fits:
-            what = (
-                f"{names[i]} and {names[j]} are exchanged" if i != j else f"{names[i]} is negated"
-            )
+            both = f"{names[i]} and {names[j]} are exchanged"
+            what = both if i != j else f"{names[i]} is negated"
             yield (
                 f"The log fits the MPC, or its model, clearly better where {what}: look at the "
                 "columns and signs of the states."
-            )
-
-
-def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
-    """Yield where the law gives the inputs once one state is taken times a factor, plus a zero."""
-    proven = proven | _held(log)
-    if np.all(proven):
-        return
-    names = labels_of(log.problem.model)[0]
-    n = log.problem.model.n_states
-    unit = log.coordinates.units
-    law = law_of(log.problem)
-    theta, u = _rows(log)
-    some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
-    theta = theta[some]
-    u = u[some]
-    scale = np.maximum(np.std(u, axis=0), 1e-6 * log.problem.u_half)
-
-    for i in range(n):
-
-        def left(p: Array, i: int = i) -> Array:
-            rows = theta.copy()
-            rows[:, i] = p[0] * rows[:, i] + p[1] * unit[i]
-            return np.asarray(np.nan_to_num((u - law(rows)) / scale).ravel())
-
-        before = np.mean(left(np.array([1.0, 0.0])) ** 2)
-        fit = least_squares(left, [1.0, 0.0], diff_step=1e-4, max_nfev=20)
-        factor, zero = fit.x
-        moved = abs(np.log(max(abs(factor), 1e-9))) > 2 * SLOPE_TOLERANCE or abs(zero) > 0.2
-        if not moved or not np.mean(fit.fun**2) < 0.5 * before:
-            continue
-        change = np.eye(n)
-        shift = np.zeros(n)
-        change[i, i] = factor
-        shift[i] = zero * unit[i]
-        on = _on_law(log, 0, (change, shift))
-        if np.any(np.diagonal(_is_one(on) & on.alone) & ~proven):
-            yield (
-                f"The MPC gives the logged inputs where {names[i]} is {factor:.4g} times what is "
-                f"logged, {shift[i]:+.4g}: is it in other units, or has it another zero? {CONFIRM}"
             )
 
 
@@ -338,26 +294,6 @@ def _other_pace(log: _Log) -> Iterator[str]:
         )
 
 
-def _held(log: _Log) -> NDArray[np.bool_]:
-    """Return which inputs (m,) mostly stand still inside of their bounds while the states move.
-
-    No law of the states makes them.
-    """
-    problem = log.problem.deviations
-    units = log.coordinates.units
-    state = log.coordinates.row.state
-    held = []
-    moves = []
-    for each in log.episodes:
-        u = each.actions
-        x = each.thetas[:-1, state]
-        still = np.abs(np.diff(u, axis=0)) <= ROUNDING * problem.u_half
-        held.append(still & (u[1:] > problem.u_min) & (u[1:] < problem.u_max))
-        moves.append(np.any(np.abs(np.diff(x, axis=0)) > MOVING * units, axis=1))
-    moving = np.concatenate(moves)
-    return np.asarray(np.concatenate(held)[moving].mean(axis=0) > 0.5) & bool(moving.any())
-
-
 def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where inputs that the law does not prove act otherwise than the model says."""
     fit = _Effects.of(log, 0)
@@ -382,9 +318,6 @@ def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
             )
             return
     yield from _against_gains(log, fit, weights, proven)
-    driven = fit.follows.min() > 0.7 and not np.any(proven)  # in closed loop noise moves the zero
-    if driven and not (log.problem.layout.has_constants or log.units_confirmed):
-        yield from _resting(log, fit)
 
 
 def _against_gains(
@@ -445,42 +378,19 @@ def _error_of_runs(log: _Log, j: int, gain: float) -> float:
     return float(np.var(np.concatenate(errors), axis=0).sum())
 
 
-def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
-    """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
-    if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
-        return
-    A = log.problem.model.A
-    names = labels_of(log.problem.model)[0]
-    rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
-    x_ss = log.problem.model.x_ss
-    shown = log.problem.units.to_plant(rest)
-    away = np.abs(rest / log.coordinates.units)
-    if np.max(away) > 5:  # beyond the log: a state that hardly returns, or noise
-        return
-    for i in np.flatnonzero(away > 0.5):
-        yield (
-            f"Without inputs the logged plant rests at {names[i]} = {shown[i]:.4g}, the "
-            f"problem's at {x_ss[i]:.4g}: compare units and operating point of states and inputs. "
-            f"{CONFIRM}"
-        )
-
-
 @dataclass(frozen=True)
 class _Effects:
     """A regression of the next states on states and inputs.
 
     It finds B (n, m), leaves the ``covariance`` (n, n) and the mean squares ``left`` (n,).
     ``factors`` (m,) are standard errors of a column of B over the deviation of what is left.
-    ``drift`` (n,) is the next state of x = 0 and u = 0. ``follows`` (m,) is the deviation of the
-    inputs that the states leave, relative to their own.
+    ``follows`` (m,) is the deviation of the inputs that the states leave, relative to their own.
     """
 
     B: Array
     covariance: Array
     factors: Array
     left: Array
-    drift: Array
-    drift_error: Array
     follows: Array
 
     @classmethod
@@ -515,9 +425,6 @@ class _Effects:
         factors = np.linalg.norm(right.T * inverse, axis=1) / scale
         own = u - F[:, m:] @ np.linalg.lstsq(F[:, m:], u, rcond=None)[0]
         follows = np.std(own, axis=0) / np.maximum(np.std(u, axis=0), 1e-12)
-        squares = np.diag(covariance).copy()
         size = log.coordinates.scale[-m:]
-        return cls(
-            slopes[:m].T / size, covariance, factors[:m] / size, squares, slopes[m],
-            np.sqrt(squares) * factors[m], follows,
-        )  # fmt: skip
+        B = slopes[:m].T / size
+        return cls(B, covariance, factors[:m] / size, np.diag(covariance).copy(), follows)

@@ -29,7 +29,6 @@ OUTSIDE = 0.05  # share of logged rows beyond the box of theta from which on uni
 LAW = 1e-3  # how far an input may be from the MPC's own, in half-widths
 PREVIOUS = 0.01  # how far theta's previous input may be from the one before it, in half-widths
 ROUNDING = 1e-6  # of a half-width: float32 rounds so much
-SPIKE = 1e3  # one reading that is so many times as far off as most stands alone
 ALONE = 0.02
 """An input's gain is known from the data where at least this share of its variance is its own."""
 
@@ -126,27 +125,22 @@ def persistence_error(
     return np.array(found)
 
 
-def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array]:
-    """Return how much of each input is its own (m,), and how much it moves (m,).
+def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array, bool]:
+    """Return how much of each input is its own (m,), how much it moves (m,), and if it is the law.
 
-    What is linear in theta or the MPC's own input is not.
+    What is linear in theta or the MPC's own input is not its own. Where nearly every input is the
+    MPC's own, the log's units are beyond doubt.
     """
     theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
     u = np.concatenate([each.actions for each in episodes])
-    columns = np.column_stack([np.ones(len(theta)), theta, law_of(problem)(theta)])
+    law = law_of(problem)(theta)
+    columns = np.column_stack([np.ones(len(theta)), theta, law])
     left = u - columns @ np.linalg.lstsq(columns, u, rcond=None)[0]
     variance = np.var(u, axis=0)
     share = np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
-    return share, np.sqrt(variance) / problem.u_half
-
-
-def follows_law(problem: LinearMPC, episodes: tuple[Episode, ...]) -> bool:
-    """Return whether nearly every logged input is the MPC's own, so its units are beyond doubt."""
-    theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
-    u = np.concatenate([each.actions for each in episodes])
-    apart = np.abs(u - law_of(problem)(theta)) / problem.u_half
-    moves = np.std(u, axis=0) / problem.u_half > STILL
-    return bool(moves.all() and np.mean((apart <= LAW).all(axis=1)) >= 1 - OUTSIDE)
+    moves = np.sqrt(variance) / problem.u_half
+    of_law = (np.abs(u - law) / problem.u_half <= LAW).all(axis=1)
+    return share, moves, bool((moves > STILL).all() and np.mean(of_law) >= 1 - OUTSIDE)
 
 
 def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
@@ -156,21 +150,6 @@ def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
     low = problem.deviations.theta_min - room
     high = problem.deviations.theta_max + room
     return np.asarray(np.mean((theta < low) | (theta > high), axis=0))
-
-
-def spikes(problem: LinearMPC, episodes: tuple[Episode, ...], left: list[Array]) -> list[str]:
-    """Return which reading stands alone, by what one step leaves of the states, (T, n) each."""
-    together = np.abs(np.concatenate(left))
-    size = np.median(together, axis=0) + ROUNDING * problem.theta_half[problem.layout.state]
-    largest = np.array([np.max(np.abs(each) / size, axis=0) for each in left])
-    episode, state = np.unravel_index(np.argmax(largest), largest.shape)
-    if not largest[episode, state] > SPIKE:
-        return []
-    row = int(np.argmax(np.abs(left[episode][:, state]))) + 1
-    reading = episodes[int(episode)].thetas[row, problem.layout.state]
-    read = problem.units.to_plant(reading)[state]
-    name = labels_of(problem.model)[0][int(state)]
-    return [f"Look at where {name} is about {read:.6g}: no other step has moved it so far."]
 
 
 def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[str]:
@@ -275,24 +254,23 @@ def evidence(
     coordinates = dynamics.coordinates
     row = dynamics.row
     standing = persistence_error(coordinates, log, runs.horizons)
-    inputs = excitation(problem, log)
-    shares = beyond_the_box(problem, log) * (not follows_law(problem, log))
+    *inputs, follows_law = excitation(problem, log)
+    shares = beyond_the_box(problem, log) * (not follows_law)
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(log))
-    problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names)
+    problems, advice = judge(
+        runs, standing, costs, (inputs[0], inputs[1]), independent, beyond, names
+    )
     problems += foreign_previous(problem, log)
     problems += objections(problem, coordinates, log, units_confirmed)
     problems += _frozen(dynamics, log)
     first = Dynamics(problem, coordinates, dynamics.members[:1])
-    parts = [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]
-    parts = [each[:, row.state] for each in parts]
-    left = np.concatenate(parts)
-    if problems:
-        advice += spikes(problem, log, parts)
+    left = [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]
+    errors = np.concatenate(left)[:, row.state]
     # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
     mixing = np.eye(problem.model.n_states) + problem.model.A**2
-    noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(left, axis=0)))[0])
+    noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(errors, axis=0)))[0])
     return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))
 
 

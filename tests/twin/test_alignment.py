@@ -9,7 +9,6 @@ import pytest
 
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
 from sb3_yann.evaluation import evaluate
-from sb3_yann.twin import alignment
 from sb3_yann_envs import cstr, problems
 from twin_samples import log, problem
 
@@ -172,29 +171,6 @@ def test_inputs_times_a_factor_are_not_those_of_the_mpc(factor, dither) -> None:
     assert not twin.trusted
 
 
-def test_a_state_with_another_zero_and_scale_is_not_the_one_that_the_mpc_saw() -> None:
-    twin = heated_twin([(x * [1.8, 1] + [0.5, 0], u) for x, u in heated(1.0, 0.2)])
-    assert "The MPC gives the logged inputs where x[0] is" in twin.report()
-    assert not twin.trusted
-
-
-def test_an_mpc_that_has_settled_still_shows_a_state_in_other_units() -> None:
-    twin = heated_twin([(x * [1, 0.4], u) for x, u in heated(1.0, 0.0, steps=200)])
-    assert "The MPC gives the logged inputs where x[1] is 2.5 times" in twin.report()
-    assert not twin.trusted
-
-
-def test_inputs_that_are_held_while_the_states_move_are_no_law_s() -> None:
-    def held(episodes: list) -> bool:
-        twin = heated_twin(episodes)
-        log = alignment._Log(room(), twin.dynamics.coordinates, twin.episodes, False)
-        return bool(alignment._held(log)[0])
-
-    assert held(heated(1.0, 0.0, open_loop=True, steps=200, hold=40))
-    assert not held(heated(1.0, 0.0, steps=200))  # at rest nothing moves
-    assert not held([(x, 0 * u + 2) for x, u in heated(1.0, 0.0)])  # on its bound
-
-
 def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed() -> None:
     log = heated(2.2, 0.0, open_loop=True)
     assert "units_confirmed=True" in heated_twin(log).report()
@@ -305,11 +281,3 @@ def test_an_episode_cut_in_two_is_one() -> None:
     found = PlantTwin.fit(problem(), [(x[:31], u[:30]), (x[30:], u[30:])])
     assert not found.trusted and "There is one episode" in found.report()
     assert PlantTwin.fit(problem(), log(3)).trusted
-
-
-def test_a_spike_is_named_where_a_log_is_not_trusted() -> None:
-    episodes = log(4)
-    episodes[2][0][17, 1] += 50.0
-    found = PlantTwin.fit(problem(), episodes)
-    said = f"Look at where x[1] is about {episodes[2][0][17, 1]:.6g}:"
-    assert not found.trusted and said in found.report()

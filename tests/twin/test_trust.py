@@ -10,7 +10,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from general_problems import solved
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
+from sb3_yann import LinearMPC, PlantTwin, RateLimits
 from sb3_yann.evaluation.plots import plot_twin
 from sb3_yann.twin import trust as trusts
 from sb3_yann.twin.dynamics import Residual
@@ -70,11 +70,11 @@ def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains
     x, own = rng.uniform(-1, 1, (401, 2)), 0.1 * rng.standard_normal((400, 1))
     feedback = 0.2 * x[:-1, :1] - 0.1 * x[:-1, 1:]
     (episode,) = as_episodes(problem(), [(x, feedback + own)])
-    share, moves = trusts.excitation(problem(), (episode,))
+    share, moves, _ = trusts.excitation(problem(), (episode,))
     assert share == pytest.approx(np.var(own) / np.var(feedback + own), rel=0.05)
     assert moves == pytest.approx([np.std(feedback + own)])  # half the range is 1
     (still,) = as_episodes(problem(), [(x, 0 * own + 0.25)])
-    assert [each.tolist() for each in trusts.excitation(problem(), (still,))] == [[0.0], [0.0]]
+    assert [each.tolist() for each in trusts.excitation(problem(), (still,))[:2]] == [[0.0], [0.0]]
     (closed,) = as_episodes(problem(), [(x, feedback)])
     assert trusts.excitation(problem(), (closed,))[0] < 1e-20
 
@@ -178,29 +178,6 @@ def test_every_other_piece_of_a_record_is_independent() -> None:
     said = report(problem(), (two, *parts), "", twin().trust).splitlines()[1]
     assert said.startswith("Episodes 1 to 4 are consecutive pieces of one record.")
     assert said.endswith("2 of 4.")
-
-
-def test_a_reading_a_thousand_times_as_far_off_as_most_is_named_with_its_value() -> None:
-    own, x_ss = problem(), [10.0, 20.0]
-    mpc = dataclasses.replace(
-        own, model=LinearModel(own.model.A, own.model.B, 0.1, x_ss=x_ss),
-        theta_min=own.theta_min + x_ss, theta_max=own.theta_max + x_ss,
-    )  # fmt: skip
-    logs = tuple(random_episode(own, 30, seed) for seed in range(3))
-    rng = np.random.default_rng(0)
-    left = [0.01 * rng.choice([-1.0, 1.0], (30, 2)) for _ in logs]
-    for size, named in ((9.9, False), (10.1, True)):
-        left[2][11, 1] = -size
-        said = trusts.spikes(mpc, logs, left)
-        value = logs[2].thetas[12, 1] + 20.0
-        assert said == ([f"Look at where x[1] is about {value:.6g}: no other step has moved it "
-                         "so far."] if named else [])  # fmt: skip
-    # Where all else fits to the last bit, rounding is what it is compared with.
-    quiet = [np.zeros((30, 2)) for _ in logs]
-    quiet[0][4, 0] = 2.9e-3  # a half-width is 3
-    assert trusts.spikes(mpc, logs, quiet) == []
-    quiet[0][4, 0] = 3.1e-3
-    assert f"{logs[0].thetas[5, 0] + 10.0:.6g}" in trusts.spikes(mpc, logs, quiet)[0]
 
 
 def test_the_noise_of_the_sensors_is_what_one_step_s_errors_amount_to() -> None:
