@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -142,7 +142,8 @@ class EnvPool:
     """Envs that play again and again: making one often takes longer than its episode.
 
     :func:`evaluate` takes it in the place of an env. There are at most so many envs: more episodes
-    are played one lot after the other. They are stepped by ``each(step, rows, actions)``.
+    are played one lot after the other. They are stepped by ``each(step, rows, actions)``. An env
+    that was given plays alone, and is never closed.
     """
 
     MAX_KEPT = 200
@@ -152,7 +153,8 @@ class EnvPool:
         self, source: Source, most: int | None = None, each: Callable[..., Iterable[Any]] = map
     ) -> None:
         self.source = as_source(source)
-        self.most = most
+        self.is_given = isinstance(self.source, gym.Env)
+        self.most = 1 if self.is_given else most
         self.each = each
         self.envs: list[gym.Env[Any, Any]] = []
 
@@ -166,15 +168,14 @@ class EnvPool:
         except BaseException:
             self.close()
             raise
-        self._close_beyond(self.MAX_KEPT)
+        self.close(self.MAX_KEPT)
 
-    def close(self) -> None:
-        """Close all envs."""
-        self._close_beyond(0)
-
-    def _close_beyond(self, kept: int) -> None:
+    def close(self, kept: int = 0) -> None:
+        """Close all envs but so many."""
         while len(self.envs) > kept:
-            self.envs.pop().close()
+            env = self.envs.pop()
+            if not self.is_given:
+                env.close()
 
 
 def evaluate(
@@ -241,25 +242,15 @@ def rollout(
     seeds = as_seeds(seeds)
     options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]
     resets = [*zip(seeds, options, strict=True)]
-    pool = plant if isinstance(plant, EnvPool) else None
-    source: Source = plant.source if isinstance(plant, EnvPool) else as_source(plant)
-    if isinstance(source, gym.Env):
-        check(source)
-        played = joined(
-            [
-                _play(of_episode(controller, i), _Envs([source], [each], problem))
-                for i, each in enumerate(resets)
-            ]
-        )
-    elif isinstance(source, str) and (vector_env := _vector_env(source, len(seeds))) is not None:
+    pool = plant if isinstance(plant, EnvPool) else EnvPool(plant)
+    source = pool.source
+    if isinstance(source, str) and (vector_env := _vector_env(source, len(seeds))) is not None:
         with closing(vector_env):
             check(vector_env)
             played = _play(controller, _Copies(vector_env, seeds, starts))
     else:
-        own = EnvPool(source)
-        pool = pool or own
-        lots = range(0, len(seeds), pool.most or len(seeds) or 1)
-        with closing(own), pool.acquire(min(len(seeds), pool.most or len(seeds))) as envs:
+        most = min(pool.most or len(seeds), len(seeds))
+        with pool.acquire(most) as envs:
             for each in envs[:1]:
                 check(each)
             if len({id(each.unwrapped) for each in envs}) < len(envs):
@@ -267,15 +258,16 @@ def rollout(
                     "The function that makes envs returned the same one twice. Make a new one each "
                     "time, since episodes run side by side, or pass the env itself."
                 )
-            played = joined(
-                [
-                    _play(
-                        of_episode(controller, i),
-                        _Envs(envs, resets[i : i + lots.step], problem, pool.each),
-                    )
-                    for i in lots
-                ]
-            )
+            lots = [
+                _play(
+                    of_episode(controller, i),
+                    _Envs(envs, resets[i : i + most], problem, pool.each),
+                )
+                for i in range(0, len(seeds), max(most, 1))
+            ]
+        if pool is not plant:
+            pool.close()
+        played = joined(lots)
     return played if problem is None else _with_stage_costs(played, problem)
 
 
@@ -392,85 +384,69 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
     """Play one episode in each env of a plant, side by side."""
     shown = plant.reset()
     n = len(shown)
-    running = np.ones(n, dtype=bool)
     rows: Rows = np.arange(n)
-    lengths = np.zeros(n, dtype=np.int64)
-    costs = np.zeros(n)
-    violations = np.zeros(n, dtype=np.int64)
-    terminated, truncated, succeeded = np.zeros((3, n), dtype=bool)
-    states = [np.array(shown, dtype=np.float64)]
+    running = np.ones(n, dtype=bool)
     inputs = list[Array]()
-    rewards = list[Array]()
-    own_rewards = list[Array]()
+    steps = list[_Step]()
+    states = [np.array(shown, dtype=np.float64)]
     while running.any():
         actions = np.asarray(controller(len(inputs), shown, rows))
         step = plant.step(actions, rows)
-        live = running[rows]
-        now = rows[live]
-        played = np.zeros((n, *actions.shape[1:]))
-        played[rows] = actions
-        inputs.append(played)
-        reached = states[-1].copy()
-        reached[rows] = step.observations
-        states.append(reached)
-        earned, own = np.full((2, n), np.nan)
-        earned[now] = step.rewards[live]
-        own[now] = np.where(step.changed | step.terminated, np.nan, step.rewards)[live]
-        rewards.append(earned)
-        own_rewards.append(own)
-        costs[now] -= step.rewards[live]
-        violations[now] += step.violated[live]
-        lengths[now] += 1
-        terminated[now] = (step.terminated & ~step.succeeded)[live]
-        truncated[now] = (step.truncated & ~step.terminated)[live]
-        over = step.terminated | step.truncated
-        succeeded[now] = (step.succeeded & over)[live]
-        running[now] = ~over[live]
+        inputs.append(_scattered(actions, rows, n).astype(np.float64))
+        states.append(_scattered(step.observations, rows, n).astype(np.float64))
+        steps.append(_Step(*(_scattered(each, rows, n) for each in step)))
+        running[rows] &= ~(step.terminated | step.truncated)
         if running.any():
             _watch_length(plant.envs[rows[0] if len(plant.envs) > 1 else 0], len(inputs))
-        shown = step.observations if plant.steps_all else step.observations[~over]
-        rows = rows if plant.steps_all else rows[~over]
+        live = np.ones(len(rows), dtype=bool) if plant.steps_all else running[rows]
+        shown = step.observations[live]
+        rows = rows[live]
+    _, rewards, terminated, truncated, violated, succeeded, changed = map(
+        np.array, zip(*steps, strict=True)
+    )
+    last = np.argmax(terminated | truncated, axis=0)
+    taken = np.arange(len(steps))[:, None] <= last
+    at_end = last, np.arange(n)
+    own = np.where(changed | terminated, np.nan, rewards)
 
-    def parts(values: Sequence[Array], more: int = 0) -> tuple[Array, ...]:
-        together = np.array(values)
-        return tuple(together[: k + more, i].copy() for i, k in enumerate(lengths))
+    def parts(values: Any, more: int = 1) -> tuple[Array, ...]:
+        together = np.array(values, dtype=np.float64)
+        return tuple(together[: k + more, i].copy() for i, k in enumerate(last))
 
     return Trajectories(
-        costs=costs,
-        violations=violations,
-        observations=parts(states, 1),
+        costs=0.0 - np.cumsum(np.where(taken, rewards, 0.0), axis=0)[-1],  # in the order of time
+        violations=np.sum(violated & taken, axis=0),
+        observations=parts(states, 2),
         actions=parts(inputs),
-        terminated=terminated,
-        truncated=truncated,
-        succeeded=succeeded,
+        terminated=(terminated & ~succeeded)[at_end],
+        truncated=(truncated & ~terminated)[at_end],
+        succeeded=succeeded[at_end],
         rewards=parts(rewards),
-        own_rewards=parts(own_rewards),
+        own_rewards=parts(own),
     )
+
+
+def _scattered(values: NDArray[Any], rows: Rows, n: int) -> NDArray[Any]:
+    """Return values (r, ...) of some episodes as those of all, (n, ...)."""
+    found = np.zeros((n, *values.shape[1:]), dtype=values.dtype)
+    found[rows] = values
+    return found
 
 
 def joined(parts: Sequence[Trajectories]) -> Trajectories:
     """Return the episodes of all parts as one."""
 
-    def arrays(name: str, dtype: Any) -> NDArray[Any]:
-        found: NDArray[Any] = np.concatenate([[], *(getattr(each, name) for each in parts)])
-        return found.astype(dtype)
+    def together(name: str) -> Any:
+        values = [getattr(each, name) for each in parts]
+        if isinstance(values[0], np.ndarray):
+            return np.concatenate(values)
+        if isinstance(values[0], BoundExcess):
+            return BoundExcess(*map(np.concatenate, zip(*values, strict=True)))
+        return None if values[0] is None else tuple(itertools.chain(*values))
 
-    def rows(name: str) -> tuple[Array, ...]:
-        return tuple(episode for each in parts for episode in getattr(each, name))
-
-    excess = [each.excess for each in parts if each.excess is not None]
-    return Trajectories(
-        costs=arrays("costs", np.float64),
-        violations=arrays("violations", np.int64),
-        observations=rows("observations"),
-        actions=rows("actions"),
-        terminated=arrays("terminated", bool),
-        truncated=arrays("truncated", bool),
-        succeeded=arrays("succeeded", bool),
-        rewards=rows("rewards"),
-        own_rewards=rows("own_rewards"),
-        excess=BoundExcess(*map(np.concatenate, zip(*excess, strict=True))) if excess else None,
-    )
+    if not parts:
+        return Trajectories(np.zeros(0), np.zeros(0, np.int64), (), (), np.zeros(0, dtype=bool))
+    return Trajectories(**{each.name: together(each.name) for each in fields(Trajectories)})
 
 
 def _with_stage_costs(played: Trajectories, problem: LinearMPC) -> Trajectories:
@@ -499,15 +475,11 @@ def _watch_length(env: Any, steps: int) -> None:
 @contextmanager
 def one_env(source: Source | EnvPool) -> Iterator[gym.Env[Any, Any]]:
     """Yield the env that is given, one of a pool, or one that is made and closed afterwards."""
-    given = source.source if isinstance(source, EnvPool) else source
-    if isinstance(given, gym.Env):
-        yield given
-    elif isinstance(source, EnvPool):
-        with source.acquire(1) as (env,):
-            yield env
-    else:
-        with closing(make_env(source)) as made:
-            yield made
+    pool = source if isinstance(source, EnvPool) else EnvPool(source)
+    with pool.acquire(1) as (env,):
+        yield env
+    if pool is not source:
+        pool.close()
 
 
 def require_like_training(source: Source | EnvPool, training_env: Any, name: str) -> None:

@@ -144,8 +144,7 @@ class SimulatedEpisodes(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        if not isinstance(self.env, gym.Env):
-            self._pool.close()
+        self._pool.close()
 
     @property
     def _count(self) -> int:

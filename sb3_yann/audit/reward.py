@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
@@ -359,7 +360,7 @@ class CostAudit(BaseCallback):
             said.append(f'Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.')
         return " ".join(said)
 
-    def _not_finite(self, finite: Array, rewards: Array) -> str:
+    def _not_finite(self, finite: NDArray[np.bool_], rewards: Array) -> str:
         """Return which steps (steps,), those of several envs in turns, are lost, in words."""
         first = int(np.argmin(finite))
         what = "an observation" if np.isfinite(rewards[first]) else f"the reward, {rewards[first]},"

@@ -470,7 +470,7 @@ class ImprovementGuard(BaseCallback):
             self.player.policy.guarded = False
             restore_accepted(self.model)
             self._save_accepted()
-            self.player.close()
+            self.player.envs.close()
             if self._handler is not None:
                 self._handler.remove()
 

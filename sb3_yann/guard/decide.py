@@ -472,11 +472,6 @@ class Player:
         seen = self.policy.theta(normalized(self.model, observations))
         return np.asarray(seen.double().cpu().numpy())
 
-    def close(self) -> None:
-        """Close the envs that were made; one that was given is the caller's."""
-        if not isinstance(self.envs.source, gym.Env):
-            self.envs.close()
-
     def _check(self, env: Any) -> None:
         if isinstance(env, gym.Env):
             require_state_shown(env, self.policy.observation_given)
