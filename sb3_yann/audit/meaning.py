@@ -37,8 +37,8 @@ UNITS = (
     *((1.8, 32.0), (1 / 1.8, -32 / 1.8)),
 )
 """Units that are mistaken for each other: factors, and what is added."""
-Reading = Callable[[Array], Array]
-"""From what is shown (steps, n), in plant units, to what it may mean."""
+Reading = tuple[Array, Array]
+"""A matrix M (n, n) and an offset v (n,): what is shown as x, in plant units, may mean M x + v."""
 SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
 LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
@@ -77,7 +77,8 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
     steps = theta[known], u[known], following[known]
     if np.count_nonzero(known) < STEPS_PER_STATE * problem.model.n_states:
         return ""
-    shown = _left_open(problem, lambda x: x, *steps)
+    n = problem.model.n_states
+    shown = _left_open(problem, (np.eye(n), np.zeros(n)), *steps)
     if not shown > WRONG:
         return ""
     for reading, what, cure in _readings(problem):
@@ -92,68 +93,57 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
 def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:
     """Yield what the states that are shown may mean, in words, and what to do."""
     names = labels_of(problem.model)[0]
-    n = problem.model.n_states
-    for order in _orders(n):
+    x_ss = problem.model.x_ss
+    n = len(names)
+    same = np.eye(n)
+    # All orders of a few states; of more, two are exchanged.
+    orders = [[*each] for each in permutations(range(n))][1:] if n <= MOST_REORDERED else []
+    for i, j in combinations(range(n), 2) if n > MOST_REORDERED else ():
+        order = [*range(n)]
+        order[i] = j
+        order[j] = i
+        orders.append(order)
+    for order in orders:
         back = np.argsort(order).tolist()
         yield (
-            partial(_taken, back),
+            (same[back], np.zeros(n)),
             f"the states in the order {[names[i] for i in order]}, which is not the MPC's, {names}",
             f"Show x[{back}] of what the plant shows, with gymnasium.wrappers."
             "TransformObservation.",
         )
-    if np.any(problem.model.x_ss):
+    if np.any(x_ss):
         yield (
-            lambda x: x + problem.model.x_ss,
+            (same, x_ss),
             "deviations from the operating point, and the MPC is in plant units",
             "Show what the plant shows, or leave x_ss and u_ss out of the model.",
         )
-    every = [(name, np.arange(n) == i) for i, name in enumerate(names)]
+    every = [*zip(names, same, strict=True)]
     if n > 1:
-        every.append(("all states", np.ones(n, dtype=bool)))
+        every.append(("all states", np.ones(n)))
     for name, which in every:
         for factor, shift in UNITS:
-            factors = np.where(which, factor, 1.0)
-            shifts = np.where(which, shift, 0.0)
             what = f"{name} times {factor:.3g}" if factor != 1 else name
             acts = f" It may also be that inputs act {factor:.3g} times as far as in the model."
+            scale = np.where(which, 1 / factor, 1.0)
             yield (
-                partial(_rescaled, factors, shifts),
+                (np.diag(scale), -scale * which * shift),
                 f"{what} plus {shift:.5g}" if shift else what,
                 "Show it in the model's units, or pass policy_kwargs={'observation': ...}."
                 + acts * (shift == 0),
             )
 
 
-def _taken(order: list[int], x: Array) -> Array:
-    return x[:, order]
-
-
-def _rescaled(factors: Array, shifts: Array, x: Array) -> Array:
-    return np.asarray((x - shifts) / factors)
-
-
-def _orders(n: int) -> Iterator[list[int]]:
-    """Yield other orders: what each entry that is shown may be."""
-    if n <= MOST_REORDERED:
-        yield from (list(each) for each in [*permutations(range(n))][1:])
-        return
-    for i, j in combinations(range(n), 2):
-        order = list(range(n))
-        order[i] = j
-        order[j] = i
-        yield order
-
-
 def _left_open(
     problem: LinearMPC, reading: Reading, theta: Array, u: Array, following: Array
 ) -> float:
     """Return the share of the states' movement that the model leaves open, 1 where none moves."""
-    at = theta.copy()
-    after = following.copy()
+    M, v = reading
     states = problem.layout.state
     x_ss = problem.model.x_ss
-    at[:, states] = reading(theta[:, states] + x_ss) - x_ss
-    after[:, states] = reading(following[:, states] + x_ss) - x_ss
+    at = theta.copy()
+    after = following.copy()
+    for rows in (at, after):
+        rows[:, states] = (rows[:, states] + x_ss) @ M.T + v - x_ss
     error = (after - problem.deviations.predict(at, u))[:, states]
     moved = np.sum((after - at)[:, states] ** 2, axis=0)
     moving = moved > 0
@@ -300,6 +290,11 @@ class InDeviations(gym.Wrapper[Any, Any, Any, Any]):
             taken.low - units.u_ss, taken.high - units.u_ss, dtype=np.float64
         )
 
+    @classmethod
+    def around(cls, make: Callable[[], gym.Env[Any, Any]], *args: Any) -> InDeviations:
+        """Return one around an env that is made."""
+        return cls(make(), *args)
+
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(**kwargs)
@@ -346,13 +341,7 @@ def in_deviations(
         )
     if observation is None and not problem.units.shifted:
         return make
-    return partial(_wrapped, make, problem.units, observation)
-
-
-def _wrapped(
-    make: Callable[[], gym.Env[Any, Any]], units: Units, observation: Map | None
-) -> gym.Env[Any, Any]:
-    return InDeviations(make(), units, observation)
+    return partial(InDeviations.around, make, problem.units, observation)
 
 
 def require_theta_shown(problem: LinearMPC, theta: Array) -> None:
