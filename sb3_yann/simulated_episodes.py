@@ -47,11 +47,8 @@ class SimulatedEpisodes(BaseCallback):
 
     When training begins, and after each training episode, the policy as it is plays episodes in
     envs of its own, with noise and step tests. Their steps join those of the training env in the
-    replay buffer, and none of its episodes changes: the plant meets the policy alone.
-
-    A policy that acts without noise sees little but what it does already. Where the way to a better
-    one leads through other actions, a simulator shows them without harm. It may differ from the
-    plant, as the model of the MPC does: the guard decides what is accepted.
+    replay buffer, and none of its episodes changes. A simulator shows without harm what lies beyond
+    other actions; the guard decides what is accepted.
 
     Parameters
     ----------

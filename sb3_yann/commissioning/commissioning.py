@@ -38,26 +38,20 @@ class Commissioning:
     """Puts a better policy to work on a plant as plants are commissioned: in growing batches.
 
     The first batch is the MPC's. After each one the twin is fitted to all that the plant has shown,
-    and a policy is improved in it (:func:`improve`). One that was accepted there is on trial from
-    the next batch on: the MPC and the policy take turns, in an order that is drawn for each pair.
-    Only the plant decides, by all pairs of all batches of the trial. The policy is kept where it
-    surely costs less than the MPC, with an error of 5 % over all looks. The MPC is back where it
-    surely costs more, where ten pairs show no gain, or where it exceeds a hard bound of the problem
-    by more than the MPC has on this plant. Fewer than six pairs keep nothing: a drift of the plant
-    may do it by the order. A policy acts at first within a small ``max_correction``, which doubles
-    with each one that is kept. Nothing else ever acts.
+    and a policy is improved in it (:func:`improve`). One that was accepted there takes turns with
+    the MPC from the next batch on, and only these pairs decide: it is kept where it surely costs
+    less, with an error of 5 % over all looks, and taken back where it surely costs more, shows no
+    gain, violates or alarms. It acts at first within a small ``max_correction``, which doubles with
+    each one that is kept. Nothing else ever acts; ``docs/improve.md`` has the rules.
 
-    What counts is the stage cost, or the plant's own reward where that is another one. The twin's
-    searches know the stage cost alone.
+    What counts is the stage cost, or the plant's own reward where that is another one. At an alarm
+    of the watchdog the MPC has the plant within the same sample, for the rest of the episode and
+    until it has played a quiet one. Two episodes in a row with an alarm are taken for a changed
+    plant: the log begins anew.
 
-    A watchdog looks on. At an alarm the MPC has the plant within the same sample, for the rest of
-    the episode and until it has played a quiet one; it has no state of its own that could bump. Two
-    episodes in a row with an alarm are taken for a changed plant: the log begins anew.
-
-    Each episode and each decision is on the disk before the next begins. After a kill at any moment
-    the same script goes on: with the same settings and record, :meth:`run` repeats nothing but the
-    episode that was cut off. When :meth:`run` returns, the model holds the policy that the plant
-    has confirmed last, or the MPC; what is still on trial it does not.
+    Each episode and each decision is on the disk before the next begins: after a kill the same
+    script repeats nothing but the episode that was cut off. When :meth:`run` returns, the model
+    holds the policy that the plant has confirmed last, or the MPC.
 
     Parameters
     ----------

@@ -170,10 +170,9 @@ def _repeats(x: Array) -> NDArray[np.int64]:
 class Watchdog:
     """Compares each transition of the plant with what its twin predicts.
 
-    Innovations are charted at several gains: at once for what is abrupt, averaged over up to 50
-    samples for what is small and lasts. Their bands come from episodes of the log that the fit
-    has not seen, times a factor. They widen where the log shows little. A reading that repeats
-    itself while the twin moves is frozen.
+    Innovations are charted at several gains, in bands that come from episodes of the log that the
+    fit has not seen, and widen where the log shows little. A reading that repeats itself while the
+    twin moves is frozen.
 
     Make one with :meth:`of`, anew after each fit of the twin. It holds nothing from one episode
     to the next, and pickles.

@@ -105,11 +105,9 @@ class ImprovementGuard(BaseCallback):
     :func:`restore_accepted` gives it the accepted policy.
 
     Candidates, accepted policy and MPC play the same seeded starts in a simulator. Where there is
-    none, use :class:`Commissioning`. `docs/guard.md` says when a candidate is refused. A refusal
+    none, use :class:`Commissioning`. ``docs/guard.md`` says when a candidate is refused. A refusal
     restores actor, target actor and the actor's optimizer bit for bit, at once or when ``patience``
-    is over. No random numbers are drawn. The rewards of the first hundred steps are compared with
-    the MPC's stage cost, as by a :class:`CostAudit`, unless one is passed as well. The state
-    travels with the model, as ``model.guard_state``: a guard with the same settings goes on there.
+    is over. No random numbers are drawn. The state travels with the model.
 
     Parameters
     ----------

@@ -178,29 +178,14 @@ def improve(
 
     Nearly optimal plans, those of :func:`headroom`, are made in a learnt model, from many starts at
     once, and the actor's networks learn to do what they do, and what their feedback does nearby.
-    Then the policy plays the same episodes in the model, and is taught more where plans do better.
-
-    *In a simulator* the model is an ensemble of small networks on top of the MPC's own, fitted to
-    twenty to sixty episodes of the MPC, half of them with random inputs on top. Each round plays
-    the policy from ten starts, and fits the model anew to what that showed, until the simulator
-    shows what the model promised. The best policy is then confirmed on new starts, in pairs with
-    the MPC: after 10, 20, 40 and 80 of them a paired test says whether it surely gains 0.1 %, with
-    an error of 5 % over all looks and tries. Its worst 5 % of the starts must be no worse by 1 %,
-    and on none of them may a bound be exceeded by more than with the MPC: forty starts leave up to
-    7 % of all unseen, at 95 %. What it loses is taught, and it is tried again on other starts,
-    three times; then half of the correction.
-
-    *In a twin* the members take turns in planning. A policy is accepted if it is no worse than the
-    MPC from new starts on every member, and surely costs less by :meth:`PlantTwin.forecast`: in
-    every twin that the log does not refute. What is refused is taught; then half and a quarter of
-    the correction are tried. Beyond what the log shows the MPC acts alone: no member of the twin
-    knows the plant there.
+    A simulator decides by new starts, in pairs with the MPC; a twin by every member, and by
+    :meth:`PlantTwin.forecast`. What is refused is taught, then parts of the correction are tried:
+    ``docs/improve.md`` has the steps and the tests.
 
     Where the actor keeps the problem's bounds, and no ``bounds_margin`` was given, it keeps as far
-    from them as the MPC's model errs in 95 % of the steps.
-
-    The model ends with the policy that was accepted and a critic that is refitted to it, else as it
-    was. It saves and goes on learning as any other.
+    from them as the MPC's model errs in 95 % of the steps. The model ends with the policy that was
+    accepted and a critic that is refitted to it, else as it was. It saves and goes on learning as
+    any other.
 
     Parameters
     ----------

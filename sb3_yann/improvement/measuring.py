@@ -236,18 +236,13 @@ def headroom(
 
     From the same starts are played: the MPC; the MPC with a disturbance observer; an MPC whose
     model is re-identified from the MPC's episodes; and plans, optimized by differential dynamic
-    programming, on which feedback keeps the plant. Plans begin their search at the MPC's runs, with
-    inputs on their bounds for a while, and at the cheapest runs of unconstrained laws with other
-    weights. They know neither noise nor the references to come: a
-    change makes a new plan. All costs are those of episodes that were played, so the gain can be
-    had; more may be there to be found. A part of it needs to know the plant, and none of a
-    controller's robustness is in it: take it for a bound of what learning can bring.
+    programming in the model of :func:`improve`, on which feedback keeps the plant. Plans know
+    neither noise nor references to come; where the plant does not do what one promised, the model
+    is fitted anew. All costs are those of episodes that were played, so the gain can be had; more
+    may be there to be found. None of a controller's robustness is in it.
 
-    Plans are those of :func:`improve`, made in the same model: networks on top of the MPC's own,
-    fitted to all that was played, and to ten to thirty episodes with random inputs. Where the plant
-    does not do what a plan promised, the model is fitted anew and planned in once more. A plant
-    that repeats its steps has the best controller of each start. A random one has the best on
-    average, for the best of each start would be luck.
+    A plant that repeats its steps has the best controller of each start. A random one has the best
+    on average, for the best of each start would be luck.
 
     Parameters
     ----------

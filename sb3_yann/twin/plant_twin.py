@@ -63,13 +63,9 @@ class PlantTwin(LearntModel):
 
     ``x+ = A x + B u + E d + residual(x, d, u)``. The residual is none, a polynomial that is shrunk
     towards the given model, or small networks, by free runs over episodes that its fit has not
-    seen.
-    Several members, fitted to episodes drawn with replacement, tell how much is not known. Two to
-    four episodes are cut into pieces for both. Outside the data the residual stays what it is at
-    their edge.
-
-    Where an observer *estimates* d, it is a part of the twin: ``x+ = A x + B u + residual(x, u)``,
-    and the observer steps its estimate from that, as it does beside the plant.
+    seen. Several members, fitted to episodes drawn with replacement, tell how much is not known.
+    Outside the data the residual stays what it is at their edge. Where an observer *estimates* d,
+    it is a part of the twin.
 
     Make one with :meth:`fit`.
 
