@@ -25,7 +25,7 @@ __version__ = "0.2.0"
 
 _NAMES = {
     "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning",
-    "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
+    "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise SimulatedEpisodes",
     "sb3_yann.commissioning": "Batch Commissioning",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified IdentifiedOutputs LinearCost LinearMPC LinearModel "
@@ -41,7 +41,6 @@ _NAMES = {
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
     "YannPolicy register_problem retarget",
     "sb3_yann.reporting": "report",
-    "sb3_yann.simulated_episodes": "SimulatedEpisodes",
     "sb3_yann.twin": "PlantTwin UntrustedTwinError",
     "sb3_yann.wrappers": "PlantEnv",
     "sb3_yann_envs": "ActionRepeat",

@@ -4,6 +4,7 @@ from sb3_yann.audit import CostMismatchError as CostMismatchError
 from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
+from sb3_yann.callbacks import SimulatedEpisodes as SimulatedEpisodes
 from sb3_yann.commissioning import Batch as Batch
 from sb3_yann.commissioning import Commissioning as Commissioning
 from sb3_yann.control import DisturbanceBounds as DisturbanceBounds
@@ -52,7 +53,6 @@ from sb3_yann.policy import YannPolicy as YannPolicy
 from sb3_yann.policy import register_problem as register_problem
 from sb3_yann.policy import retarget as retarget
 from sb3_yann.reporting import report as report
-from sb3_yann.simulated_episodes import SimulatedEpisodes as SimulatedEpisodes
 from sb3_yann.twin import PlantTwin as PlantTwin
 from sb3_yann.twin import UntrustedTwinError as UntrustedTwinError
 from sb3_yann.wrappers import PlantEnv as PlantEnv

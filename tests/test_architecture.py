@@ -27,7 +27,7 @@ FLOORS = [
     {"sb3_yann.twin"},
     {"sb3_yann.plan"},
     {"sb3_yann.policy"},
-    {"sb3_yann.callbacks", "sb3_yann.simulated_episodes", "sb3_yann.wrappers"},
+    {"sb3_yann.callbacks", "sb3_yann.wrappers"},
     {"sb3_yann.audit"},
     {"sb3_yann.guard"},
     {"sb3_yann.deployment", "sb3_yann.tuning"},

@@ -402,7 +402,7 @@ class ImprovementGuard(BaseCallback):
         if self.verbose:
             print(decision)
         if self._record is not None:
-            self._record.add(state.decisions)
+            self._record.write(state.decisions)
 
     def _leave_accepted(self) -> None:
         """Restore the accepted policy where Ctrl-C is about to end `learn`, also in a trial."""

@@ -242,35 +242,25 @@ class Record:
         A run that goes on from a checkpoint drops what it had decided after it.
         """
         self.path = path
-        self.is_complete = False
-        try:
-            ours = _rows(decisions, header=True)
+        if path.is_file():
+            ours = as_csv(decisions)
             theirs = path.read_bytes().decode(errors="replace")
-            is_ours = ours.startswith(theirs) or (decisions != [] and theirs.startswith(ours))
-        except FileNotFoundError:
-            is_ours = True
-        except OSError:
-            is_ours = False
-        if not is_ours:
-            numbered = (path.with_name(f"{path.stem}.{i}{path.suffix}") for i in count(1))
-            beside = next(each for each in numbered if not each.exists())
-            os.rename(path, beside)
-            warnings.warn(
-                f"{path} held the record of another run: it is {beside} now.", stacklevel=2
-            )
-        self.add(decisions)
+            if not ours.startswith(theirs) and not (decisions and theirs.startswith(ours)):
+                numbered = (path.with_name(f"{path.stem}.{i}{path.suffix}") for i in count(1))
+                beside = next(each for each in numbered if not each.exists())
+                os.rename(path, beside)
+                warnings.warn(
+                    f"{path} held the record of another run: it is {beside} now.", stacklevel=2
+                )
+        self.write(decisions)
 
-    def add(self, decisions: list[Decision]) -> None:
-        """Write the last decision, or all where some are missing; warn where that fails."""
+    def write(self, decisions: list[Decision]) -> None:
+        """Write all decisions, or none of them; warn where that fails."""
         try:
-            if self.is_complete and self.path.exists():
-                with self.path.open("a", newline="", encoding="utf-8") as file:
-                    file.write(_rows(decisions[-1:], header=False))
-            else:  # to do so each time would take ever longer
-                write_csv(self.path, decisions)
-            self.is_complete = True
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self.path) as part:
+                part.write_text(as_csv(decisions), encoding="utf-8", newline="")
         except OSError as error:
-            self.is_complete = False
             warnings.warn(
                 f"The guard's record {self.path} could not be written ({error}). Training goes on, "
                 "and guard.decisions has all decisions; the record is completed once there is "
@@ -279,18 +269,11 @@ class Record:
             )
 
 
-def write_csv(path: Path, decisions: list[Decision]) -> None:
-    """Write the decisions, all or none of them."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as part:
-        part.write_text(_rows(decisions, header=True), encoding="utf-8", newline="")
-
-
-def _rows(decisions: list[Decision], header: bool) -> str:
+def as_csv(decisions: list[Decision]) -> str:
+    """Return a line for each decision, below their names."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [each.name for each in fields(Decision)])
-    if header:
-        writer.writeheader()
+    writer.writeheader()
     for each in decisions:
         writer.writerow({**asdict(each), "regions": " ".join(map(str, each.regions))})
     return text.getvalue()

@@ -89,16 +89,16 @@ def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
 def test_a_full_disk_ends_no_training_and_the_record_is_completed_later(
     tmp_path, monkeypatch
 ) -> None:
-    path, own, calls = tmp_path / "guard.csv", record._rows, []
+    path, own, calls = tmp_path / "guard.csv", record.as_csv, []
 
-    def at_times(decisions, header):
+    def at_times(decisions):
         calls.append(len(decisions))
         if len(calls) == 3:  # the head, the first decision, the second one
             raise OSError(28, "No space left on device")
-        return own(decisions, header)
+        return own(decisions)
 
     guard = make_guard(log_path=path)
-    monkeypatch.setattr(record, "_rows", at_times)
+    monkeypatch.setattr(record, "as_csv", at_times)
     with pytest.warns(UserWarning, match=r"guard\.csv could not be written .*No space"):
         three_decisions(guard)
     assert [row["verdict"] for row in rows(path)] == verdicts(guard)
