@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from guard_samples import MPC, STEPS, Slide, build
 from sb3_yann import NoActionNoise, SimulatedEpisodes
-from sb3_yann.policy import AffineObservation
 from sb3_yann.callbacks import _Exploration
+from sb3_yann.policy import AffineObservation
 
 FEW = {"per_episode": 3}
 
