@@ -7,12 +7,10 @@ import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._validation import Array, check_bool, check_int, check_positive
 from sb3_yann.audit.meaning import CostMismatchError, CostMismatchWarning, warn_of_order
@@ -20,30 +18,11 @@ from sb3_yann.policy.observations import require_frozen
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.rollout import may_change_reward
-from sb3_yann_envs import ActionRepeat
 
+EXPLAINED = 0.999  # share of the rewards' variance that a line explains where it is the cause
 EXACT = 1e-5
 """What rounding to float32 leaves of an agreement, relative to the spread of the rewards."""
 MIN_STEPS = 10  # steps that must be compared
-
-_EFFECTS = {
-    "NormalizeReward": "divides rewards by running statistics: leave it out, reward_scale is for a "
-    "constant factor",
-    "ClipReward": "clips rewards, and the critic's cost goes on beyond that: leave it out",
-    "TransformReward": "changes rewards",
-    "DelayObservation": "shows an earlier observation, and the law needs the present state: leave "
-    "it out",
-    "NormalizeObservation": "changes observations: pass policy_kwargs={'observation': ...}",
-    "RescaleObservation": "changes observations: pass policy_kwargs={'observation': ...}",
-    "TransformObservation": "changes observations: pass policy_kwargs={'observation': ...}",
-    "MaxAndSkipObservation": "repeats actions",
-    "StickyAction": "does not always take the action: leave it out",
-    "RepeatAction": "repeats actions: the MPC needs the sampling time and weights of all of them",
-    "RescaleAction": "changes actions: build the LinearMPC for the inputs that the env takes",
-    "TransformAction": "changes actions",
-}
-"""What Gymnasium's wrappers do; special classes come before those that they derive from."""
-
 
 _NAMES = ("observation", "following", "action", "reward", "counted")
 
@@ -66,12 +45,10 @@ class CostFinding:
         The nearest line ``reward = scale * (-cost) + offset``, and the variance that it explains.
     steps : int
         Steps that were compared.
-    wrappers : tuple of str
-        Wrappers of the env that may have to do with it.
 
     Examples
     --------
-    >>> CostFinding(True, "", "The reward is minus the cost.", 1.0, 0.0, 1.0, 100, ()).matches
+    >>> CostFinding(True, "", "The reward is minus the cost.", 1.0, 0.0, 1.0, 100).matches
     True
     """
 
@@ -82,7 +59,6 @@ class CostFinding:
     offset: float
     r2: float
     steps: int
-    wrappers: tuple[str, ...]
 
 
 class Line(NamedTuple):
@@ -144,47 +120,23 @@ class Rewards(NamedTuple):
         at_rest = 1e-9 * np.abs(self.rewards).max() + 1e-12
         return bool(np.all(np.abs(self.implied - self.cost) <= allowed + at_rest))
 
-    def agree(self, costs: Array, predicted: Array, tolerance: float) -> bool:
-        """Tell whether nearly all costs (steps,) are those predicted.
-
-        Errors are relative to how much it varies: a large constant explains nothing.
-        """
-        spread = np.abs(predicted - np.median(predicted))
-        allowed = tolerance * np.maximum(spread, spread.mean()) + self.rounded
-        return bool(np.mean(np.abs(costs - predicted) <= allowed) >= 0.98)
-
-    def likely_cause(self, line: Line, tolerance: float) -> tuple[str, str]:
-        """Return the name of what explains the rewards, and a sentence.
-
-        Near a steady state many explanations are nearly right, hence exact ones go first.
-        """
+    def likely_cause(self, line: Line) -> tuple[str, str]:
+        """Return the name of what explains the rewards, and a sentence."""
         if np.ptp(self.rewards) <= 1e-9 * np.abs(self.rewards).max():
             return "constant", f"every reward is {self.rewards[0]:g}, whatever happens."
-        for width in (EXACT, tolerance):
-            if line.scale != 0:
-                of_line = (line.offset - self.rewards) / line.scale
-                if self.agree(of_line, self.cost, width):
-                    return line.cause
-            if self.agree(self.implied, self.after, width):
-                return "next state", (
-                    "the cost is c(s', u), of the state after the step, where the problem has "
-                    "c(s, u). Compute it before the env steps; leave a delay out."
-                )
+        late = Line.through(-self.after, -self.implied)
+        if late.r2 > max(EXPLAINED, line.r2) and abs(late.scale - 1) < 1 - EXPLAINED:
+            return "next state", (
+                "the cost is c(s', u), of the state after the step, where the problem has c(s, u). "
+                "Compute it before the env steps; leave a delay out."
+            )
+        if line.r2 > EXPLAINED:
+            return line.cause
         return "unknown", (
             "none that the audit knows. Compare the env's reward with problem.stage_cost(theta, u) "
-            "step by step: weights, units, what an observation means, whether actions are repeated."
+            "step by step: weights, units, what an observation means, whether actions are repeated, "
+            "and wrappers that change rewards, observations, actions or time."
         )
-
-
-def wrappers_of(venv: VecEnv) -> tuple[str, ...]:
-    """Return the wrappers of the envs that change rewards, observations, actions or time."""
-    found: list[type] = []
-    for each in (ActionRepeat, *(getattr(gymnasium.wrappers, name, None) for name in _EFFECTS)):
-        if each is None or any(issubclass(special, each) for special in found):
-            continue  # not in this version of Gymnasium, or named already
-        if any(venv.env_is_wrapped(each)):  # in other processes too
-            found.append(each)
-    return tuple(each.__name__ for each in found)
 
 
 class CostAudit(BaseCallback):
@@ -192,7 +144,7 @@ class CostAudit(BaseCallback):
 
     Actor and critic are exact only where the reward is minus the stage cost, scaled and shifted as
     the policy's :class:`CriticOptions` say. The audit compares the first steps of every `learn`,
-    and names a likely cause and wrappers of the env. Steps with ``info["violation"]``, and those
+    and names a likely cause. Steps with ``info["violation"]``, and those
     that terminate an episode, may cost more. While the plant rests it sees nothing.
 
     Parameters
@@ -295,17 +247,16 @@ class CostAudit(BaseCallback):
         line = Line.through(-compared.cost, compared.rewards)
         cause, explanation = self._vec_normalize_switched_on()
         if not cause and count >= MIN_STEPS and not compared.match(self.tolerance):
-            cause, explanation = compared.likely_cause(line, self.tolerance)
-        wrappers = wrappers_of(self.training_env) if cause else ()
+            cause, explanation = compared.likely_cause(line)
         message = f"The reward is the cost of the problem in all of {count} steps."
         if cause:
-            message = self._in_words(compared, line, explanation, wrappers)
+            message = self._in_words(compared, line, explanation)
         if not finite.all():
             rest = f" In the others, {cause}: {explanation}" if cause else ""
             cause = "not finite"
             message = f"{self._not_finite(finite, records['reward'])}{rest}"
         self._records = []
-        self.finding = CostFinding(not cause, cause, message, *line, count, wrappers)
+        self.finding = CostFinding(not cause, cause, message, *line, count)
         if not cause:
             if self.verbose:
                 print(f"Cost audit: {message}")
@@ -332,9 +283,7 @@ class CostAudit(BaseCallback):
         implied = (options.reward_offset - rewards) / options.reward_scale
         return Rewards(rewards, implied, cost, stage_cost(following, u), rounded)
 
-    def _in_words(
-        self, compared: Rewards, line: Line, explanation: str, wrappers: tuple[str, ...]
-    ) -> str:
+    def _in_words(self, compared: Rewards, line: Line, explanation: str) -> str:
         """Return what is said of rewards that are not the problem's."""
         options = self.policy.critic_options
         scale = options.reward_scale
@@ -348,9 +297,6 @@ class CostAudit(BaseCallback):
             f"{error.mean():.3g} on average, where the cost is {np.abs(compared.cost).mean():.3g}.",
             f"Likely cause: {explanation}",
         ]
-        if wrappers:
-            named = [f"{name} {_EFFECTS.get(name, _EFFECTS['RepeatAction'])}" for name in wrappers]
-            said.append(f"Wrappers of the env that may do this: {'; '.join(named)}.")
         said.append(
             f"The nearest straight line is reward = {line.scale:.6g} * (-cost) {line.offset:+.6g}, "
             f"R² = {line.r2:.6f}."

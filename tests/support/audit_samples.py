@@ -82,90 +82,76 @@ def show_shifted(env: gym.Env) -> gym.Env:
 OTHER = dataclasses.replace(MPC, Q=np.diag([1, 2, 3]), R=MPC.R / 2, terminal=None)
 LOW, HIGH = MPC.u_min.astype(np.float32), MPC.u_max.astype(np.float32)
 
-# What is done to the env, what it is taken for, the wrapper that is named, what else is said.
+# What is done to the env, what it is taken for, what else is said.
 WRONG = {
     "NormalizeReward": (
         lambda: wrappers.NormalizeReward(plant()),
         "unknown",
-        "NormalizeReward",
-        "divides rewards by running statistics: leave it out",
+        "step by step: weights, units",
     ),
     "TransformReward: sign": (
         lambda: wrappers.TransformReward(plant(), lambda reward: -reward),
         "sign flipped",
-        "TransformReward",
         "The learner would maximize it",
     ),
     "TransformReward: scale": (
         lambda: wrappers.TransformReward(plant(), lambda reward: 0.01 * reward),
         "scaled",
-        "TransformReward",
         'policy_kwargs={"critic": {"reward_scale": 0.01, "reward_offset": 0}}',
     ),
     "TransformReward: scale and offset": (
         lambda: wrappers.TransformReward(plant(), lambda reward: 0.5 * reward + 10),
         "scaled and shifted",
-        "TransformReward",
         '"reward_scale": 0.5',
     ),
     "TransformReward: constant": (
         lambda: wrappers.TransformReward(plant(), lambda reward: 1.0),
         "constant",
-        "TransformReward",
         "every reward is 1",
     ),
     "TransformReward: bent": (
         lambda: wrappers.TransformReward(plant(), lambda reward: -np.sqrt(-reward)),
         "unknown",
-        "TransformReward",
         "R² = 0.9",
     ),
     "ClipReward": (
         lambda: wrappers.ClipReward(plant(), -1.0),
         "unknown",
-        "ClipReward",
-        "clips rewards",
+        "step by step: weights, units",
     ),
     "DelayObservation by two": (
         lambda: wrappers.DelayObservation(plant(), 2),
         "unknown",
-        "DelayObservation",
-        "leave it out",
+        "step by step: weights, units",
     ),
     "StickyAction": (
         lambda: wrappers.StickyAction(plant(), 0.3),
         "unknown",
-        "StickyAction",
-        "does not always take the action",
+        "step by step: weights, units",
     ),
     "ActionRepeat": (
         lambda: ActionRepeat(plant(), 2),
         "unknown",
-        "ActionRepeat",
-        "repeats actions: the MPC needs the sampling time",
+        "step by step: weights, units",
     ),
     "RescaleAction": (
         lambda: wrappers.RescaleAction(with_other_inputs(), LOW, HIGH),
         "unknown",
-        "RescaleAction",
-        "build the LinearMPC for the inputs that the env takes",
+        "step by step: weights, units",
     ),
     "RescaleObservation": (
         lambda: wrappers.RescaleObservation(boxed(), np.float32(-1), np.float32(1)),
         "unknown",
-        "RescaleObservation",
-        "pass policy_kwargs={'observation': ...}",
+        "step by step: weights, units",
     ),
     "the next state": (
         lambda: Changed(plant(), at_the_next_state),
         "next state",
-        None,
         "c(s', u)",
     ),
     "other weights": (
         lambda: plant(OTHER),
         "unknown",
-        None,
         "step by step: weights, units",
     ),
 }
