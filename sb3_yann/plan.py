@@ -48,16 +48,6 @@ PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new
 Law = Callable[[Array], Array]
 
 
-class Plant(Protocol):
-    """What a plan may ask of a plant. The rows are numbers of starts."""
-
-    def step(self, theta: Array, u: Array, rows: Rows) -> Array:
-        """Return the next theta (k, n_theta) from theta and u (k, m); r and d stay."""
-
-    def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
-        """Return the derivatives of the step at theta (T, k, n_theta) and u (T, k, m)."""
-
-
 class TwinPlant:
     """The members of a twin, one for each start, or by default the mean of all."""
 
@@ -94,7 +84,7 @@ class TwinPlant:
         return np.asarray(after.mean(axis=0))
 
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
-        """Return the next theta (k, n_theta); an estimated d stays, as in an env's plan."""
+        """Return the next theta (k, n_theta), of the starts ``rows``; an estimated d stays."""
         row = self.dynamics.row
         after = self.advance(row.begin(theta), u, rows)
         found = row.shown(after).copy()
@@ -214,7 +204,7 @@ class Task:
 
 
 def roll_out(
-    plant: Plant, task: Task, policy: Policy, starts: Array, steps: int, rows: Rows
+    plant: TwinPlant, task: Task, policy: Policy, starts: Array, steps: int, rows: Rows
 ) -> tuple[Array, Array]:
     """Return thetas (steps + 1, k, n_theta) and inputs (steps, k, m) of a policy within bounds.
 
@@ -263,7 +253,7 @@ def follow(plans: Plans, t: int, theta: Array) -> Array:
 
 
 def planned(
-    plant: Plant, task: Task, policies: list[Policy], starts: Array, steps: int, rows: Rows
+    plant: TwinPlant, task: Task, policies: list[Policy], starts: Array, steps: int, rows: Rows
 ) -> Plans:
     """Return the best plan of each start that the policies' trajectories lead to.
 
@@ -271,7 +261,7 @@ def planned(
     """
     found = []
     every = np.arange(len(starts))
-    turn = getattr(plant, "turn", None)
+    turn = plant.turn
     soft = dataclasses.replace(task, weight=SOFT * task.weight)
     for policy in policies:
         thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
@@ -290,7 +280,7 @@ def planned(
     return dataclasses.replace(plans, gains=gains)
 
 
-def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
+def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
     """Return plans that no correction improves, or those after so many rounds.
 
     ``rows`` (k,) are the numbers of the starts, as the plant knows them.
@@ -335,7 +325,7 @@ def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) ->
 
 
 def _backward(
-    plant: Plant, task: Task, plans: Plans, rows: Rows, damping: Array
+    plant: TwinPlant, task: Task, plans: Plans, rows: Rows, damping: Array
 ) -> tuple[Array, Array]:
     """Return corrections (T, k, m) and gains (T, k, m, n_theta)."""
     problem = task.problem
@@ -428,7 +418,7 @@ def _reduced(H: Array, held: Mask) -> Array:
 
 
 def initial_guesses(
-    plant: Plant, task: Task, starts: Array, steps: int, rows: Rows
+    plant: TwinPlant, task: Task, starts: Array, steps: int, rows: Rows
 ) -> list[Policy]:
     """Return the policies whose trajectories plans may begin with; the first one is the MPC.
 
@@ -504,7 +494,7 @@ class Planning:
 
     def __init__(
         self,
-        plant: Plant,
+        plant: TwinPlant,
         task: Task,
         steps: int,
         pause: int = 0,

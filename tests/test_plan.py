@@ -24,6 +24,8 @@ STEPS = 30
 class Exact:
     """The prediction model as the plant."""
 
+    turn = None
+
     def __init__(self, mpc: LinearMPC) -> None:
         self.mpc = mpc
 

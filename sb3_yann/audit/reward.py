@@ -134,8 +134,8 @@ class Rewards(NamedTuple):
             return line.cause
         return "unknown", (
             "none that the audit knows. Compare the env's reward with problem.stage_cost(theta, u) "
-            "step by step: weights, units, what an observation means, whether actions are repeated, "
-            "and wrappers that change rewards, observations, actions or time."
+            "step by step: weights, units, what an observation means, repeated actions, wrappers "
+            "that change rewards, observations, actions or time."
         )
 
 

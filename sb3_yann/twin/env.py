@@ -310,11 +310,12 @@ class TwinEnv(gym.Env[Single, Single]):
         theta[state] = self.model.starts.draw(1, self.np_random)[0, state]
         if options:
             given = np.asarray(options.get("state"), np.float64)
-            if given.shape not in ((problem.model.n_states,), (problem.n_theta,)):
-                sizes = f"({problem.model.n_states},) or ({problem.n_theta},)"
-                raise ValueError(f"options['state'] has shape {given.shape}, expected {sizes}.")
-            if not np.all(np.isfinite(given)):
-                raise ValueError(f"options['state'] = {given.tolist()} must be finite numbers.")
+            sizes = (problem.model.n_states,), (problem.n_theta,)
+            if given.shape not in sizes or not np.all(np.isfinite(given)):
+                raise ValueError(
+                    f"options['state'] = {given.tolist()} must be finite numbers of the shape "
+                    f"{sizes[0]} or {sizes[1]}."
+                )
             theta[: len(given)] = units.to_deviations(given)
         self._theta = row.begin(theta)
         self._steps = 0

@@ -75,11 +75,11 @@ def as_episodes(
             x = x[:, None]
         own = {name: None if each is None else each[i] for name, each in given.items()}
         if x.ndim != 2 or x.shape[1] not in (layout.n_states, layout.size):
-            wanted = f"(T + 1, {layout.n_states})"
-            if layout.size > layout.n_states:
-                wanted += f", or all of theta, (T + 1, {layout.size})"
-            wanted += f".{_lacking(problem, x)}"
-            raise ValueError(f"episode {i}: states have shape {x.shape}, expected {wanted}")
+            raise ValueError(
+                f"episode {i}: states have shape {x.shape}, expected (T + 1, {layout.n_states}) or "
+                f"all of theta, (T + 1, {layout.size}). Past inputs are states where the model has "
+                "them: log the env in sb3_yann.wrappers.PastInputs."
+            )
         if len(x) != len(u) + 1:
             raise ValueError(
                 f"episode {i}: {len(x)} states and {len(u)} actions; there is one state more than "
@@ -139,24 +139,6 @@ def records(episodes: tuple[Episode, ...]) -> list[range]:
     follows = [np.array_equal(a.thetas[-1], b.thetas[0]) for a, b in pairwise(episodes)]
     edges = [0, *(np.flatnonzero(~np.array(follows, dtype=bool)) + 1), len(episodes)]
     return [range(int(first), int(stop)) for first, stop in pairwise(edges)]
-
-
-def _lacking(problem: LinearMPC, states: Array) -> str:
-    """Return a hint where states (T + 1, k) lack the inputs on their way, empty elsewhere."""
-    model = problem.model
-    past = list[int]()
-    rows = np.hstack([model.A, model.B])
-    taken_over = (np.count_nonzero(rows, axis=1) == 1) & (rows.max(axis=1) == 1.0)
-    for _ in range(model.n_states):  # each is an input of the step before, or such a state's value
-        known = {*past, *range(model.n_states, rows.shape[1])}
-        past = [int(k) for k in np.flatnonzero(taken_over) if int(np.argmax(rows[k])) in known]
-    if not past or states.ndim != 2 or states.shape[1] != model.n_states - len(past):
-        return ""
-    names = ", ".join(problem.labels()[k] for k in past)
-    return (
-        f" They lack the past inputs {names}, which are states of the model: log the env in "
-        "sb3_yann.wrappers.PastInputs, or append them as columns."
-    )
 
 
 def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:

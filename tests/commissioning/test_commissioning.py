@@ -15,7 +15,7 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import Commissioning, Improvement, YannPolicy
 from sb3_yann.commissioning import commissioning
-from sb3_yann.commissioning.comparison import (
+from sb3_yann.commissioning.commissioning import (
     Costs,
     is_hopeless,
     is_kept,

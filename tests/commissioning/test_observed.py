@@ -8,7 +8,7 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import Commissioning, Improvement, PlantTwin, YannPolicy, improve
 from sb3_yann.commissioning import commissioning
-from sb3_yann.commissioning.comparison import predicted_costs
+from sb3_yann.commissioning.commissioning import predicted_costs
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import law_of

@@ -15,7 +15,7 @@ from stable_baselines3 import DDPG
 from resumed import all_bits, envs, model_bits
 from sb3_yann import Commissioning, Improvement, YannPolicy, improve
 from sb3_yann.commissioning import commissioning
-from sb3_yann.commissioning.comparison import why_taken_back
+from sb3_yann.commissioning.commissioning import why_taken_back
 from sb3_yann.improvement import Check
 from twin_samples import Cart, twin
 

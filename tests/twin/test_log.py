@@ -31,21 +31,6 @@ def test_what_is_no_log_is_refused_by_name(episodes, error, message) -> None:
         as_episodes(problem(), episodes)
 
 
-def test_past_inputs_that_a_log_lacks_are_named() -> None:
-    """x[0] and x[2] are the plant's, x[1] and x[3] the inputs of one and of two steps before."""
-    A = [[0.9, 0, 0, 0.5], [0, 0, 0, 0], [0, 0, 0.8, 0], [0, 1, 0, 0]]
-    model = LinearModel(A, [[0], [1], [0.1], [0]], 1.0)
-    box = {"u_min": -1, "u_max": 1, "theta_min": -5, "theta_max": 5}
-    mpc = LinearMPC(model, Q=np.eye(4), R=[[1]], horizon=2, **box)
-    with pytest.raises(
-        ValueError, match=r"lack the past inputs x\[1\], x\[3\], .*PastInputs, or app"
-    ):
-        as_episodes(mpc, [(X, U)])
-    for columns in (1, 3):
-        with pytest.raises(ValueError, match=r"expected \(T \+ 1, 4\)\.$"):
-            as_episodes(mpc, [(np.zeros((11, columns)), U)])
-
-
 def test_the_parts_of_theta_come_from_beside_the_states_or_with_them() -> None:
     model = LinearModel([[0.9]], [[1.0]], 1.0, E=[[0.5]])
     mpc = LinearMPC(
