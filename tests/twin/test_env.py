@@ -115,7 +115,7 @@ def test_an_episode_may_begin_where_it_is_asked_to() -> None:
     np.testing.assert_array_equal(info["state"][:2], [0.3, -0.2])
     assert info["state"][2] in {each.thetas[0, 2] for each in logs} and info["member"] == 1
     for given, message in (
-        ([0.3], r"has shape \(1,\), expected \(2,\) or \(3,\)"),
+        ([0.3], r"of the shape \(2,\) or \(3,\)"),
         ([0.3, np.nan], "must be finite numbers"),
     ):
         with pytest.raises(ValueError, match=message):
