@@ -15,8 +15,6 @@ from sb3_yann.compare import (
     Starts,
     Tolerance,
     less_safe,
-    level_of_look,
-    looks,
     no_worse,
     tail_average,
     unsafe_columns,
@@ -251,11 +249,6 @@ def test_a_gain_is_sure_or_hopeless_by_the_pairs() -> None:
     tail = scores([11.5] + [1.0] * 19)
     assert not no_worse(tail, mpc, mpc, Tolerance(1.0, 0.05, 10.0)).is_hopeless
     assert no_worse(tail, mpc, mpc, Tolerance(1.0)).is_hopeless
-
-
-def test_looks_double_and_share_the_level() -> None:
-    assert looks(5, 100) == [5, 10, 20, 40, 80, 100] and looks(5, 3) == [3]
-    assert sum(level_of_look(0.05, j) for j in range(1, 1000)) == pytest.approx(0.05, rel=0.01)
 
 
 def test_pairs_that_follow_each_other_alike_are_fewer_than_they_seem() -> None:

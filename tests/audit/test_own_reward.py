@@ -14,9 +14,8 @@ from stable_baselines3 import DDPG
 from sb3_yann import CostMismatchWarning, LinearModel, LinearMPC, Tracking, headroom, improve
 from sb3_yann.audit.meaning import below_set_points, warn_of_own_reward
 from sb3_yann.improvement.simulator import of_law
-from sb3_yann.rollout import Trajectories, as_reward, rollout
+from sb3_yann.rollout import Trajectories, rollout
 from sb3_yann.wrappers import SetPoint, StageCost
-from sb3_yann_envs import problems
 
 PLANT = LinearModel([[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0)
 
@@ -93,12 +92,6 @@ def test_the_reward_of_the_wrapper_is_none(kind: str) -> None:
     assert not told(lambda: StageCost(Rewarded(OTHER[kind]), mpc()), mpc())
 
 
-@pytest.mark.parametrize("name", ["CSTR-v0", "ClippedPendulum-v0"])
-def test_the_rewards_of_the_built_in_envs_are_none(name: str) -> None:
-    with_problem = {"CSTR-v0": problems.cstr, "ClippedPendulum-v0": problems.clipped_pendulum}
-    assert not told(partial(gym.make, name), with_problem[name]())
-
-
 def test_what_a_violation_or_a_termination_costs_does_not_count() -> None:
     class Ends(gym.Wrapper):
         def step(self, action):
@@ -130,11 +123,6 @@ def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
             own_rewards=(rewards,),
         )
         warn_of_own_reward(problem, played, stacklevel=2)
-
-
-def test_a_reward_is_a_number_or_none() -> None:
-    assert as_reward(2) == as_reward(np.array([2.0])) == 2
-    assert all(np.isnan(as_reward(each)) for each in (None, "much", [1, 2], {}))
 
 
 def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:

@@ -243,15 +243,6 @@ def test_weights_that_nobody_accepted_never_act() -> None:
     assert run.policy.max_correction == 0.2 and run.episodes[-1].apart <= 0.2 + 1e-6
 
 
-def test_what_the_model_had_learnt_before_waits_for_its_test() -> None:
-    model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
-    with th.no_grad():
-        for each in model.policy.actor.parameters():
-            each.add_(0.01)
-    run = Commissioning(model, Cart, batch=3, updates=1)
-    assert is_mpc(model) and run.accepted.candidate is not None
-
-
 def test_a_plant_that_trips_under_the_policy_gets_the_mpc(tmp_path) -> None:
     class Trips(Cart):
         def step(self, action):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from functools import cache
 
@@ -127,16 +126,6 @@ def test_the_first_alarm_of_an_episode_stays_until_the_next_begins() -> None:
     assert dog.watch(*drive(1)[1]) is alarm and not dog.quiet
     dog.start(drive(1)[0][0])
     assert dog.quiet and dog.watch(*drive(1)[0]) is None
-
-
-def test_it_pickles_in_the_middle_of_an_episode_and_says_the_same_in_the_next() -> None:
-    dog, faulty = watchdog(), drive(5, force=1.5)
-    dog.start(faulty[0][0])
-    dog.watch(*faulty[0])
-    again = pickle.loads(pickle.dumps(dog))
-    with pytest.raises(RuntimeError, match="call start"):
-        again.watch(*faulty[1])
-    assert barks(again, faulty) == barks(dog, faulty) is not None
 
 
 def test_where_the_log_tells_little_the_band_is_wider() -> None:

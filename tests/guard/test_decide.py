@@ -81,17 +81,6 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     assert hard and all(seed % 3 == 0 for seed in hard)
 
 
-@pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
-def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, seeds) -> None:
-    model = build(gradient_steps=0)
-    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule=WHOLE)
-    train(model, STEPS, At([STEPS], spoil_left), guard)
-    assert guard.state.evidence.next_seed == FIRST + 10 + seeds
-    assert is_mpc(model) == (final is not None)
-    if final is not None:
-        assert guard.decisions[-1].reason.startswith("at the end, on 30 new starts, start 1000")
-
-
 def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> None:
     simulator = partial(OftenRight, after=FIRST + 10)
     model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
@@ -126,18 +115,6 @@ def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() 
     assert guard.decisions[-1].accepted_cost == pytest.approx(guard.decisions[-1].mpc_cost)
 
 
-def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
-    # Only the very last of them shows the left.
-    simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 5 + 199)
-    model, guard = tried(spoil_left, env=simulator, n_new_starts=20)
-    whole, end = guard.decisions
-    assert whole.verdict == "accepted"
-    assert end.verdict == "accepted in part" and end.reason.startswith("at the end, on 200 new")
-    assert not last_layer(model)[REGION[LEFT], :, -1].any()
-    assert actor_bits(model.policy) == accepted_bits(guard)
-    assert guard.state.evidence.starts.seeds[0] == FIRST + 10 + 5 + 199
-
-
 GENTLE = {"cvar_alpha": 0.05, "backtrack": True}
 SHARED_NETWORK = {"networks": "shared"}
 
@@ -166,18 +143,6 @@ def test_at_the_end_half_of_a_correction_is_kept_that_loses() -> None:
 def push_left(policy) -> None:
     correct(policy, RIGHT, 0.5)
     correct(policy, LEFT, -1.2)  # the best is -.5
-
-
-def test_a_fall_back_to_the_mpc_is_called_that() -> None:
-    model = build(gradient_steps=0)
-    rule = {**GENTLE, "by_region": False, "backtrack": False}
-    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=60, rule=rule)
-    train(model, STEPS, At([STEPS], push_left), guard)
-    assert guard.decisions[-1].reason.endswith("; the guard falls back to the MPC")
-    assert is_mpc(model)
-    said = guard.summary()
-    assert "accepted last is the MPC" in said and "raise n_eval_episodes" in said
-    assert f"  steps        {guard.steps:,} of the guard's simulator" in said
 
 
 def test_the_guard_counts_the_steps_of_its_simulator() -> None:

@@ -180,16 +180,6 @@ def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections(
     assert not any(shrunk[i] for i in range(3) if not any(restored[: i + 1]))
 
 
-def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=5, keep_if_worse=True)
-    train(model, 2 * STEPS, At([1], worse), guard)
-    assert guard.decisions[-1].restored
-    assert is_mpc(model)
-    worse(model.policy)
-    train(model, STEPS + 1, guard)  # five more, not what was left
-    assert [each.restored for each in guard.decisions[-2:]] == [False, True]
-
-
 def test_rejections_shrink_the_step_to_its_floor_and_acceptances_let_it_grow_to_one() -> None:
     model = build(gradient_steps=0)
     guard = make_guard(step_size=StepSize(0.3, 2.5, 0.2), rule={"margin": 10.0})

@@ -191,14 +191,6 @@ def test_with_other_settings_the_guard_starts_afresh(change) -> None:
     assert accepted_bits(second) == actor_bits(model.policy)  # it is better than the MPC: kept
 
 
-def test_what_does_not_concern_the_evidence_may_change_in_between() -> None:
-    model = three_decisions(make_guard())
-    others = {"rule": {"by_region": False}, "step_size": {"shrink": 0.9}, "log_path": None}
-    second = make_guard(eval_freq=2, patience=2, **others)
-    train(model, 1, second)
-    assert len(second.decisions) == 3
-
-
 def saved(folder: Path) -> Any:
     return DDPG.load(folder / "accepted_model.zip", device="cpu")
 
@@ -304,21 +296,6 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("last", "words"),
-    [
-        (decision("accepted", 41.0), ("gains nothing", "+2.50 %", "41 instead of 40")),
-        (decision("rejected", 40.0, "x"), ("is not the MPC, and gains nothing", "+0.00 %")),
-        (decision("accepted", -2.0, mpc=0.0), ("is better", "  -2 instead of 0 over 5 episodes")),
-        (decision("accepted", -50.0, mpc=-40.0), ("is better", "-25.00 %", "of -40 over")),
-    ],
-    ids=["more", "as much", "an MPC that costs nothing", "negative costs"],
-)
-def test_the_change_is_against_the_size_of_the_mpc_s_cost(last, words) -> None:
-    verdict, change, *_ = said_of([last])
-    assert all(each in f"{verdict} {change}" for each in words)
-
-
 def test_the_final_starts_that_the_rule_lets_it_lose_are_listed() -> None:
     said = said_of([decision("accepted", 30.0)], lost=(7, 12))
     assert said[3].endswith(
@@ -387,10 +364,6 @@ def test_a_candidate_far_beyond_is_drawn_at_the_edge_and_counted() -> None:
     assert top < 20
     assert drawn(axes)["refused, policy restored"] == ([4, 5], [top, top])
     assert any(name.startswith("(2 beyond") for name in drawn(axes))
-
-
-def test_no_decision_is_said_to_be_none() -> None:
-    assert [text.get_text() for text in plot_decisions([]).texts] == ["no candidate was tried"]
 
 
 def test_headroom_is_drawn_part_after_part() -> None:

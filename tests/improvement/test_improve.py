@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import importlib
 import pickle
 from contextlib import closing
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import gymnasium as gym
 import numpy as np
@@ -530,21 +529,3 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
         Improvement((small,), 0.0, accepted=False)
     )
     assert Improvement((), 0.0, False).reason == "Nothing better was found: no gain in the twin."
-
-
-def test_what_a_final_check_says_is_the_reason() -> None:
-    refused = partial(Check, change=0.01, worst=0.0, safe=True)
-    checks = (
-        refused(1, False, "early"),
-        refused(2, False, "the last word", final=True),
-        refused(3, True, ""),
-    )
-    assert "the last word" in Improvement(checks, 0.0, False).reason
-    assert "no steps left" in Improvement(checks, 0.0, False, note="no steps left").reason
-
-
-def test_a_copy_of_a_model_is_not_shared() -> None:
-    model = model_of()
-    other = copy.deepcopy(model.policy)
-    assert improve(model, Spring, **FEW).accepted
-    assert other.actor.mu.network.is_zero()

@@ -79,36 +79,6 @@ def test_an_episode_is_a_loop_of_the_members_steps(make, each) -> None:
     assert played.unsafe.shape == (len(found), 9) and not played.unsafe[:, :4].any()
 
 
-def test_half_of_them_begin_as_their_episode_did_and_the_others_in_its_box() -> None:
-    found = scenarios(learnt())
-    first = np.array([each.thetas[0] for each in learnt().episodes])
-    np.testing.assert_array_equal(found.starts[::2], first[::2])
-    moved, box = found.starts[1::2], learnt().starts
-    assert np.all((moved >= box.low) & (moved <= box.high))
-    assert not np.any(moved == first[1::2])
-    again = scenarios(learnt())
-    np.testing.assert_array_equal(found.starts, again.starts)
-    assert found.given.shape == (60, 4, 0)  # as long as the longest
-
-
-def test_references_are_those_of_the_episodes_and_stay_after_their_end() -> None:
-    found, model = scenarios(observed(), each=True), observed()
-    part = model.dynamics.row.given
-    for i, each in enumerate(model.episodes[:4]):
-        np.testing.assert_array_equal(found.given[:, i], each.thetas[: len(each), part])
-    assert np.array_equal(found.members, np.arange(4) % len(model.dynamics.members))
-
-
-def test_an_input_beyond_its_bounds_is_clipped_and_one_that_is_none_is_zero() -> None:
-    found = scenarios(learnt())
-
-    def act(t, theta, rows):
-        return np.where(rows[:, None] == 0, np.nan, 7.0)
-
-    played = found.play(act)
-    assert np.all(played.inputs[:, 0] == 0) and np.all(played.inputs[:, 1:] == 1)
-
-
 def test_what_is_not_finite_is_lost_and_has_no_cost() -> None:
     found = scenarios(learnt())
     found.starts[2] = np.nan
@@ -154,15 +124,6 @@ def test_the_price_of_doubt_is_that_of_what_sets_members_apart(make) -> None:
         np.testing.assert_allclose(gradient[..., j], slope, rtol=1e-4, atol=1e-6 * price.max())
     np.testing.assert_allclose(curvature, np.swapaxes(curvature, -1, -2))
     assert np.linalg.eigvalsh(curvature).min() > -1e-9 * np.abs(curvature).max()
-
-
-def test_members_that_agree_cost_nothing() -> None:
-    dynamics = learnt().dynamics
-    same = type(dynamics)(problem(), dynamics.coordinates, (dynamics.members[0],) * 2)
-    at = np.full((3, 2, 2), 0.4), np.full((3, 2, 1), 0.2)
-    doubt = Disagreement(same, weight=1e6)
-    assert not doubt.costs(*at).any()
-    assert not any(each.any() for each in doubt.slopes(*at))
 
 
 @pytest.mark.parametrize(

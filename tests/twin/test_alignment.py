@@ -243,19 +243,6 @@ def test_a_reactor_s_log_in_other_units_is_refused_or_not_trusted(change) -> Non
     refuse_or_doubt(problems.cstr(), [change(x, u) for x, u in reactor()])
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda x, u: (x + np.array([20.0, 0.0]), u),
-        lambda x, u: (100 * x, u),
-        lambda x, u: (x, 100 * u),
-    ],
-    ids=["absolute place", "per cent", "input in per cent"],
-)
-def test_the_cart_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
-    refuse_or_doubt(problem(), [change(x, u) for x, u in log(3)])
-
-
 def test_what_is_missing_in_a_poor_log_is_advised() -> None:
     one, still = reactor()[:1], [(x, 0 * u + 0.1) for x, u in reactor()]
     for episodes, advice in (

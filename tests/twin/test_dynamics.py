@@ -7,7 +7,7 @@ import pytest
 
 from general_problems import solved
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, Residual, law_of
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual, law_of
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import random_episode as episode
@@ -33,23 +33,6 @@ def test_it_is_the_sum_of_a_network_and_a_polynomial(hidden: int) -> None:
     moves = 1e-6 * np.eye(K)
     slopes = [(found.predict(z + e) - found.predict(z - e)) / 2e-6 for e in moves]
     np.testing.assert_allclose(found.jacobian(z), np.stack(slopes, -1), atol=1e-8)
-
-
-@pytest.mark.parametrize("hidden", [0, 4])
-def test_a_stack_says_what_each_of_them_says(hidden: int) -> None:
-    members, z = [network(seed, hidden) for seed in range(2)], np.ones((2, 5, K))
-    z[1] *= 0.3
-    for method in ("predict", "jacobian"):
-        expected = [getattr(each, method)(rows) for each, rows in zip(members, z, strict=True)]
-        np.testing.assert_allclose(getattr(Residual.stack(members), method)(z), expected)
-
-
-def test_none_is_zero_and_a_polynomial_without_a_constant_is_so_at_rest() -> None:
-    nothing, z = Residual.zero(K, N), np.ones((2, 4, K))
-    assert not nothing.predict(z).any() and not nothing.jacobian(z).any()
-    assert nothing.jacobian(z).shape == (2, 4, N, K)
-    straight = Residual.polynomial(np.ones((K, N)))
-    assert not straight.predict(0 * z).any() and straight.is_polynomial
 
 
 DT = 0.1
@@ -87,16 +70,6 @@ def test_a_wrapped_angle_is_found_and_its_jumps_are_not_learnt(turn, low) -> Non
         assert np.ptp(after[:, 0]) <= 1.001 * turn
 
 
-def test_a_state_that_does_not_jump_is_no_angle() -> None:
-    log = episodes(2 * np.pi, -np.pi)
-    calm = [Episode(np.unwrap(e.thetas, axis=0), e.actions) for e in log]
-    assert Coordinates.of(rotor(), calm).turn is None
-    # A sensor that falls to zero now and then is none either.
-    for each in calm:
-        each.thetas[::7, 0] = 0.0
-    assert Coordinates.of(rotor(), calm).turn is None
-
-
 def bent(mpc: LinearMPC, members: int = 2) -> tuple[Dynamics, Episode]:
     """Return dynamics with quadratic residuals, and the episode that scales them."""
     log, found = episode(mpc), []
@@ -121,31 +94,6 @@ def stepped(dynamics: Dynamics, member: int, theta: np.ndarray, u: np.ndarray) -
     after[:n] += dynamics.members[member].predict(z[None])[0]
     after[mpc.layout.previous] = u[: mpc.layout.n_previous]
     return after
-
-
-def test_the_box_of_the_data_is_a_quarter_wider_and_its_scale_the_largest_magnitude() -> None:
-    mpc = solved("servo with a disturbance")
-    logs = [episode(mpc, seed=seed) for seed in range(2)]
-    found = Coordinates.of(mpc, logs)
-    seen = np.vstack([np.column_stack([e.thetas[:-1, [0, 1, 3]], e.actions]) for e in logs])
-    width = np.ptp(seen, axis=0)
-    np.testing.assert_allclose(found.low, seen.min(axis=0) - 0.25 * width)
-    np.testing.assert_allclose(found.high, seen.max(axis=0) + 0.25 * width)
-    np.testing.assert_allclose(found.scale, np.abs(seen).max(axis=0))
-    np.testing.assert_allclose(found.units, np.std(seen, axis=0)[:2])
-    far = np.vstack([found.high + 1, found.low - 1, seen[0]])
-    expected = np.vstack([found.high, found.low, seen[0]]) / found.scale
-    np.testing.assert_allclose(found.scaled(far), expected)
-
-
-def test_what_never_moves_is_scaled_by_its_half_width() -> None:
-    mpc = solved("servo with a disturbance")
-    still = Episode(np.zeros((7, mpc.n_theta)), np.zeros((6, 1)))
-    found, half = Coordinates.of(mpc, [still]), np.array([5.0, 5.0, 0.3, 1.5])
-    np.testing.assert_allclose(found.high, MARGIN * 1e-6 * half)
-    np.testing.assert_allclose(found.low, -MARGIN * 1e-6 * half)
-    np.testing.assert_allclose(found.scale, 1e-3 * half)
-    np.testing.assert_allclose(found.units, 1e-6 * half[:2])
 
 
 def test_the_law_says_nothing_where_a_row_is_not_finite() -> None:
@@ -186,32 +134,6 @@ def test_a_replay_takes_inputs_set_points_and_disturbances_of_the_log_and_nothin
                 if k < 5:
                     theta[given] = log.thetas[start + k, given]
                     theta = stepped(dynamics, member, theta, log.actions[start + k])
-
-
-@pytest.mark.parametrize("moving", [False, True])
-def test_a_roll_out_acts_on_what_it_is_given_at_each_step_else_on_what_stays(moving) -> None:
-    mpc = solved("servo with all of it")
-    dynamics, log = bent(mpc)
-    starts = np.stack([log.thetas[:3], log.thetas[4:7]])
-    given = None
-    if moving:
-        rng, part = np.random.default_rng(5), mpc.layout.constant
-        low, high = mpc.theta_min[part], mpc.theta_max[part]
-        given = rng.uniform(0.5 * low, 0.5 * high, (4, 3, 2))
-    law = mpc.explicit()
-    thetas, inputs = dynamics.roll_out(law, starts, 4, given)
-    assert thetas.shape == (5, 2, 3, mpc.n_theta) and inputs.shape == (4, 2, 3, 1)
-    for member in range(2):
-        for i in range(3):
-            theta = starts[member, i].copy()
-            for t in range(4):
-                if given is not None:
-                    theta[mpc.layout.constant] = given[t, i]
-                np.testing.assert_allclose(thetas[t, member, i], theta, rtol=1e-9, atol=1e-10)
-                u = law(theta)
-                np.testing.assert_allclose(inputs[t, member, i], u, rtol=1e-9, atol=1e-9)
-                theta = stepped(dynamics, member, theta, u)
-            np.testing.assert_allclose(thetas[4, member, i], theta, rtol=1e-9, atol=1e-10)
 
 
 def test_in_a_closed_loop_the_logged_inputs_are_corrected_by_the_law() -> None:

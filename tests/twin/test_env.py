@@ -66,11 +66,6 @@ def test_a_model_trains_in_it_under_a_guard_that_plays_every_member() -> None:
     assert guard.settings.of_evidence["env"] == "PlantTwin.env"
 
 
-def test_a_start_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"options\['state'\] = \[nan, 0.0\] must be finite"):
-        twin().env().reset(options={"state": [np.nan, 0.0]})
-
-
 def held() -> tuple[PlantTwin, list[Episode]]:
     """The twin of a servo whose set-point moves at each step, from episodes of two lengths."""
     mpc = solved("servo")
@@ -122,18 +117,3 @@ def test_an_episode_may_begin_where_it_is_asked_to() -> None:
             env.reset(options={"state": given})
     with pytest.raises(gym.error.ResetNeeded):
         found.env().step(np.zeros(1))
-
-
-def test_without_a_seed_the_members_are_drawn() -> None:
-    env = twin().env()
-    env.reset(seed=0)
-    assert {env.reset()[1]["member"] for _ in range(60)} == set(range(5))
-    assert twin().env(member=4).reset(seed=1)[1]["member"] == 4
-    assert twin().env(member=0).reset(seed=1)[1]["member"] == 0
-
-
-def test_a_member_s_number_is_whole_and_below_their_count() -> None:
-    with pytest.raises(ValueError, match="member = 5 must be below 5"):
-        twin().env(member=5)
-    with pytest.raises(ValueError, match="member = -1"):
-        twin().env(member=-1)

@@ -80,17 +80,6 @@ def test_an_input_a_thousandth_beyond_its_bound_is_rounding_and_more_is_not() ->
             as_episodes(problem(), [(X, sign * 10.011 * U)])
 
 
-def test_a_state_and_an_input_alone_may_be_rows() -> None:
-    mpc = LinearMPC(
-        LinearModel([[0.9]], [[1.0]], 1.0), Q=[[1]], R=[[1]], horizon=2, u_min=-1, u_max=1,
-        theta_min=-5, theta_max=5,
-    )  # fmt: skip
-    x, u = np.arange(8.0), np.linspace(-0.3, 0.3, 7)
-    (episode,) = as_episodes(mpc, [(x, u)])
-    np.testing.assert_array_equal(episode.thetas, x[:, None])
-    np.testing.assert_array_equal(episode.actions, u[:, None])
-
-
 def loaded() -> LinearMPC:
     """A problem whose theta holds a state, a reference, two disturbances and the input before."""
     return LinearMPC(
@@ -110,12 +99,6 @@ def test_an_observer_s_disturbances_are_not_known_where_they_are_not_given() -> 
         as_episodes(loaded(), [(x, u)], [r])
     with pytest.raises(ValueError, match="theta holds 1 references"):
         as_episodes(loaded(), [(x, u)], observed=True)
-
-
-def test_disturbances_are_taken_off_their_own_operating_point() -> None:
-    x, u = np.zeros((8, 1)), np.zeros((7, 1))
-    (episode,) = as_episodes(loaded(), [(x, u)], [0.0], [[7.5, 7.8]])
-    np.testing.assert_allclose(episode.thetas[:, 2:4], np.tile([0.5, -0.2], (8, 1)))
 
 
 @pytest.mark.parametrize(

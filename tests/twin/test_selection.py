@@ -55,15 +55,6 @@ def test_weights_are_those_of_a_ridge_regression_on_what_the_model_leaves(name, 
     np.testing.assert_allclose(at_rest, solution[-1:] if constant else 0.0, atol=1e-7)
 
 
-def test_errors_and_scores_are_means_over_episodes_and_over_horizons() -> None:
-    by_episode = np.array([[[1.0, 2.0], [3.0, np.nan]], [[0.5, 0.5], [0.5, 2.0]]])
-    found = FreeRuns(np.array([5, 10]), by_episode)
-    expected = [[np.sqrt((1 + 9) / 2), 2.0], [0.5, np.sqrt((0.25 + 4) / 2)]]
-    np.testing.assert_allclose(found.errors, expected)
-    scores = [[np.log(2) / 2, np.log(3)], [np.log(0.5), 0.0]]
-    np.testing.assert_allclose(found.scores, scores, atol=1e-9)
-
-
 def runs(*scores: list[float]) -> FreeRuns:
     """Return free runs with these scores of each candidate, by episode."""
     return FreeRuns(np.array([5]), np.exp(np.array(scores))[:, :, None])
@@ -78,18 +69,6 @@ def test_the_first_is_taken_of_what_is_one_standard_error_from_the_best() -> Non
         assert runs([9.0] * 4, [*near], [*best]).choose() == chosen
     assert runs([1.0, 2.0], [1.0, 2.0]).choose() == 0
     assert runs([0.0, 0.0], [2.0, 2.0], [1.0, 1.0]).choose(1) == 2
-
-
-def test_an_episode_that_is_too_short_for_any_horizon_says_nothing() -> None:
-    """An observer's may be: it loses a row where it begins amid an estimate."""
-    found = runs([1.0, 0.0, 1.1], [0.0, 9.0, 0.0])
-    assert found.choose() == 0
-    found.by_episode[:, 1] = np.nan
-    assert found.choose() == 1
-    log = [episode(problem(), steps, seed) for seed, steps in enumerate((4, 20, 20))]
-    box = Coordinates.of(problem(), log)
-    short = held_out(box, log, candidates(box, log, []))
-    assert np.isnan(short.by_episode[:, 0]).all() and np.isfinite(short.by_episode[:, 1:]).all()
 
 
 def test_each_episode_is_left_out_once_in_five_folds() -> None:

@@ -57,20 +57,6 @@ def test_a_start_is_the_rarer_the_farther_it_lies_outside_the_range_of_the_log()
         assert abs(often - 2 / (k + 1) * ((1 + rho) / 2) ** (1.0 - k)) < 0.01
 
 
-def test_what_a_log_shows_are_its_rows_and_where_it_may_begin() -> None:
-    starts = twin().starts
-    low, high = starts.shown
-    assert np.all((starts.rows >= low) & (starts.rows <= high))
-    k, half = len(starts.first), np.ptp(starts.first, axis=0) / 2
-    middle = (starts.first.max(0) + starts.first.min(0)) / 2
-    assert 2 / (k + 1) > 0.05  # so many starts lie beyond the range of the log itself
-    beyond = middle + half * (2 * (40 / (k + 1)) ** (1 / (k - 1)) - 1) * np.eye(2)
-    np.testing.assert_allclose(starts.chance_beyond(beyond), 0.05)
-    further = beyond.max(0) - middle
-    np.testing.assert_allclose(low, np.minimum(starts.rows.min(0), middle - further))
-    np.testing.assert_allclose(high, np.maximum(starts.rows.max(0), middle + further))
-
-
 def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
     mpc, rng = solved("servo with rates"), np.random.default_rng(0)
     held = mpc.layout.reference
@@ -88,38 +74,6 @@ def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
     assert np.isin(starts.draw(200, rng)[:, held], thetas[:, held]).all()
     never_moved = Starts(mpc, starts.low, starts.high, thetas[:1], thetas[:1])
     assert np.isin(never_moved.draw_between(50, rng)[:, held], thetas[0, held]).all()
-
-
-@pytest.mark.parametrize(("k", "widened"), [(1, 2.0), (2, 2.0), (3, 2.0), (5, 1.5), (11, 1.2)])
-def test_the_box_of_starts_is_wider_than_they_are_the_fewer_there_are(k, widened) -> None:
-    rng, mpc = np.random.default_rng(0), problem()
-    first = rng.uniform(-1, 1, (k, 2))
-    episodes = [
-        Episode(np.vstack([x, rng.uniform(-3, 3, (5, 2))]), np.zeros((5, 1))) for x in first
-    ]
-    found = Starts.of(mpc, tuple(episodes))
-    middle, half = (first.max(0) + first.min(0)) / 2, np.ptp(first, axis=0) / 2
-    np.testing.assert_allclose(found.low, middle - widened * half)
-    np.testing.assert_allclose(found.high, middle + widened * half)
-    assert len(found.rows) == 5 * k  # without the last one, from which nothing was done
-    np.testing.assert_array_equal(found.rows[:5], episodes[0].thetas[:-1])
-    beyond = tuple(Episode(3 * each.thetas, each.actions) for each in episodes)
-    clipped = Starts.of(mpc, beyond)
-    np.testing.assert_allclose(clipped.low, np.maximum(3 * found.low, -3))
-    np.testing.assert_allclose(clipped.high, np.minimum(3 * found.high, 3))
-
-
-def test_a_draw_has_the_rest_of_the_episode_that_is_named() -> None:
-    mpc, rng = solved("servo with rates"), np.random.default_rng(0)
-    thetas = 0.2 * mpc.theta_half * rng.uniform(-1, 1, (4, mpc.n_theta))
-    episodes = (Episode(np.tile(each, (7, 1)), np.zeros((6, 1))) for each in thetas)
-    starts = Starts.of(mpc, tuple(episodes))
-    before = starts.first.copy()
-    which = np.array([3, 0, 0, 2, 1, 3])
-    drawn = starts.draw(6, rng, which)
-    np.testing.assert_array_equal(drawn[:, 2:], thetas[which, 2:])
-    assert np.ptp(drawn[:, 0]) > 0 and np.all(drawn[:, :2] <= starts.high)
-    np.testing.assert_array_equal(starts.first, before)  # drawn from, and not written to
 
 
 @pytest.mark.parametrize("k", [2, 4, 12])

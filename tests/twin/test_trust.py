@@ -10,10 +10,9 @@ import pytest
 from matplotlib.axes import Axes
 
 from general_problems import solved
-from sb3_yann import LinearMPC, PlantTwin, RateLimits
+from sb3_yann import PlantTwin
 from sb3_yann.evaluation.plots import plot_twin
 from sb3_yann.twin import trust as trusts
-from sb3_yann.twin.dynamics import Residual
 from sb3_yann.twin.log import Episode, as_episodes, records
 from sb3_yann.twin.selection import FreeRuns
 from sb3_yann.twin.trust import report
@@ -38,31 +37,6 @@ def judged(found: FreeRuns, standing=(1.0, 1.0), **changes):
 
 
 GOOD = [0.1, 0.2]
-
-
-def test_the_error_of_costs_is_relative_to_their_mean() -> None:
-    assert trusts.relative_error(np.array([1.0, 7.0]), np.array([4.0, 3.0])) == pytest.approx(
-        np.sqrt(12.5) / 3.5
-    )
-    assert trusts.relative_error(np.zeros(0), np.zeros(0)) == np.inf
-
-
-def test_costs_of_each_episode_are_predicted_by_the_residual_without_its_fold() -> None:
-    x, u = np.zeros((11, 2)), np.zeros((10, 1))
-    episodes = as_episodes(problem(), [(x, u)] * 3)
-    coordinates = twin().dynamics.coordinates
-    moved = [Residual.polynomial(np.zeros((3, 2)), np.array([0.0, b])) for b in (0.0, 0.1, 0.2)]
-    predicted, actual = trusts.costs_of_each(coordinates, episodes, moved)
-    assert actual.tolist() == [0.0, 0.0, 0.0]
-    assert predicted[0] == 0.0 < predicted[1] < predicted[2]
-    assert [len(each) for each in trusts.costs_of_each(coordinates, episodes, ())] == [0, 0]
-
-
-def test_rows_count_as_beyond_the_box_where_they_are_beyond_rounding() -> None:
-    x = np.zeros((11, 2))
-    x[:4, 0], x[4, 1], x[5, 1] = 3.1, -3.0 - 1e-7, -3.01  # the box is -3 to 3
-    (episode,) = as_episodes(problem(), [(x, np.zeros((10, 1)))])
-    np.testing.assert_allclose(trusts.beyond_the_box(problem(), (episode,)), [4 / 11, 1 / 11])
 
 
 def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains() -> None:
@@ -108,63 +82,6 @@ def test_the_edges_of_what_is_trusted() -> None:
     assert "Input 1" not in advice
     named = judged(runs(GOOD), inputs=inputs, names=["steam", "feed", "reflux"])
     assert "reflux never moves" in named[0] and "step test on reflux" in named[1]
-
-
-def test_a_log_whose_theta_does_not_hold_the_input_before_is_told_by_its_share() -> None:
-    given = problem()
-    mpc = LinearMPC(
-        given.model, Q=given.Q, R=given.R, horizon=3, u_min=-1, u_max=1,
-        theta_min=[-3, -3], theta_max=[3, 3], rate=RateLimits(-0.5, 0.5),
-    )  # fmt: skip
-    u = np.linspace(-0.2, 0.2, 40)[:, None]
-    thetas = np.hstack([np.zeros((41, 2)), np.vstack([[[0.0]], u])])
-    assert trusts.foreign_previous(mpc, (Episode(thetas, u),)) == []
-    thetas[5:7, 2] += 0.02
-    assert trusts.foreign_previous(mpc, (Episode(thetas, u),)) == []  # one row of twenty
-    thetas[7:15, 2] += 0.02
-    (said,) = trusts.foreign_previous(mpc, (Episode(thetas, u),))
-    assert said.startswith("In 25 % of the rows theta does not hold the input before it")
-    assert trusts.foreign_previous(problem(), as_episodes(problem(), log(2))) == []
-
-
-def test_the_report_shows_these_numbers() -> None:
-    given = dataclasses.replace(
-        twin().trust, predicted=np.array([10.0, 22.0]), actual=np.array([10.0, 20.0]),
-        moves=np.array([0.123]), excitation=np.array([0.0456]), noise=np.array([0.01, 0.5]),
-    )  # fmt: skip
-    said = report(problem(), twin().episodes, "quadratic", given)
-    assert "The log: 5 episodes, 300 steps." in said
-    assert "  u[0]: 12.3 % of half the range, 4.56 %: its gain is known from the log" in said
-    assert f"  error {100 * np.sqrt(2) / 15:.3g} % of the mean cost" in said
-    assert "Sensor noise, at most (standard deviations): x[0] 0.01, x[1] 0.5." in said
-    little = dataclasses.replace(given, noise=np.array([0.1401, 0.00102]))
-    said_of_little = report(problem(), twin().episodes, "quadratic", little)
-    assert "x[0] 0.15, x[1] 0.0011." in said_of_little
-    rests = dataclasses.replace(given, excitation=np.array([0.0199]))
-    assert "1.99 %: its gain rests on the given B" in report(problem(), twin().episodes, "", rests)
-
-
-def test_standing_still_errs_by_how_far_the_states_move_in_units_of_the_log() -> None:
-    logs = [random_episode(problem(), steps, seed) for seed, steps in enumerate((20, 14))]
-    box = dataclasses.replace(twin().dynamics.coordinates, units=np.array([2.0, 5.0]))
-    found = trusts.persistence_error(box, (*logs,), [1, 5, 14])
-    for h, error in zip((1, 5, 14), found, strict=True):
-        squares = [
-            ((each.thetas[i + h, k] - each.thetas[i, k]) / (2.0, 5.0)[k]) ** 2
-            for each in logs
-            for i in range(len(each) + 1 - h)
-            for k in range(2)
-        ]
-        assert error == pytest.approx(np.sqrt(np.mean(squares)))
-
-
-def test_the_actual_cost_of_an_episode_is_that_of_its_steps() -> None:
-    each = random_episode(problem(), 9)
-    expected = sum(
-        x @ problem().Q @ x + u @ problem().R @ u
-        for x, u in zip(each.thetas[:-1], each.actions, strict=True)
-    )
-    assert trusts.costs_of(problem(), each) == pytest.approx(expected)
 
 
 def test_every_other_piece_of_a_record_is_independent() -> None:
