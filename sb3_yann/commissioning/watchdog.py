@@ -175,7 +175,7 @@ class Watchdog:
     twin moves is frozen.
 
     Make one with :meth:`of`, anew after each fit of the twin. It holds nothing from one episode
-    to the next, and pickles.
+    to the next.
 
     Attributes
     ----------
@@ -226,10 +226,6 @@ class Watchdog:
     def __repr__(self) -> str:
         """Say whether it is quiet."""
         return f"Watchdog({'quiet' if self.alarm is None else self.alarm})"
-
-    def __getstate__(self) -> dict[str, object]:
-        """Leave out the running episode."""
-        return vars(self) | {"_episode": None}
 
     @property
     def quiet(self) -> bool:

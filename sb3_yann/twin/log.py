@@ -66,20 +66,17 @@ def as_episodes(
     units = problem.units
     given = {"references": references, "disturbances": disturbances, "previous": previous}
     for name, values in given.items():
-        _one_for_each(name, values, len(pairs))
+        if values is not None and not hasattr(values, "__len__"):
+            raise TypeError(f"{name} must be a list with an entry for each episode.")
+        if values is not None and len(values) != len(pairs):
+            raise ValueError(f"{name} has {len(values)} entries for {len(pairs)} episodes.")
     found = []
     for i, (states, actions) in enumerate(pairs):
         u = _actions(problem, i, actions)
-        x = _finite(f"episode {i}: states", states)
-        if x.ndim == 1:
-            x = x[:, None]
+        sizes = layout.n_states, layout.size
+        hint = " Past inputs are states where the model has them: see sb3_yann.wrappers.PastInputs."
+        x = _table(f"episode {i}: states", states, "T + 1", sizes, hint)
         own = {name: None if each is None else each[i] for name, each in given.items()}
-        if x.ndim != 2 or x.shape[1] not in (layout.n_states, layout.size):
-            raise ValueError(
-                f"episode {i}: states have shape {x.shape}, expected (T + 1, {layout.n_states}) or "
-                f"all of theta, (T + 1, {layout.size}). Past inputs are states where the model has "
-                "them: log the env in sb3_yann.wrappers.PastInputs."
-            )
         if len(x) != len(u) + 1:
             raise ValueError(
                 f"episode {i}: {len(x)} states and {len(u)} actions; there is one state more than "
@@ -156,13 +153,6 @@ def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
     return [(states, actions) for states, actions in pairs]
 
 
-def _one_for_each(name: str, values: Any, count: int) -> None:
-    if values is not None and not hasattr(values, "__len__"):
-        raise TypeError(f"{name} must be a list with an entry for each episode.")
-    if values is not None and len(values) != count:
-        raise ValueError(f"{name} has {len(values)} entries for {count} episodes.")
-
-
 def _finite(name: str, values: ArrayLike) -> Array:
     array = to_float(name, values)
     finite = np.abs(array) < LARGE  # nor is NaN
@@ -175,12 +165,20 @@ def _finite(name: str, values: ArrayLike) -> Array:
     return array
 
 
+def _table(
+    name: str, values: ArrayLike, rows: str, columns: Sequence[int], hint: str = ""
+) -> Array:
+    """Return finite rows (T, k) of so many columns; a list of numbers is one column."""
+    array = _finite(name, values)
+    array = array[:, None] if array.ndim == 1 else array
+    if array.ndim != 2 or array.shape[1] not in columns:
+        wanted = " or ".join(f"({rows}, {each})" for each in dict.fromkeys(columns))
+        raise ValueError(f"{name} have shape {array.shape}, expected {wanted}.{hint}")
+    return array
+
+
 def _actions(problem: LinearMPC, i: int, actions: ArrayLike) -> Array:
-    u = _finite(f"episode {i}: actions", actions)
-    u = u[:, None] if u.ndim == 1 else u
-    m = problem.model.n_inputs
-    if u.ndim != 2 or u.shape[1] != m:
-        raise ValueError(f"episode {i}: actions have shape {u.shape}, expected (T, {m}).")
+    u = _table(f"episode {i}: actions", actions, "T", [problem.model.n_inputs])
     room = 1e-3 * problem.u_half
     beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
     if beyond.any():
