@@ -270,35 +270,37 @@ class RowLayout:
         States (T + 1, n) and estimated disturbances (T + 1, d) within their bounds, all of it in
         plant units. A reading that is NaN is left out.
         """
-        assert self.estimator is not None
-        filtered = copy.deepcopy(self.estimator)
-        model = self.estimator.model
-        y = np.asarray(outputs, np.float64) - filtered.C @ model.x_ss
+        estimator = self.estimator
+        assert estimator is not None
+        model = estimator.model
+        y = np.asarray(outputs, np.float64) - estimator.C @ model.x_ss
         u = np.asarray(inputs, np.float64).reshape(len(y) - 1, -1) - model.u_ss
-        n_known = filtered.n_known
-        d = None if loads is None or not n_known else loads[:, :n_known] - model.d_ss[:n_known]
-        found = [filtered.reset(y[0])]
-        for k in range(len(u)):
-            found.append(filtered.update(y[k + 1], u[k], None if d is None else d[k]))
-        x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
+        k = estimator.n_known
+        d = None if loads is None or not k else loads[:, :k] - model.d_ss[:k]
+        x_hat, d_hat = np.split(self._filtered(y, u, d), [model.n_states], axis=1)
         bounds = self.problem.disturbances
-        known = self._n_disturbances - filtered.n_estimated
-        d_hat = np.clip(d_hat + model.d_ss[n_known:], bounds.d_min[known:], bounds.d_max[known:])
+        known = self._n_disturbances - estimator.n_estimated
+        d_hat = np.clip(d_hat + model.d_ss[k:], bounds.d_min[known:], bounds.d_max[known:])
         return x_hat + model.x_ss, d_hat
+
+    def _filtered(self, y: Array, u: Array, d: Array | None = None) -> Array:
+        """Return the estimates (T + 1, n + d) of readings, inputs and measured d in deviations."""
+        estimator = copy.deepcopy(self.estimator)
+        assert estimator is not None
+        estimator.reset(y[0])
+        found = [estimator.estimate]
+        for k in range(len(u)):
+            estimator.update(y[k + 1], u[k], None if d is None else d[k])
+            found.append(estimator.estimate)
+        return np.array(found)
 
     def _run(self, thetas: Array, actions: Array) -> Array:
         """Return rows of thetas whose states were measured, and whose d is not known."""
         assert self.observer is not None
-        observer = self.observer
         parts = self.problem.layout
-        n = self.problem.layout.n_states
+        n = parts.n_states
         x = thetas[:, parts.state]
-        z = np.concatenate([x[0], np.zeros(parts.n_disturbances)])
-        found = [z]
-        for after, u in zip(x[1:], actions, strict=True):
-            z = observer.A @ z + observer.B @ u
-            found.append(z := z + observer.gain @ (observer.C @ after - observer.C_aug @ z))
-        estimates = np.array(found)
+        estimates = self._filtered(x @ self.observer.C.T, actions)
         rows = np.concatenate([thetas, x, estimates[:, n:]], axis=1)
         rows[:, parts.state] = estimates[:, :n]
         self.clip(rows)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, Context
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from sb3_yann._validation import Array
@@ -190,51 +189,49 @@ def judge(
     of each is its own, and how much it moves (m,). ``beyond`` is the largest share of logged rows
     beyond the box of theta, and of which entry.
     """
-    problems = []
-    advice = []
+    found: list[tuple[str, str]] = []  # what speaks against it, and what would help
     share, moves = inputs
-    if n_episodes < 2:
-        problems.append("There is one episode: nothing is left to test the twin on.")
-        advice.append(
-            "Log at least one episode more; five are a good number. A long "
-            "record may be cut into three consecutive pieces or more."
+    several = n_episodes > 1
+    if not several:
+        found.append(
+            (
+                "There is one episode: nothing is left to test the twin on.",
+                "Log at least one episode more; five are a good number. A long record may be cut "
+                "into three consecutive pieces or more.",
+            )
         )
-    still: NDArray[np.bool_] = moves < STILL
-    for k in np.flatnonzero(still):
-        which, what = (names[k] if names else f"{each} {k}" for each in ("Input", "input"))
-        problems.append(f"{which} never moves: what it does is not in the log.")
-        advice.append(f"Make a small step test on {what}, or log another set-point.")
-    for k in np.flatnonzero(~still & (share < ALONE)):
-        which = names[k] if names else f"Input {k}"
-        advice.append(
-            f"{which} follows the MPC ({100 * share[k]:.2f} % of its variance is its own), so "
-            "its gain rests on the given B. A small step test on it would tell."
-        )
-    if n_episodes > 1 and runs.errors[0][0] > FOREIGN * standing[0]:
-        problems.append(
-            f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing moves' "
-            f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
-        )
-        advice.append("Compare units, operating point and sampling time of the log and the model.")
-    elif n_episodes > 1 and runs.errors[0][0] > POOR * standing[0]:
-        advice.append(
-            f"The problem's model predicts {runs.horizons[0]} steps worse than 'nothing moves' "
-            f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations). Look at the "
-            "order of the columns, units, operating point and sampling time of the log."
-        )
+    named = [*names] or [f"u[{k}]" for k in range(len(moves))]
+    for name, own, moved in zip(named, share, moves, strict=True):
+        if moved < STILL:
+            step = f"Make a small step test on {name}, or log another set-point."
+            found.append((f"{name} never moves: what it does is not in the log.", step))
+        elif own < ALONE:
+            said = f"{name} follows the MPC ({100 * own:.2f} % of its variance is its own), so its "
+            found.append(("", f"{said}gain rests on the given B. A small step test would tell."))
+    worse = runs.errors[0][0] / max(standing[0], 1e-300) if several else 0.0
+    compared = (
+        f"predicts {runs.horizons[0]} steps {{}}worse than 'nothing moves' "
+        f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
+    )
+    units = "Compare units, operating point and sampling time of the log and the model."
+    if worse > FOREIGN:
+        found.append((f"The problem's model {compared.format('far ')}", units))
+    elif worse > POOR:
+        columns = "Look at the order of the columns, units, operating point and sampling time."
+        found.append(("", f"The problem's model {compared.format('')} {columns}"))
     if beyond[0] > OUTSIDE:
-        problems.append(
-            f"{100 * beyond[0]:.3g} % of the logged {beyond[1]} lie beyond the problem's box of "
-            "theta."
-        )
-        advice.append("Compare units and operating point of the log and the model.")
+        rows = f"{100 * beyond[0]:.3g} % of the logged {beyond[1]}"
+        found.append((f"{rows} lie beyond the problem's box of theta.", units))
     error = relative_error(*costs)
-    if n_episodes > 1 and not error <= COST_ERROR:
-        problems.append(
-            f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
-            f"mean; {100 * COST_ERROR:.0f} % are the most."
+    if several and not error <= COST_ERROR:
+        found.append(
+            (
+                f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
+                f"mean; {100 * COST_ERROR:.0f} % are the most.",
+                f"Log {max(3, n_episodes)} episodes more, or lessen the sensors' noise.",
+            )
         )
-        advice.append(f"Log {max(3, n_episodes)} episodes more, or lessen the sensors' noise.")
+    problems, advice = ([each[i] for each in found if each[i]] for i in range(2))
     return problems, advice
 
 
@@ -276,79 +273,53 @@ def evidence(
 
 def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:
     """Return what a twin explains, what it does not know, and whether to trust it, as text."""
-    parts = _data(problem, episodes), _errors(kind, trust), _costs(trust), _inputs(problem, trust)
-    lines = [line for part in (*parts, _noise(problem, trust), _verdict(trust)) for line in part]
-    return "\n".join(lines)
-
-
-def _data(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Iterator[str]:
     steps = sum(map(len, episodes))
-    yield f"The log: {len(episodes)} episodes, {steps} steps."
+    said = [f"The log: {len(episodes)} episodes, {steps} steps."]
     for pieces in filter(lambda each: len(each) > 1, records(episodes)):
-        yield (
+        said.append(
             f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "
             f"other one is independent: {len(pieces[::2])} of {len(pieces)}."
         )
     constant = problem.layout.constant
     seen = np.concatenate([each.thetas[:, constant] for each in episodes])
-    names = np.array(problem.layout.names)[constant]
-    if still := [*names[np.ptp(seen, axis=0) == 0]]:
-        yield f"The log shows one value alone of {', '.join(still)}: elsewhere the MPC will act."
-
-
-def _errors(kind: str, trust: Trust) -> Iterator[str]:
-    yield f"Residual beside the linear model: {kind}."
-    if len(trust.actual) == 0:
-        return
-    yield "Error of free runs over held-out episodes, in standard deviations of the states:"
-    yield "  steps ahead      " + "".join(f"{h:>9d}" for h in trust.runs.horizons)
-    rows = (
-        ("twin", trust.runs.errors[trust.chosen]),
-        ("linear model", trust.runs.errors[0]),
-        ("nothing moves", trust.standing),
-    )
-    for name, errors in rows:
-        yield f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in errors)
-
-
-def _costs(trust: Trust) -> Iterator[str]:
-    if len(trust.actual) == 0:
-        return
-    yield "Cost of held-out episodes (or pieces of them), predicted and actual:"
-    for predicted, actual in zip(trust.predicted[:10], trust.actual[:10], strict=True):
-        yield f"  {predicted:>10.4g} {actual:>10.4g}"
-    if (more := len(trust.actual) - 10) > 0:
-        yield f"  ... and {more} more"
-    yield f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost"
-
-
-def _inputs(problem: LinearMPC, trust: Trust) -> Iterator[str]:
-    yield "Inputs: how much they move, and how much of that does not follow the MPC:"
-    for k in range(problem.model.n_inputs):
-        known = "its gain is known from the log"
-        if trust.excitation[k] < ALONE:
-            known = "its gain rests on the given B"
-        moves = 100 * trust.moves[k]
-        share = 100 * trust.excitation[k]
-        name = labels_of(problem.model)[1][k]
-        yield f"  {name}: {moves:.3g} % of half the range, {share:.2f} %: {known}"
-
-
-def _noise(problem: LinearMPC, trust: Trust) -> Iterator[str]:
-    names = labels_of(problem.model)[0]
-    found = ", ".join(f"{n} {_rounded_up(s)}" for n, s in zip(names, trust.noise, strict=True))
-    yield f"Sensor noise, at most (standard deviations): {found}."
+    if still := [*np.array(problem.layout.names)[constant][np.ptp(seen, axis=0) == 0]]:
+        one = f"The log shows one value alone of {', '.join(still)}"
+        said.append(f"{one}: elsewhere the MPC will act.")
+    said.append(f"Residual beside the linear model: {kind}.")
+    if len(trust.actual):
+        said.append(
+            "Error of free runs over held-out episodes, in standard deviations of the states:"
+        )
+        rows = {
+            "steps ahead": trust.runs.horizons,
+            "twin": trust.runs.errors[trust.chosen],
+            "linear model": trust.runs.errors[0],
+            "nothing moves": trust.standing,
+        }
+        for name, errors in rows.items():
+            said.append(f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in errors))
+        said.append("Cost of held-out episodes (or pieces of them), predicted and actual:")
+        for predicted, actual in zip(trust.predicted[:10], trust.actual[:10], strict=True):
+            said.append(f"  {predicted:>10.4g} {actual:>10.4g}")
+        if (more := len(trust.actual) - 10) > 0:
+            said.append(f"  ... and {more} more")
+        said.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
+    said.append("Inputs: how much they move, and how much of that does not follow the MPC:")
+    states, inputs = labels_of(problem.model)
+    for name, own, moves in zip(inputs, trust.excitation, trust.moves, strict=True):
+        rests = "rests on the given B" if own < ALONE else "is known from the log"
+        half = f"{100 * moves:.3g} % of half the range"
+        said.append(f"  {name}: {half}, {100 * own:.2f} %: its gain {rests}")
+    noise = [f"{n} {_rounded_up(s)}" for n, s in zip(states, trust.noise, strict=True)]
+    said.append(f"Sensor noise, at most (standard deviations): {', '.join(noise)}.")
+    said.append("Verdict: trusted." if trust.trusted else "Verdict: NOT trusted; the MPC stays.")
+    said += [f"  {each}" for each in trust.problems]
+    if trust.advice:
+        said += ["What would help:", *(f"  {each}" for each in np.unique(trust.advice))]
+    return "\n".join(said)
 
 
 def _rounded_up(value: float) -> str:
     """Return a number in two digits that is no less: what holds at most stays true."""
     digits = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(float(value)))
     return f"{float(digits):.2g}"
-
-
-def _verdict(trust: Trust) -> Iterator[str]:
-    yield "Verdict: trusted." if trust.trusted else "Verdict: NOT trusted; the MPC stays."
-    yield from (f"  {each}" for each in trust.problems)
-    if trust.advice:
-        yield "What would help:"
-        yield from (f"  {each}" for each in np.unique(trust.advice))

@@ -77,9 +77,9 @@ def test_the_edges_of_what_is_trusted() -> None:
     assert "Log 5 episodes more" in judged(runs(GOOD), costs=costs)[1]
     inputs = np.array([0.019, 0.021, 0.0]), np.array([0.1, 0.1, 0.9e-4])
     problems, advice = judged(runs(GOOD), inputs=inputs)
-    assert problems == "Input 2 never moves: what it does is not in the log."
-    assert "Input 0 follows the MPC (1.90 % of its variance is its own)" in advice
-    assert "Input 1" not in advice
+    assert problems == "u[2] never moves: what it does is not in the log."
+    assert "u[0] follows the MPC (1.90 % of its variance is its own)" in advice
+    assert "u[1]" not in advice
     named = judged(runs(GOOD), inputs=inputs, names=["steam", "feed", "reflux"])
     assert "reflux never moves" in named[0] and "step test on reflux" in named[1]
 
