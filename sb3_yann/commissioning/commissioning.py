@@ -15,7 +15,15 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, check_bool, check_int, check_range
-from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal, Record, Verdict
+from sb3_yann.commissioning.journal import (
+    MPC,
+    Accepted,
+    Batch,
+    CommissioningState,
+    Journal,
+    Record,
+    Verdict,
+)
 from sb3_yann.commissioning.plant import AcceptedPolicy, Inputs, Plant, PlantEpisode
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import (
@@ -159,7 +167,7 @@ class Commissioning:
     @property
     def kept(self) -> str:
         """The policy that the plant has confirmed: "MPC", or the batch after which it came."""
-        return self.journal.state.kept_policy
+        return self.journal.state.kept.policy
 
     @property
     def episodes(self) -> list[PlantEpisode]:
@@ -281,13 +289,11 @@ class Commissioning:
             if verdict == "accepted":
                 saved = journal.record.save(self.model, number)
                 digest = journal.record.digest_of(saved)
-                policy = f"batch {number}"
-                state = replace(
-                    state, policy=policy, model=saved, model_digest=digest, since=number
-                )
+                acting = Accepted(f"batch {number}", saved, digest, state.max_correction)
+                state = replace(state, acting=acting, since=number)
             elif verdict != "stays":
                 self.accepted.keep(False)
-                state = state.with_mpc()
+                state = replace(state, acting=MPC, kept=MPC, since=0)
             self.accepted.limit(state.max_correction)
             shown = costs.actual, costs.predicted, costs.mpc
             sizes = number, len(journal.batch), alarms
@@ -317,7 +323,7 @@ class Commissioning:
             if not is_kept(costs):
                 return costs, state, "stays", f"{costs.difference.pairs} pairs are not enough."
             self.accepted.keep(True)
-            state = state.with_kept()
+            state = replace(state, kept=state.acting)
             said = f"{costs.difference.pairs} pairs show that it costs less. "
         if known is None:
             why = f"There are {len(numbers)} episodes to learn from."
@@ -333,9 +339,11 @@ class Commissioning:
     ) -> tuple[CommissioningState, Verdict, str]:
         """Go back to what the plant has confirmed before, else to the MPC."""
         said = f"The policy was taken back: {why}."
-        if state.kept_policy not in ("MPC", state.policy):
+        kept = state.kept
+        if kept.policy not in ("MPC", state.policy):
             self.accepted.return_to_kept()
-            return state.back_to_kept(number), "stays", said
+            state = replace(state, acting=kept, max_correction=kept.bound, since=number)
+            return state, "stays", said
         self.accepted.give_back()
         return replace(state, max_correction=self._first_bound), "the MPC acts", said
 
@@ -412,20 +420,22 @@ class Commissioning:
         if not self.journal.batches:
             return
         self.accepted.limit(state.max_correction)
-        if state.model is None:
+        load = self.journal.record.load
+        acting = state.acting
+        kept = state.kept
+        if acting.model is None:
             self.accepted.give_back()
         else:
-            self.journal.record.load(state.model, state.model_digest, self.model)
+            load(acting.model, acting.digest, self.model)
         if state.tried:
             self.accepted.candidate = None
         self.accepted.hold()
-        if state.kept is not None and state.model is not None:
-            whole = self.policy.max_correction
-            self.journal.record.load(state.kept, state.kept_digest, self.model)
-            self.accepted.limit(state.kept_bound)
+        if kept.model is not None and acting.model is not None:
+            load(kept.model, kept.digest, self.model)
+            self.accepted.limit(kept.bound)
             self.accepted.keep(True)
-            self.accepted.limit(whole)
-            self.journal.record.load(state.model, state.model_digest, self.model)
+            self.accepted.limit(state.max_correction)
+            load(acting.model, acting.digest, self.model)
         self.accepted.show()
         if state.twin is not None:
             self.twin = self._fit(state.twin, state.twin_seed)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -182,63 +182,47 @@ class Batch:
     reason: str
 
 
+class Accepted(NamedTuple):
+    """A policy that was accepted: after which batch, in which file, within which bound."""
+
+    policy: str = "MPC"
+    model: str | None = None
+    digest: str | None = None
+    bound: float = 0.0
+
+
+MPC = Accepted()
+
+
 @dataclass(frozen=True)
 class CommissioningState:
     """What holds after a batch.
 
-    ``policy`` is the name of the accepted one, "MPC" if there is none, on trial ``since`` a batch,
-    and ``kept_policy`` that of the one that the plant has confirmed. Each has a bound, a file and
-    its digest. The log begins with the episode ``first``, everything began anew after ``anew``
-    batches. ``twin`` are the episodes that the twin in force was fitted to. ``tried`` says whether
-    what the model had learnt before has been tried.
+    One accepted policy is ``acting``, on trial ``since`` a batch; another, or the same, is
+    ``kept``: the plant has confirmed it. The log begins with the episode ``first``, everything
+    began anew after ``anew`` batches. ``twin`` are the episodes that the twin in force was fitted
+    to. ``tried`` says whether what the model had learnt before has been tried.
     """
 
     max_correction: float
-    policy: str = "MPC"
+    acting: Accepted = MPC
+    kept: Accepted = MPC
     first: int = 0
     anew: int = 0
     twin: list[int] | None = None
     twin_seed: int = 0
-    model: str | None = None
-    model_digest: str | None = None
-    kept: str | None = None
-    kept_digest: str | None = None
-    kept_bound: float | None = None
-    kept_policy: str = "MPC"
     tried: bool = False
     since: int = 0
 
     @property
+    def policy(self) -> str:
+        """The name of the policy that acts in turns with the MPC; "MPC" where there is none."""
+        return self.acting.policy
+
+    @property
     def is_kept(self) -> bool:
         """Whether the plant has confirmed the policy that acts in turns with the MPC."""
-        return self.kept_policy == self.policy != "MPC"
-
-    def with_kept(self) -> CommissioningState:
-        """Return it with the present policy as the one that the plant has confirmed."""
-        return replace(
-            self,
-            kept=self.model,
-            kept_digest=self.model_digest,
-            kept_bound=self.max_correction,
-            kept_policy=self.policy,
-        )
-
-    def back_to_kept(self, number: int) -> CommissioningState:
-        """Return it with the policy that was kept on trial, from a batch on."""
-        assert self.kept_bound is not None
-        return replace(
-            self,
-            model=self.kept,
-            model_digest=self.kept_digest,
-            max_correction=self.kept_bound,
-            policy=self.kept_policy,
-            since=number,
-        )
-
-    def with_mpc(self) -> CommissioningState:
-        """Return it without a policy."""
-        first = CommissioningState(self.max_correction, first=self.first, anew=self.anew)
-        return replace(first, twin=self.twin, twin_seed=self.twin_seed, tried=self.tried)
+        return self.kept.policy == self.policy != "MPC"
 
 
 class Journal:
@@ -378,7 +362,9 @@ class Journal:
             self._open = ""
         else:
             self.batches.append(Batch(**_named(Batch, event)))
-            self.state = CommissioningState(**event["from_here"])
+            state = dict(event["from_here"])
+            acting, kept = (Accepted(*state.pop(name)) for name in ("acting", "kept"))
+            self.state = CommissioningState(acting=acting, kept=kept, **state)
             self._first_of_batch = len(self.episodes)
             self._cut_off = 0
 

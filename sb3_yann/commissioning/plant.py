@@ -273,13 +273,19 @@ class AcceptedPolicy:
 
     def keep(self, kept: bool) -> None:
         """Take it for the one that the plant has confirmed; or forget which one that was."""
-        self._kept = (ActorCheckpoint.of(self.policy), self.policy.max_correction) if kept else None
+        self._kept = self._present() if kept else None
 
     def return_to_kept(self) -> None:
         """Make it the one that the plant has confirmed."""
         assert self._kept is not None
-        self._kept[0].restore(self.policy)
-        self.limit(self._kept[1])
+        self._become(*self._kept)
+
+    def _present(self) -> tuple[ActorCheckpoint, float | None]:
+        return ActorCheckpoint.of(self.policy), self.policy.max_correction
+
+    def _become(self, checkpoint: ActorCheckpoint, bound: float | None) -> None:
+        checkpoint.restore(self.policy)
+        self.limit(bound)
 
     def show(self) -> None:
         """Make it the one that the plant has confirmed, else the MPC, while no episode is played.
@@ -298,7 +304,7 @@ class AcceptedPolicy:
     def hold(self) -> None:
         """Take it for the accepted one from here on."""
         self._shown = None
-        self._held = ActorCheckpoint.of(self.policy), self.policy.max_correction
+        self._held = self._present()
 
     def restore(self) -> None:
         """Make it the accepted one again, with a warning where something has changed it."""
@@ -311,8 +317,7 @@ class AcceptedPolicy:
                 self.limit(its_bound)
         if held.is_actor_of(self.policy) and bound == self.policy.max_correction:
             return
-        held.restore(self.policy)
-        self.limit(bound)
+        self._become(held, bound)
         warnings.warn(
             "The model's actor is not the one that was accepted: that one is restored. Train "
             "another copy of the model, not the one that is being commissioned.",

@@ -35,37 +35,31 @@ class Starts:
     and ``rows`` are the first row of each episode, and all of them.
     """
 
-    problem: LinearMPC
+    row: RowLayout
     low: Array
     high: Array
     first: Array
     rows: Array
-    observer: StateEstimator | None = None
 
     @classmethod
-    def of(
-        cls,
-        problem: LinearMPC,
-        episodes: tuple[Episode, ...],
-        observer: StateEstimator | None = None,
-    ) -> Starts:
-        """Return those of a log."""
+    def of(cls, row: RowLayout, episodes: tuple[Episode, ...]) -> Starts:
+        """Return those of a log, whose episodes hold rows of this layout."""
+        problem = row.problem
         first = np.array([each.thetas[0] for each in episodes])
         rows = np.concatenate([each.thetas[:-1] for each in episodes])
         n = problem.model.n_states
         x = first[:, :n]
         k = len(first)
         middle = (x.max(0) + x.min(0)) / 2
-        half = (x.max(0) - x.min(0)) / 2
-        half = half * _widened(k)
+        half = (x.max(0) - x.min(0)) / 2 * _widened(k)
         low = np.maximum(middle - half, problem.deviations.theta_min[:n])
         high = np.minimum(middle + half, problem.deviations.theta_max[:n])
-        return cls(problem, low, high, first, rows, observer)
+        return cls(row, low, high, first, rows)
 
-    @cached_property
-    def row(self) -> RowLayout:
-        """What a row holds."""
-        return RowLayout(self.problem, self.observer)
+    @property
+    def problem(self) -> LinearMPC:
+        """The MPC of the plant."""
+        return self.row.problem
 
     @property
     def shown(self) -> tuple[Array, Array]:
@@ -176,23 +170,23 @@ PLANNED = 200  # runs of the MPC on its own model that tell where it means to go
 class Limits:
     """A box of states; beyond it is a violation."""
 
-    problem: LinearMPC
+    row: RowLayout
     low: Array
     high: Array
-    row: RowLayout
 
     @classmethod
-    def of(cls, problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> Limits:
+    def of(cls, coordinates: Coordinates, starts: Starts) -> Limits:
         """Return the data's neighborhood, with the starts, as far as hard bounds let it.
 
         With set-points or disturbances also that of where the MPC would take its own model: the log
         of a worn plant, which rests beside its set-points, does not show that.
         """
+        problem = coordinates.row.problem
         n = problem.model.n_states
         soft = problem.soft.x > 0
         low = coordinates.low[:n]
         high = coordinates.high[:n]
-        planned = [_planned(problem, coordinates, starts)] if problem.layout.has_constants else []
+        planned = [_planned(coordinates, starts)] if problem.layout.has_constants else []
         for least, most in [(starts.low, starts.high), *planned]:
             width = MARGIN * (most - least)
             low = np.minimum(low, least - width)
@@ -200,7 +194,7 @@ class Limits:
         room = ROUNDING * problem.theta_half[:n]
         bounded = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min))
         limited = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max))
-        return cls(problem, bounded - room, limited + room, coordinates.row)
+        return cls(coordinates.row, bounded - room, limited + room)
 
     def violated(self, thetas: Array) -> NDArray[np.bool_]:
         """Return whether states lie beyond, for rows (..., size); NaN does."""
@@ -209,8 +203,9 @@ class Limits:
         return np.asarray(~inside.all(axis=-1))
 
 
-def _planned(problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
+def _planned(coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
     """Return the box of the MPC's runs on its own model: as long as the log's, from its starts."""
+    problem = starts.problem
     n = problem.model.n_states
     steps = len(starts.rows) // len(starts.first)
     model = Dynamics(problem, coordinates, (Residual.zero(len(coordinates.scale), n),))
@@ -236,12 +231,12 @@ class LearntModel:
     @cached_property
     def starts(self) -> Starts:
         """Where episodes begin."""
-        return Starts.of(self.problem, self.episodes, self.dynamics.row.estimator)
+        return Starts.of(self.dynamics.row, self.episodes)
 
     @cached_property
     def limits(self) -> Limits:
         """Where it holds, and the problem's own bounds of the states."""
-        return Limits.of(self.problem, self.dynamics.coordinates, self.starts)
+        return Limits.of(self.dynamics.coordinates, self.starts)
 
 
 class TwinEnv(gym.Env[Single, Single]):

@@ -96,9 +96,9 @@ def test_only_accepted_policies_act(tmp_path) -> None:
     accepted, holds = {"MPC": None}, "MPC"
     for event in events[1:]:
         if event["event"] == "batch":
-            holds = event["from_here"]["policy"]
+            holds, saved = event["from_here"]["acting"][:2]
             if event["verdict"] == "accepted":
-                accepted[holds] = event["from_here"]["model"]
+                accepted[holds] = saved
         if event["event"] != "episode":
             continue
         assert event["acts"] in ("MPC", holds)

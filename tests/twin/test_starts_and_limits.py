@@ -64,7 +64,7 @@ def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
     episodes = (
         Episode(np.tile(each, (7, 1)), np.zeros((6, mpc.model.n_inputs))) for each in thetas
     )
-    starts = Starts.of(mpc, tuple(episodes))
+    starts = Starts.of(RowLayout(mpc), tuple(episodes))
     low, high = starts.shown
     for draw in (starts.draw_between, starts.draw_around):
         drawn = draw(200, rng)[:, held]
@@ -72,7 +72,7 @@ def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
         logged = np.isin(drawn, thetas[:, held]).all(axis=1)
         assert 0.4 < logged.mean() < 0.7
     assert np.isin(starts.draw(200, rng)[:, held], thetas[:, held]).all()
-    never_moved = Starts(mpc, starts.low, starts.high, thetas[:1], thetas[:1])
+    never_moved = Starts(RowLayout(mpc), starts.low, starts.high, thetas[:1], thetas[:1])
     assert np.isin(never_moved.draw_between(50, rng)[:, held], thetas[0, held]).all()
 
 
@@ -80,7 +80,7 @@ def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
 def test_around_the_log_boxes_are_one_to_three_times_as_wide(k) -> None:
     rng, free = np.random.default_rng(0), np.full(2, 0.1)
     first = 0.1 * np.column_stack([np.linspace(-1, 1, k), np.linspace(1, -1, k)])
-    starts = Starts(problem(), -free, free, first, np.zeros((1, 2)))
+    starts = Starts(RowLayout(problem()), -free, free, first, np.zeros((1, 2)))
     drawn = np.abs(starts.draw_around(20_000, rng)) / 0.1
     assert 2.95 < drawn.max() <= 3.0 + 1e-9
     widened = min(2.0, (k + 1) / (k - 1))
@@ -100,7 +100,7 @@ def limits_of(mpc: LinearMPC, **box: np.ndarray) -> Limits:
     coordinates = Coordinates(low, high, np.ones(k), np.ones(2), RowLayout(mpc))
     given = {"low": np.array([-1.0, -0.1]), "high": np.array([0.2, 1.5])} | box
     row = np.zeros((2, mpc.n_theta))
-    return Limits.of(mpc, coordinates, Starts(mpc, given["low"], given["high"], row, row))
+    return Limits.of(coordinates, Starts(RowLayout(mpc), given["low"], given["high"], row, row))
 
 
 def test_the_limits_hold_the_data_and_the_starts_with_a_quarter_of_their_width() -> None:
@@ -130,7 +130,7 @@ def test_with_set_points_the_limits_hold_what_the_mpc_plans() -> None:
     k = np.full(3, 0.01)
     coordinates = Coordinates(-k, k, np.ones(3), np.ones(2), RowLayout(mpc))
     zero = np.zeros(2)
-    found = Limits.of(mpc, coordinates, Starts(mpc, zero, zero, row, rows))
+    found = Limits.of(coordinates, Starts(RowLayout(mpc), zero, zero, row, rows))
     thetas, _ = mpc.simulate(row[0], 30)
     low, high = thetas[:, :2].min(0), thetas[:, :2].max(0)
     width = 0.25 * (high - low)
