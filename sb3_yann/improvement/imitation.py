@@ -76,14 +76,24 @@ class Teacher:
         pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
         planning = Planning(self.scenarios.plant, self.task, self.steps, pause)
         first = self.hardest(played) if played else np.zeros(len(self.scenarios), dtype=np.int64)
-        later = SwitchedController(planning, first, act or self.problem.law())
-        shown = self.scenarios.play(later)
+        before = controller_of(act or self.problem.law())
+        plans: list[dict[int, tuple[int, Plans, Array]]] = []  # at each step
+
+        def switched(t: int, theta: Array, rows: Rows) -> Array:
+            u = np.array(before(t, theta, rows), np.float64)
+            begun = (first[rows] >= 0) & (first[rows] <= t)
+            if np.any(begun):
+                u[begun] = planning(t, theta[begun], rows[begun])
+            plans.append({**planning.plans})
+            return u
+
+        shown = self.scenarios.play(switched)
         safe = ~less_safe(shown.unsafe, self.mpc.unsafe).any(axis=1)
         taught = (first >= 0) & safe & (shown.costs <= self.mpc.costs)
         self.best = np.where(taught, np.fmin(self.best, shown.costs), self.best)
         for i in np.flatnonzero(taught):
             for t in range(first[i], self.steps):
-                when, plan, _ = later.plans[t][i]
+                when, plan, _ = plans[t][i]
                 theta = shown.thetas[t, i]
                 near = np.tile(theta, (NEARBY, 1))
                 states = self.problem.layout.state
@@ -114,28 +124,6 @@ class Teacher:
         begins[chosen] = self.rng.integers(0, self.steps, size=len(chosen))
         begins[chosen[::2]] = 0
         return begins
-
-
-class SwitchedController:
-    """A controller that is planned from a step (k,) of each episode on, never where that is -1.
-
-    A policy acts before. ``plans`` are those of :class:`Planning` at every step.
-    """
-
-    def __init__(self, planning: Planning, begins: NDArray[np.int64], act: Inputs) -> None:
-        self.planning = planning
-        self.begins = begins
-        self.act = act
-        self.plans: list[dict[int, tuple[int, Plans, Array]]] = []
-
-    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
-        """Return the inputs (r, m)."""
-        begun = (self.begins[rows] >= 0) & (self.begins[rows] <= t)
-        u = np.array(controller_of(self.act)(t, theta, rows), np.float64)
-        if np.any(begun):
-            u[begun] = self.planning(t, theta[begun], rows[begun])
-        self.plans.append({**self.planning.plans})
-        return u
 
 
 def imitate(

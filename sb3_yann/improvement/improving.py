@@ -36,7 +36,7 @@ from sb3_yann.improvement.simulator import (
     OutOfStepsError,
     Scenarios,
     Simulator,
-    SimulatorModel,
+    model_of,
     one_step_error,
 )
 from sb3_yann.networks.yann import LawLayer
@@ -516,7 +516,7 @@ class _Work:
     ) -> tuple[LearntModel, Teacher]:
         """Return a model of all episodes so far, and plans in it: of what was lost first."""
         self.say(f"a model of {len(simulator.episodes)} episodes, and {self.n_starts} plans in it")
-        model = SimulatorModel.fit(
+        model = model_of(
             self.problem, simulator.episodes, simulator.row.estimator, self.seed + number
         )
         order = self.rng.permutation(len(simulator.episodes))

@@ -19,7 +19,8 @@ from sb3_yann.control.mpc.augmented import SHARE
 from sb3_yann.improvement.simulator import (
     OutOfStepsError,
     Simulator,
-    SimulatorModel,
+    lacks,
+    model_of,
     of_law,
     task_of,
 )
@@ -437,10 +438,8 @@ class _Search:
             now = todo[: simulator.affordable()]
             if not len(now):
                 raise OutOfStepsError
-            model = SimulatorModel.fit(
-                self.mpc, simulator.episodes, simulator.row.estimator, number
-            )
-            self.random, self.poor = model.lacks()
+            model = model_of(self.mpc, simulator.episodes, simulator.row.estimator, number)
+            self.random, self.poor = lacks(model)
             planning = self._planning(model, TwinPlant(model.dynamics), unit)
             loops = simulator.play(planning, [self.seeds[i] for i in now], strict=False)
             if number == 0 and len(now) == len(todo):

@@ -337,46 +337,38 @@ def one_step_error(row: RowLayout, episodes: Sequence[Episode]) -> float:
     return float(np.nanquantile(np.concatenate(errors), 0.95))
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatorModel(LearntModel):
-    """An ensemble of networks on top of the given model, fitted to a simulator's episodes."""
+def model_of(
+    problem: LinearMPC, episodes: Sequence[Episode], observer: StateEstimator | None, seed: int
+) -> LearntModel:
+    """Return networks on top of the given model, fitted to episodes in the observer's rows."""
+    coordinates = Coordinates.of(problem, episodes, observer)
+    members = fit_ensemble(coordinates, [episodes] * MEMBERS, seed)
+    return LearntModel(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
 
-    @classmethod
-    def fit(
-        cls,
-        problem: LinearMPC,
-        episodes: Sequence[Episode],
-        observer: StateEstimator | None,
-        seed: int,
-    ) -> SimulatorModel:
-        """Return the model of some episodes, in rows of the observer's layout."""
-        coordinates = Coordinates.of(problem, episodes, observer)
-        members = fit_ensemble(coordinates, [episodes] * MEMBERS, seed)
-        return cls(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
 
-    def lacks(self) -> tuple[bool, bool]:
-        """Return whether it errs in most steps, and whether that is more than noise.
+def lacks(model: LearntModel) -> tuple[bool, bool]:
+    """Return whether a model errs in most steps, and whether that is more than noise.
 
-        Kinks of a plant show in few. Noise of a step says nothing about that of the nearest one,
-        half of whose squared difference is its variance. What a model lacks is alike in both.
-        """
-        from scipy.spatial import cKDTree
+    Kinks of a plant show in few. Noise of a step says nothing about that of the nearest one, half
+    of whose squared difference is its variance. What a model lacks is alike in both.
+    """
+    from scipy.spatial import cKDTree
 
-        row = self.dynamics.row
-        units = self.dynamics.coordinates.units
-        rows = np.concatenate([each.thetas[:-1] for each in self.episodes])
-        inputs = np.concatenate([each.actions for each in self.episodes])
-        after = np.concatenate([each.thetas[1:, row.state] for each in self.episodes])
-        predicted = TwinPlant(self.dynamics).advance(rows, inputs, np.arange(len(rows)))
-        near = self.dynamics.coordinates.nearest(predicted[:, row.state], after)
-        errors = (after - near) / units
-        points = row.features(rows, inputs)
-        points = points / np.maximum(points.std(axis=0), 1e-9)
-        other = cKDTree(points).query(points, k=2)[1][:, 1]
-        apart = float(np.mean((errors - errors[other]) ** 2)) / 2
-        whole = float(np.mean(errors**2))
-        errs = bool(np.median(np.abs(errors), axis=0).max() > NOISE)
-        return errs, errs and apart < LACKING * whole
+    dynamics = model.dynamics
+    coordinates = dynamics.coordinates
+    row = dynamics.row
+    rows = np.concatenate([each.thetas[:-1] for each in model.episodes])
+    inputs = np.concatenate([each.actions for each in model.episodes])
+    after = np.concatenate([each.thetas[1:, row.state] for each in model.episodes])
+    predicted = TwinPlant(dynamics).advance(rows, inputs, np.arange(len(rows)))
+    errors = (after - coordinates.nearest(predicted[:, row.state], after)) / coordinates.units
+    points = row.features(rows, inputs)
+    points = points / np.maximum(points.std(axis=0), 1e-9)
+    other = cKDTree(points).query(points, k=2)[1][:, 1]
+    apart = float(np.mean((errors - errors[other]) ** 2)) / 2
+    whole = float(np.mean(errors**2))
+    errs = bool(np.median(np.abs(errors), axis=0).max() > NOISE)
+    return errs, errs and apart < LACKING * whole
 
 
 @dataclass(frozen=True, eq=False)

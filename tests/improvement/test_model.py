@@ -17,28 +17,30 @@ from sb3_yann.improvement.improving import _Progress, _Work
 from sb3_yann.improvement.simulator import (
     Disagreement,
     Scenarios,
-    SimulatorModel,
+    lacks,
+    model_of,
     of_law,
     one_step_error,
 )
 from sb3_yann.plan import TwinPlant
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
+from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import POLYNOMIALS, Cart, log, observed, problem, rated
 
 
 @cache
-def learnt() -> SimulatorModel:
+def learnt() -> LearntModel:
     """Return a model of a few episodes of the cart, of which one is short."""
     seen = [Episode(*each) for each in log(4)]
     seen[1] = Episode(seen[1].thetas[:31], seen[1].actions[:30])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "fit_ensemble", partial(fit_ensemble, updates=200))
-        return SimulatorModel.fit(problem(), seen, None, seed=0)
+        return model_of(problem(), seen, None, seed=0)
 
 
-def scenarios(found: SimulatorModel, each: bool = False) -> Scenarios:
+def scenarios(found: LearntModel, each: bool = False) -> Scenarios:
     rng = np.random.default_rng(0)
     like = Scenarios.like(found, found.episodes[:4], rng)
     members = np.arange(4) % len(found.dynamics.members) if each else None
@@ -127,10 +129,10 @@ def test_the_price_of_doubt_is_that_of_what_sets_members_apart(make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("noise", "bend", "lacks"),
+    ("noise", "bend", "wanted"),
     [(0.0, 0.0, (False, False)), (0.1, 0.0, (True, False)), (0.0, 0.3, (True, True))],
 )
-def test_what_a_model_lacks_is_told_from_noise(noise, bend, lacks) -> None:
+def test_what_a_model_lacks_is_told_from_noise(noise, bend, wanted) -> None:
     mpc, rng = problem(), np.random.default_rng(0)
     episodes = []
     for _ in range(20):
@@ -142,8 +144,8 @@ def test_what_a_model_lacks_is_told_from_noise(noise, bend, lacks) -> None:
         episodes.append(Episode(np.array(rows), u))
     box = Coordinates.of(mpc, episodes)
     none = Residual.zero(len(box.scale), mpc.model.n_states)
-    found = SimulatorModel(mpc, tuple(episodes), Dynamics(mpc, box, (none, none)))
-    assert found.lacks() == lacks
+    found = LearntModel(mpc, tuple(episodes), Dynamics(mpc, box, (none, none)))
+    assert lacks(found) == wanted
 
 
 def bounded() -> PlantTwin:
