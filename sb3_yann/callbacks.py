@@ -329,8 +329,8 @@ class SimulatedEpisodes(BaseCallback):
             shown = played.observations[k]
             for t, u in enumerate(actions):
                 over = t == len(actions) - 1
-                reward = np.float32(played.rewards[k][t])
-                step = shown[t], shown[t + 1], u, reward, over, over and played.truncated[k]
+                earned = np.float32(played.rewards[k][t])
+                step = shown[t], shown[t + 1], u, earned, over, over and played.truncated[k]
                 columns[k % len(columns)].append(step)
         length = min(map(len, columns))
         for t, steps in enumerate(zip(*columns, strict=False)):  # longer columns end there

@@ -251,13 +251,14 @@ def evidence(
     coordinates = dynamics.coordinates
     row = dynamics.row
     standing = persistence_error(coordinates, log, runs.horizons)
-    *inputs, follows_law = excitation(problem, log)
+    share, moves, follows_law = excitation(problem, log)
+    inputs = share, moves
     shares = beyond_the_box(problem, log) * (not follows_law)
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(log))
     problems, advice = judge(
-        runs, standing, costs, (inputs[0], inputs[1]), independent, beyond, names
+        runs, standing, costs, inputs, independent, beyond, names
     )
     problems += foreign_previous(problem, log)
     problems += objections(problem, coordinates, log, units_confirmed)
