@@ -19,7 +19,6 @@ from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.rollout import may_change_reward
 
-EXPLAINED = 0.999  # share of the rewards' variance that a line explains where it is the cause
 EXACT = 1e-5
 """What rounding to float32 leaves of an agreement, relative to the spread of the rewards."""
 MIN_STEPS = 10  # steps that must be compared
@@ -120,18 +119,31 @@ class Rewards(NamedTuple):
         at_rest = 1e-9 * np.abs(self.rewards).max() + 1e-12
         return bool(np.all(np.abs(self.implied - self.cost) <= allowed + at_rest))
 
-    def likely_cause(self, line: Line) -> tuple[str, str]:
-        """Return the name of what explains the rewards, and a sentence."""
+    def agree(self, costs: Array, predicted: Array, tolerance: float) -> bool:
+        """Tell whether nearly all costs (steps,) are those predicted.
+
+        Errors are relative to how much these vary: a large constant explains nothing.
+        """
+        spread = np.abs(predicted - np.median(predicted))
+        allowed = tolerance * np.maximum(spread, spread.mean()) + self.rounded
+        return bool(np.mean(np.abs(costs - predicted) <= allowed) >= 0.98)
+
+    def likely_cause(self, line: Line, tolerance: float) -> tuple[str, str]:
+        """Return the name of what explains the rewards, and a sentence.
+
+        Near a steady state many explanations are nearly right, hence exact ones go first.
+        """
         if np.ptp(self.rewards) <= 1e-9 * np.abs(self.rewards).max():
             return "constant", f"every reward is {self.rewards[0]:g}, whatever happens."
-        late = Line.through(-self.after, -self.implied)
-        if late.r2 > max(EXPLAINED, line.r2) and abs(late.scale - 1) < 1 - EXPLAINED:
-            return "next state", (
-                "the cost is c(s', u), of the state after the step, where the problem has c(s, u). "
-                "Compute it before the env steps; leave a delay out."
-            )
-        if line.r2 > EXPLAINED:
-            return line.cause
+        of_line = (line.offset - self.rewards) / line.scale if line.scale else self.rewards
+        for width in (EXACT, tolerance):
+            if line.scale != 0 and self.agree(of_line, self.cost, width):
+                return line.cause
+            if self.agree(self.implied, self.after, width):
+                return "next state", (
+                    "the cost is c(s', u), of the state after the step, where the problem has "
+                    "c(s, u). Compute it before the env steps; leave a delay out."
+                )
         return "unknown", (
             "none that the audit knows. Compare the env's reward with problem.stage_cost(theta, u) "
             "step by step: weights, units, what an observation means, repeated actions, wrappers "
@@ -247,7 +259,7 @@ class CostAudit(BaseCallback):
         line = Line.through(-compared.cost, compared.rewards)
         cause, explanation = self._vec_normalize_switched_on()
         if not cause and count >= MIN_STEPS and not compared.match(self.tolerance):
-            cause, explanation = compared.likely_cause(line)
+            cause, explanation = compared.likely_cause(line, self.tolerance)
         message = f"The reward is the cost of the problem in all of {count} steps."
         if cause:
             message = self._in_words(compared, line, explanation)

@@ -257,9 +257,7 @@ def evidence(
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(log))
-    problems, advice = judge(
-        runs, standing, costs, inputs, independent, beyond, names
-    )
+    problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names)
     problems += foreign_previous(problem, log)
     problems += objections(problem, coordinates, log, units_confirmed)
     problems += _frozen(dynamics, log)

@@ -122,7 +122,7 @@ def test_all_of_theta_and_something_beside_it_is_too_much() -> None:
     as_episodes(loaded(), whole)
     with pytest.raises(ValueError, match=r"\['references'\] is given, but states are all of theta"):
         as_episodes(loaded(), whole, [0.0])
-    with pytest.raises(ValueError, match=r"expected \(T \+ 1, 1\), or all of theta, \(T \+ 1, 5\)"):
+    with pytest.raises(ValueError, match=r"expected \(T \+ 1, 1\) or \(T \+ 1, 5\)"):
         as_episodes(loaded(), [(np.zeros((8, 3)), np.zeros((7, 1)))])
 
 
