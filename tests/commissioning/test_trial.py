@@ -7,7 +7,7 @@ import pytest
 
 from sb3_yann.improvement.confirmation import Trial
 from sb3_yann.twin.dynamics import law_of
-from twin_samples import observed, twin
+from twin_samples import observed
 
 
 def trial() -> Trial:
@@ -31,11 +31,6 @@ def test_every_other_start_goes_on_with_the_set_points_of_a_logged_episode() -> 
     np.testing.assert_array_equal(rows[:-1, 2][..., part], found.given)
 
 
-def test_without_set_points_all_that_begin_as_the_log_does_count() -> None:
-    found = Trial.draw(twin(), 12, np.random.default_rng([0, 1]))
-    assert (found.follow >= 0).tolist() == [True] * 12 + [False] * 12
-
-
 def test_what_loses_on_episodes_like_the_logs_is_refused() -> None:
     found = trial()
     (costs, unsafe), follow = found.mpc, np.tile(found.follow, len(found.starts))
@@ -47,17 +42,3 @@ def test_what_loses_on_episodes_like_the_logs_is_refused() -> None:
     gains = found.check(1, (costs - room * found.known, unsafe))
     assert gains.accepted and gains.logged == pytest.approx(-4e-4)
     assert gains.error == pytest.approx(0, abs=1e-12)
-
-
-def test_the_standard_error_is_over_episodes_and_members() -> None:
-    found = trial()
-    costs, unsafe = found.mpc
-    rng, shape = np.random.default_rng(0), found.starts.shape[:2]
-    by_episode, by_member = rng.uniform(-1, 0, 5), 0.1 * rng.uniform(-1, 0, shape[0])
-    gain = found.mean * np.where(found.follow >= 0, by_episode[found.follow], 0) * np.ones(shape)
-    error = by_episode.std(ddof=1) / np.sqrt(5)
-    said = found.check(1, (costs + gain.ravel(), unsafe))
-    assert said.error == pytest.approx(error, rel=1e-6)
-    gain += found.mean * by_member[:, None]
-    said = found.check(1, (costs + gain.ravel(), unsafe))
-    assert said.error == pytest.approx(np.hypot(error, by_member.std(ddof=1)), rel=1e-6)

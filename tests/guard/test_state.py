@@ -175,22 +175,6 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(
     assert [row["verdict"] for row in rows(tmp_path / "guard.csv")] == verdicts(again)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "change",
-    [{"n_eval_episodes": 4}, {"seed": 7}, {"rule": {"margin": 0.5}}, {"env": "Slide-v0"}],
-)
-def test_with_other_settings_the_guard_starts_afresh(change) -> None:
-    first, second = make_guard(), make_guard(**change)
-    model = three_decisions(first)
-    assert len(first.decisions) == 3
-    before, evidence = [*first.decisions], first.state.evidence
-    train(model, 1, second)
-    assert second.decisions == before  # what was decided is not forgotten
-    assert second.state.evidence is not evidence
-    assert accepted_bits(second) == actor_bits(model.policy)  # it is better than the MPC: kept
-
-
 def saved(folder: Path) -> Any:
     return DDPG.load(folder / "accepted_model.zip", device="cpu")
 

@@ -140,27 +140,6 @@ def test_whatever_is_taught_nothing_worse_is_accepted(monkeypatch, share) -> Non
     assert not found.accepted and found.reason and bits(model) == before
 
 
-class Limited(Spring):
-    """Says that whoever leaves the MPC breaks a limit, from some starts."""
-
-    def reset(self, *, seed=None, options=None):
-        self.bad = seed is not None and seed % 7 == 0
-        return super().reset(seed=seed)
-
-    def step(self, action):
-        left = np.abs(problem().explicit()(self.x.astype(np.float32)) - action).max() > 1e-3
-        *rest, info = super().step(action)
-        return *rest, {**info, "violation": bool(self.bad and left)}
-
-
-def test_a_policy_that_breaks_a_limit_is_refused_whatever_it_gains() -> None:
-    model = model_of(Limited)
-    before = bits(model)
-    found = improve(model, Limited, **FEW)
-    assert not found.accepted and bits(model) == before
-    assert "starts with violations" in found.reason
-
-
 def test_what_was_learnt_before_is_kept_or_bettered() -> None:
     before, first, state = pickle.loads(better())
     model = model_of()

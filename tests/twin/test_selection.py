@@ -17,22 +17,9 @@ from sb3_yann.twin.selection import (
     candidates,
     held_out,
     ridge,
-    without_each_fold,
 )
 from twin_samples import problem
 from twin_samples import random_episode as episode
-
-
-def test_the_model_comes_first_then_polynomials_in_the_order_of_their_freedom() -> None:
-    log = [episode(problem(), seed=seed) for seed in range(3)]
-    box = Coordinates.of(problem(), log)
-    found = candidates(box, log, ["linear", "quadratic"])
-    assert found[0].name == "none" and found[0].setting is None and len(found) == 29
-    settings = [each.setting for each in found[1:]]
-    freedom = [s.degree - 2 * np.log10(s.shrinkage) - np.log10(s.factor) for s in settings]
-    assert freedom == sorted(freedom)
-    assert found[1].name == "linear, shrinkage 1 (30 of inputs)"
-    assert len(candidates(box, log, ["network"])) == 1
 
 
 @pytest.mark.parametrize("name", ["regulator with rates", "servo with all of it"])
@@ -69,17 +56,6 @@ def test_the_first_is_taken_of_what_is_one_standard_error_from_the_best() -> Non
         assert runs([9.0] * 4, [*near], [*best]).choose() == chosen
     assert runs([1.0, 2.0], [1.0, 2.0]).choose() == 0
     assert runs([0.0, 0.0], [2.0, 2.0], [1.0, 1.0]).choose(1) == 2
-
-
-def test_each_episode_is_left_out_once_in_five_folds() -> None:
-    log = [episode(problem(), 10 + seed, seed) for seed in range(7)]
-    folds = [(0, 5), (1, 6), (2,), (3,), (4,)]
-    for kept, fold in zip(without_each_fold(log), folds, strict=True):
-        assert kept == [each for i, each in enumerate(log) if i not in fold]
-    assert without_each_fold(log[:1]) == []
-    found = held_out(box := Coordinates.of(problem(), log), log, candidates(box, log, []))
-    assert found.by_episode.shape[:2] == (1, 7)
-    assert found.horizons.tolist() == [5, 6, 7, 8, 10, 13]  # up to the median length
 
 
 def test_a_free_run_s_error_is_that_of_the_model_from_twenty_logged_states() -> None:
