@@ -53,7 +53,7 @@ def test_sensor_noise_is_measured_and_shrinks_the_residual() -> None:
     ("episodes", "message"),
     [
         (lambda: log(1), "There is one episode"),
-        (lambda: log(3, act=lambda x: [0.5]), r"u\[0\] never moves"),
+        (lambda: log(3, act=lambda x: [0.5]), "never moves: what it does is not in the log"),
         (lambda: [(100 * x, u) for x, u in log(3)], "beyond the problem's box of theta"),
         (lambda: log(5, noise=0.3), "Predicted costs of held-out episodes err by"),
     ],
