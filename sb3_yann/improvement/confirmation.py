@@ -23,7 +23,6 @@ from sb3_yann.compare import (
     Tolerance,
     Verdict,
     less_safe,
-    level_of_look,
     looks,
     mean_change,
     no_worse,
@@ -336,19 +335,22 @@ def confirm(
 ) -> tuple[Check, SimulatorTrial]:
     """Play pairs from new starts until they are decisive; return the last look, and the trial.
 
-    Looks come after 10, 20, 40 and 80 pairs; all together err with a probability of no more than
-    ``significance``. A policy that breaks a bound, or does not gain, is refused at the first look
-    that shows it. Where a hard bound is in force, acceptance takes all 80: it may be exceeded in
-    few episodes, and that is never traded for cost. ``say`` is called with what each look
-    shows, and after how many pairs.
+    Looks come after 10, 20, 40 and 80 pairs. The last two accept, and together err with a
+    probability of no more than ``significance``. A policy that breaks a bound, or surely gains too
+    little, is refused at the first look that shows it. Where a hard bound is in force, acceptance
+    takes all 80: it may be exceeded in few episodes, and that is never traded for cost. ``say`` is
+    called with what each look shows, and after how many pairs.
     """
     trial = SimulatorTrial(simulator)
-    for look in trial.stages(act, LOOKS):
-        found, verdict = trial.check(number, level_of_look(significance, look), final=True)
+    level = significance / sum(count >= ENOUGH for count in LOOKS)
+    for _ in trial.stages(act, LOOKS):
+        found, verdict = trial.check(number, level, final=True)
         count = len(trial.starts.seeds)
         say(f"{count} pairs: {100 * found.change:+.2f} %", count)
         enough = LOOKS[-1] if trial.rides_a_bound else ENOUGH
-        if (found.accepted and count >= enough) or (not found.accepted and verdict.is_hopeless):
+        most = max(-found.change, 2 * found.error - found.logged)  # what it may gain
+        hopeless = verdict.is_hopeless or most < RULE.least_gain
+        if (found.accepted and count >= enough) or (not found.accepted and hopeless):
             break
     if found.accepted and count < ENOUGH:
         few = f"{count} pairs whose costs are finite are too few"
