@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, check_int, check_range, check_type
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.policy.exploring import Explores
 from sb3_yann.policy.observations import normalized, require_frozen, require_same_statistics
 from sb3_yann.policy.policies import StartsAsMPC, require_yann_policy

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, lqr
-from sb3_yann.control.mpc.at_rest import Value
 from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond, mixed_half
+from sb3_yann.control.mpc.problem import Value
 from sb3_yann.rollout import Rows
 from sb3_yann.twin.dynamics import Dynamics, law_of
 

@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann._validation import Array, check_int, check_type, half_widths
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
-from sb3_yann.control.linearization.simulator import require_makes
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
+from sb3_yann.control.simulator import require_makes
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.units import same_bounds
 
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.rollout import Trajectories
 from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers import SetPoint

@@ -17,8 +17,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.improvement.imitation import policy_of
 from sb3_yann.improvement.simulator import Excited
 from sb3_yann.policy.checkpoint import (

@@ -31,8 +31,8 @@ from sb3_yann.compare import (
     looks,
     no_worse,
 )
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.guard.state import Decision, Evidence, Outcome, Play
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import normalized

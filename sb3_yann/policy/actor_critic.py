@@ -27,7 +27,7 @@ from sb3_yann._validation import (
     check_positive,
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.mpc.at_rest import Value
+from sb3_yann.control.mpc.problem import Value
 from sb3_yann.control.online import Law
 from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
 from sb3_yann.networks.value import PredictionModel

@@ -28,8 +28,8 @@ from sb3_yann._validation import (
     check_range,
 )
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.online import LAWS
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import checks, sb3_hooks

@@ -17,9 +17,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._validation import Array, is_text
 from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.control.online import Law
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.state import GuardState
 from sb3_yann.improvement import Headroom

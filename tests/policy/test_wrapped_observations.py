@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import AffineObservation, ImprovementGuard, NoActionNoise, headroom
-from sb3_yann.control.linearization.wrapper_stack import require_state_shown
+from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.evaluation import evaluate
 
 MPC = two_input_mpc()

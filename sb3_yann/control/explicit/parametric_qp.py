@@ -173,8 +173,8 @@ def moderated(program: ParametricQP) -> ParametricQP:
     c[inputs:] = np.minimum(c[inputs:] * largest, most)
     G[:, inputs:] *= largest
     length = _row_norms(np.hstack([G, program.S]))
-    rows = {"G": G / length[:, None], "S": program.S / length[:, None], "w": program.w / length}
-    return replace(program, H=H, c=c, **rows)
+    S = program.S / length[:, None]
+    return replace(program, H=H, c=c, G=G / length[:, None], S=S, w=program.w / length)
 
 
 def slack_costs(program: ParametricQP) -> tuple[Array, Array]:

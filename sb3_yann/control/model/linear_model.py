@@ -33,7 +33,7 @@ from sb3_yann.control.linear_system import (
     with_units,
     zero_order_hold,
 )
-from sb3_yann.control.linearization.linearize import linearize_dynamics, linearize_env
+from sb3_yann.control.linearization import linearize_dynamics, linearize_env
 from sb3_yann.control.model.report import describe
 from sb3_yann.log import Arrays, Log
 

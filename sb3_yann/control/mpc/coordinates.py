@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
-from sb3_yann._validation import Array, ReadOnlyArrays
+from sb3_yann._validation import Array, ReadOnlyArrays, check_bounds, to_float
 from sb3_yann.control.model.linear_model import LinearModel
 
 
@@ -164,6 +165,61 @@ class ThetaLayout:
 
 def _after(part: slice, size: int) -> slice:
     return slice(part.stop, part.stop + size)
+
+
+Bounds = tuple[Array, Array]
+Given = ArrayLike | None
+
+
+def constant_box(layout: ThetaLayout, r: Bounds, d: Bounds) -> list[Bounds]:
+    """Return the boxes of r and d with their previews."""
+    loads = layout.n_disturbances - layout.n_estimated
+    ahead_r, ahead_d = layout.previews
+    found = [(np.tile(r[0], ahead_r + 1), np.tile(r[1], ahead_r + 1))]
+    low, high = (np.concatenate([np.tile(s[:loads], ahead_d + 1), s[loads:]]) for s in d)
+    return [*found, (low, high)]
+
+
+def theta_box(
+    layout: ThetaLayout,
+    given: tuple[Given, Given],
+    states: Bounds,
+    others: Sequence[Bounds],
+) -> Bounds:
+    """Return the box of theta.
+
+    ``given`` are theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
+    ``states`` (n,) stand in for them. ``others`` are the boxes of r, d, bounds and the previous
+    input, from which those given must not differ.
+    """
+    n = layout.n_states
+    parts = []
+    for value, fallback in zip(given, states, strict=True):
+        part = fallback if value is None else to_float("theta", value)
+        parts.append(part[:n] if part.shape == (layout.size,) else part)
+    pieces = [check_bounds("theta", parts[0], parts[1], n), *others]
+    low, high = (np.concatenate(side) for side in zip(*pieces, strict=True))
+    low, high = check_bounds("theta", low, high, layout.size)
+    for name, value, stored in zip(("theta_min", "theta_max"), given, (low, high), strict=True):
+        _require_same_rest(name, value, stored, layout)
+    return low, high
+
+
+def _require_same_rest(name: str, given: Given, stored: Array, layout: ThetaLayout) -> None:
+    """Raise where a box given for all of theta differs from that of r, d and u_prev."""
+    box = None if given is None else to_float(name, given)
+    # `dataclasses.replace` passes the stored box, which is read-only, and means the states.
+    taken_over = isinstance(given, np.ndarray) and not given.flags.writeable
+    if box is None or box.shape != stored.shape or taken_over:
+        return
+    for i in np.flatnonzero(box != stored):
+        if i >= layout.n_states:
+            part = layout.names[i].partition("[")[0].replace("u_prev", "u")
+            side = name.partition("_")[2]
+            raise ValueError(
+                f"{name} has {box[i]:g} for {layout.names[i]}, but {part}_{side} is {stored[i]:g}. "
+                f"Pass {name} of the {layout.n_states} states only; the rest has its own bounds."
+            )
 
 
 @dataclass(frozen=True, eq=False)

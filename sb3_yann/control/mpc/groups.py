@@ -18,8 +18,9 @@ from sb3_yann._validation import (
     check_symmetric,
     to_float,
 )
-from sb3_yann.control.mpc.arguments import Bounds, Given, as_softness
 
+Bounds = tuple[Array, Array]
+Given = ArrayLike | None
 Outputs = ArrayLike | Sequence[int]
 HalfSpaces = tuple[ArrayLike, ArrayLike]
 
@@ -46,6 +47,25 @@ def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> B
             f"{' or '.join(check.sides_of(name))} is given, but there is no {missing}."
         )
     return check_bounds(name, low, high, size)
+
+
+def _softness(name: str, given: Array, bounds: Bounds) -> Array:
+    """Return the unit of violation (size,) of soft bounds; one number is for all that are there."""
+    size = len(bounds[0])
+    bounded = np.isfinite(bounds).any(axis=0)
+    units = given
+    if given.ndim == 0:
+        units = np.where(bounded, given, 0.0) if np.any(bounded) else np.full(size, float(given))
+    units = check_array(name, units, (size,))
+    if np.any(given > 0) and not np.any(units[bounded] > 0):
+        wanted = f"pass {name[-1]}_min or {name[-1]}_max"
+        raise ValueError(f"{name} = {given.tolist()}, but there is no bound to soften: {wanted}.")
+    if np.any(units[~bounded] > 0):
+        i = int(np.argmax((units > 0) & ~bounded))
+        raise ValueError(
+            f"{name} = {given.tolist()} softens entry {i}, which has no bound: make it 0."
+        )
+    return units
 
 
 def _preview(name: str, value: int) -> int:
@@ -250,7 +270,7 @@ class SoftBounds(ReadOnlyArrays):
 
         ``mixed`` are the units of :class:`MixedBounds`, which have the same penalty.
         """
-        units = as_softness("SoftBounds.x", self.x, x), as_softness("SoftBounds.y", self.y, y)
+        units = _softness("SoftBounds.x", self.x, x), _softness("SoftBounds.y", self.y, y)
         soft = any(np.any(unit) for unit in (*units, mixed))
         if self.penalty and not soft:
             raise ValueError(
@@ -321,7 +341,7 @@ class MixedBounds(ReadOnlyArrays):
             raise ValueError(f"Row {k} of MixedBounds is zero in F and G: it bounds nothing.")
         for k in np.flatnonzero(np.isinf(low) & np.isinf(high)):
             raise ValueError(f"Row {k} of MixedBounds has no bound: pass low or high, or both.")
-        units = as_softness("MixedBounds.soft", self.soft, (low, high)) if count else self.soft
+        units = _softness("MixedBounds.soft", self.soft, (low, high)) if count else self.soft
         return MixedBounds(F, G, low, high, np.ravel(units)[:count])
 
     def at_steps(self, horizon: int) -> list[tuple[int, NDArray[np.bool_]]]:

@@ -1,14 +1,16 @@
-"""Sets in which hard bounds can be kept for ever: by the terminal gain, and by any inputs."""
+"""Terminal cost and set, and sets in which hard bounds are kept for ever, by any inputs too."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import optimize
 
-from sb3_yann._validation import Array, ReadOnlyArrays
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array
 from sb3_yann.control import lqr
+from sb3_yann.control.mpc.groups import Terminal
 from sb3_yann.control.mpc.problem import MPCProblem
 from sb3_yann.control.polyhedra import bounded_region, farthest_points
 
@@ -17,6 +19,55 @@ MARGIN = 0.01
 MAX_ROWS = 200
 MAX_STEPS = 500
 Rows = tuple[Array, Array]  # half-spaces F theta <= g
+
+
+def completed(problem: MPCProblem) -> Terminal:
+    """Return the terminal cost and set of a problem, solved where they are left to it.
+
+    The set is in the units of the problem.
+    """
+    errors = problem.settled.error_system
+    cost: Any = problem.terminal.cost
+    half_spaces: Any = problem.terminal.set
+    if cost is None:
+        try:
+            cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
+        except ValueError:
+            _require_weighted_inputs(problem)
+            raise
+    elif len(cost) != len(errors.Q):
+        check_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
+    if np.shape(cost) == np.shape(errors.Q):
+        _require_weighted_inputs(problem, cost)
+    if isinstance(half_spaces, str):
+        F, g = invariant_set(problem.deviations.settled, cost)
+        F = F @ np.eye(problem.n_theta)[problem.layout.settles]
+        half_spaces = F, g + F @ problem.theta_ss
+    n = problem.model.n_states
+    size = problem.n_theta
+    F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
+    if F.shape[1] != size:
+        F = np.pad(check_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))
+    return Terminal(cost, (F, g))
+
+
+def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:
+    """Raise where an input costs nothing: not itself, not by its rate, not by what it moves."""
+    errors = problem.settled.error_system
+    if np.linalg.eigvalsh(problem.R)[0] > 0:
+        return  # where rounding hides it, the laws say so
+    B = errors.model.B
+    weight = errors.R if cost is None else errors.R + problem.gamma * B.T @ cost @ B
+    unit = np.outer(problem.u_half, problem.u_half)
+    sizes = np.linalg.eigvalsh(weight * unit)
+    if sizes[0] > 1e-13 * max(sizes[-1], np.finfo(float).tiny):
+        return
+    raise ValueError(
+        "R must be positive definite, its smallest eigenvalue is "
+        f"{np.linalg.eigvalsh(problem.R)[0]:g}, where an input costs nothing else: neither its "
+        "rate nor a state that it moves has a weight. Give every input a positive weight, in R or "
+        "in RateLimits(R_du=...)."
+    )
 
 
 def invariant_set(problem: MPCProblem, cost: Array) -> Rows:

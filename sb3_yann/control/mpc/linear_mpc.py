@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,22 +14,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
 from sb3_yann._validation import Array, check_array, check_bounds, check_symmetric, to_float
-from sb3_yann.control import lqr
 from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
 from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine
-from sb3_yann.control.linearization.simulator import borrow
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.model.identify import Identified
 from sb3_yann.control.model.identify_outputs import IdentifiedOutputs
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.mpc import arguments, at_rest
-from sb3_yann.control.mpc.arguments import Given
-from sb3_yann.control.mpc.at_rest import Value
+from sb3_yann.control.mpc import problem as at_rest
 from sb3_yann.control.mpc.condensing import condense
+from sb3_yann.control.mpc.coordinates import constant_box, theta_box
 from sb3_yann.control.mpc.groups import (
+    Bounds,
     DisturbanceBounds,
+    Given,
     LinearCost,
     MixedBounds,
     OutputBounds,
@@ -41,13 +41,14 @@ from sb3_yann.control.mpc.groups import (
     parametric_box,
     parametric_names,
 )
-from sb3_yann.control.mpc.invariant_sets import KeptSet, hard_rows, invariant_set, kept_set
-from sb3_yann.control.mpc.problem import MPCProblem, layout_of
+from sb3_yann.control.mpc.invariant_sets import KeptSet, completed, hard_rows, kept_set
+from sb3_yann.control.mpc.problem import MPCProblem, Value, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.online import LAWS, Law, OnlineLaw, OnlineLawWarning, steepness
+from sb3_yann.control.simulator import borrow
 
 if TYPE_CHECKING:
-    from sb3_yann.control.linearization.simulator import Maker
+    from sb3_yann.control.simulator import Maker
 
 G = TypeVar("G")
 EFFORT = 1.0
@@ -56,6 +57,9 @@ REGIONS = 5000
 """The most regions of a law that "auto" takes."""
 LARGE = 50_000
 """Constraints times parameters beyond which a single region takes long, and none is looked for."""
+DRIFT = 1e-3
+BEYOND = 0.5
+"""In widths: the drift in a sample that warns; how far theta's box reaches beyond soft bounds."""
 ONLINE_CHOSEN = "_online_chosen"
 """Notes in a problem that its online law was chosen, and travels with it."""
 
@@ -178,7 +182,7 @@ class LinearMPC(MPCProblem):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         n = model.n_states
         m = model.n_inputs
-        horizon = arguments.as_horizon(horizon)
+        horizon = _as_horizon(horizon)
         gamma = check.check_discount(gamma)
         infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE)
         Q = check_symmetric("Q", Q, n)
@@ -201,15 +205,15 @@ class LinearMPC(MPCProblem):
             "mixed": mixed,
             "price": price,
             "parametric_bounds": parametric_bounds,
-            "control_horizon": arguments.as_control_horizon(control_horizon, horizon),
+            "control_horizon": _as_control_horizon(control_horizon, horizon),
         }
-        arguments.require_preview_within(model, horizon, tracking.preview, d.preview)
+        _require_preview_within(model, horizon, tracking.preview, d.preview)
         layout = layout_of(model, tracking, rate, d.preview, parametric_bounds)
-        rest = arguments.constant_box(layout, (tracking.r_min, tracking.r_max), (d.d_min, d.d_max))
+        rest = constant_box(layout, (tracking.r_min, tracking.r_max), (d.d_min, d.d_max))
         rest += [parametric_box(parametric_bounds, limits)]
         rest += [u] if layout.n_previous else []
-        fallback = arguments.softened_box(x, soft.x)
-        theta = arguments.theta_box(layout, (theta_min, theta_max), fallback, rest)
+        fallback = _softened_box(x, soft.x)
+        theta = theta_box(layout, (theta_min, theta_max), fallback, rest)
         states = theta[0][:n], theta[1][:n]
         ranges = {
             "x": (*x, model.x_ss),
@@ -219,17 +223,17 @@ class LinearMPC(MPCProblem):
             "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
             "y": (*y, outputs.C @ model.x_ss),
         }
-        arguments.warn_of_misread_bounds(model, ranges, layout.has_constants)
-        arguments.warn_of_unused_softness(soft.x, x, states)
-        arguments.warn_of_drift(model, *states)
+        _warn_of_misread_bounds(model, ranges, layout.has_constants)
+        _warn_of_unused_softness(soft.x, x, states)
+        _warn_of_drift(model, *states)
         checked = (
             model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
             tracking, d, rate, outputs, soft,
         )  # fmt: skip
-        completed = _completed(MPCProblem(*checked, terminal, **extra))
+        ends = completed(MPCProblem(*checked, terminal, **extra))
         if soft.penalty is None:
-            _choose_penalty(MPCProblem(*checked, completed, **extra).deviations)
-        super().__init__(*checked, completed, **extra)
+            _choose_penalty(MPCProblem(*checked, ends, **extra).deviations)
+        super().__init__(*checked, ends, **extra)
         if not np.any(model.B):
             raise ValueError(
                 "B of the model is zero: no input does anything, so there is nothing to control. "
@@ -527,58 +531,144 @@ class LinearMPC(MPCProblem):
         return report(self, self.law(), samples, seed)
 
 
+def _as_horizon(value: int) -> int:
+    """Return the number of predicted steps, a whole number of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"horizon = {value!r} must be a whole number of steps.")
+    return check.check_int("horizon", value)
+
+
+def _as_control_horizon(
+    value: int | Sequence[int] | None, horizon: int
+) -> int | tuple[int, ...] | None:
+    """Return the number of samples in which inputs move, or the lengths of their blocks."""
+    if value is None:
+        return None
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+        moves = check.check_int("control_horizon", value)
+        if moves > horizon:
+            raise ValueError(
+                f"control_horizon = {moves} must be at most the horizon, {horizon}: inputs move in "
+                "so many of its samples."
+            )
+        return moves
+    if isinstance(value, (str, bool)) or not isinstance(value, (Sequence, np.ndarray)):
+        raise TypeError(
+            f"control_horizon = {value!r} must be a number of samples, or a list of the lengths of "
+            "blocks."
+        )
+    blocks = tuple(check.check_int("control_horizon", each) for each in value)
+    if sum(blocks) != horizon:
+        raise ValueError(
+            f"The blocks control_horizon = {[*blocks]} make {sum(blocks)} samples, and the horizon "
+            f"is {horizon}: they must sum up to it."
+        )
+    return blocks
+
+
+def _require_preview_within(model: LinearModel, horizon: int, reference: int, load: int) -> None:
+    """Raise where a preview is longer than the horizon, or nothing measures what it foresees."""
+    for name, ahead in (("Tracking", reference), ("DisturbanceBounds", load)):
+        if ahead > horizon:
+            raise ValueError(
+                f"{name}.preview = {ahead} must be at most the horizon, {horizon}: the law looks "
+                "no further."
+            )
+    measured = model.n_disturbances - len(model.estimated)
+    if load and sorted(model.estimated) != [*range(measured, model.n_disturbances)]:
+        raise ValueError(
+            f"estimated = {[*model.estimated]}: with a preview, theta holds the measured "
+            "disturbances before the estimated ones. Sort the columns of E so."
+        )
+    if load and not measured:
+        raise ValueError(
+            "DisturbanceBounds.preview is of measured disturbances, and all are estimated."
+        )
+
+
+def _softened_box(bounds: Bounds, softness: Array) -> Bounds:
+    """Return bounds moved out by `BEYOND` of their width where they are soft."""
+    width = bounds[1] - bounds[0]
+    beyond = np.where((softness > 0) & np.isfinite(width), BEYOND * width, 0.0)
+    return bounds[0] - beyond, bounds[1] + beyond
+
+
+def _warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
+    """Warn of an operating point that moves noticeably: the law would rest beside it."""
+    width = (upper - lower) / 2
+    size = np.where(np.isfinite(width), width, np.maximum(np.abs(model.x_ss), 1.0))
+    if np.any(np.abs(model.drift) > DRIFT * size):
+        warnings.warn(
+            f"x_ss = {model.x_ss.tolist()} with u_ss = {model.u_ss.tolist()} is no steady state: "
+            f"there the plant moves by {model.drift.tolist()} in one sample, and the law will rest "
+            "beside its references. Identify it with an x_ss and u_ss at which it rests.",
+            stacklevel=3,
+        )
+
+
+def _warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> None:
+    """Warn of soft bounds of states that no theta of the box breaks."""
+    (lower, upper) = bounds
+    (low, high) = box
+    unused = (softness > 0) & (low >= lower) & (high <= upper)
+    if np.any(unused):
+        i = int(np.argmax(unused))
+        warnings.warn(
+            f"SoftBounds.x softens the bounds {lower[i]:g} to {upper[i]:g} of x[{i}], but theta_min"
+            f" = {low[i]:g} and theta_max = {high[i]:g} do not exceed them: the law ends there. "
+            "Give theta_min and theta_max the states from which it is to come back.",
+            stacklevel=3,
+        )
+
+
+def _warn_of_misread_bounds(
+    model: LinearModel, ranges: Mapping[str, tuple[Array, Array, Array]], has_constants: bool
+) -> None:
+    """Warn of bounds that seem to be deviations, or in which the law cannot rest.
+
+    Ranges are lower and upper bounds, and the operating point between them, by name: "x", "theta"
+    of the states, "u", and others. References and disturbances are other places to rest at.
+    """
+    left_out = {name: (low > point) | (high < point) for name, (low, high, point) in ranges.items()}
+    for name, (lower, upper, points) in ranges.items():
+        for i in np.flatnonzero(left_out[name] & (lower < 0) & (upper > 0))[:1]:
+            low = lower[i]
+            high = upper[i]
+            point = points[i]
+            warnings.warn(
+                f"{name}_min = {low:g} and {name}_max = {high:g} of entry {i} leave out the "
+                f"operating point, {point:g}, and hold 0. Bounds are what the plant shows. If "
+                f"these are deviations, pass {name}_min = {low + point:g} and {name}_max = "
+                f"{high + point:g}, or leave x_ss and u_ss out of the model.",
+                stacklevel=3,
+            )
+            return
+    if has_constants:
+        return
+    has_point = bool(np.any(model.x_ss) or np.any(model.u_ss))
+    cure = "If these are what the plant takes, give the model its x_ss and u_ss."
+    if has_point:
+        cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
+    for i in np.flatnonzero(left_out["u"]):
+        low, high, point = (each[i] for each in ranges["u"])
+        warnings.warn(
+            f"u_min = {low:g} and u_max = {high:g} leave out u[{i}] = {point:g}, "
+            f"the operating point: the law cannot rest there. {cure}",
+            stacklevel=3,
+        )
+    for i in np.flatnonzero(has_point & (left_out["x"] | left_out["theta"])):
+        low, high, point = (each[i] for each in ranges["x" if left_out["x"][i] else "theta"])
+        warnings.warn(
+            f"{labels_of(model)[0][i]} = {point:g}, the operating point, lies outside its "
+            f"bounds, {low:g} to {high:g}: the law cannot rest there. Look at the "
+            "order of the states.",
+            stacklevel=3,
+        )
+
+
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
     """Return a group of arguments; None is one that says nothing."""
     return check.check_options(name, kind() if value is None else value, kind)
-
-
-def _completed(problem: MPCProblem) -> Terminal:
-    """Return the terminal cost and set of a problem, solved where they are left to it.
-
-    The set is in the units of the problem.
-    """
-    errors = problem.settled.error_system
-    cost: Any = problem.terminal.cost
-    half_spaces: Any = problem.terminal.set
-    if cost is None:
-        try:
-            cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
-        except ValueError:
-            _require_weighted_inputs(problem)
-            raise
-    elif len(cost) != len(errors.Q):
-        check_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
-    if np.shape(cost) == np.shape(errors.Q):
-        _require_weighted_inputs(problem, cost)
-    if isinstance(half_spaces, str):
-        F, g = invariant_set(problem.deviations.settled, cost)
-        F = F @ np.eye(problem.n_theta)[problem.layout.settles]
-        half_spaces = F, g + F @ problem.theta_ss
-    n = problem.model.n_states
-    size = problem.n_theta
-    F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
-    if F.shape[1] != size:
-        F = np.pad(check_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))
-    return Terminal(cost, (F, g))
-
-
-def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:
-    """Raise where an input costs nothing: not itself, not by its rate, not by what it moves."""
-    errors = problem.settled.error_system
-    if np.linalg.eigvalsh(problem.R)[0] > 0:
-        return  # where rounding hides it, the laws say so
-    B = errors.model.B
-    weight = errors.R if cost is None else errors.R + problem.gamma * B.T @ cost @ B
-    unit = np.outer(problem.u_half, problem.u_half)
-    sizes = np.linalg.eigvalsh(weight * unit)
-    if sizes[0] > 1e-13 * max(sizes[-1], np.finfo(float).tiny):
-        return
-    raise ValueError(
-        "R must be positive definite, its smallest eigenvalue is "
-        f"{np.linalg.eigvalsh(problem.R)[0]:g}, where an input costs nothing else: neither its "
-        "rate nor a state that it moves has a weight. Give every input a positive weight, in R or "
-        "in RateLimits(R_du=...)."
-    )
 
 
 def _choose_penalty(problem: MPCProblem) -> None:

@@ -10,9 +10,8 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.linear_system import labels_of
-from sb3_yann.control.mpc.at_rest import is_reachable
 from sb3_yann.control.mpc.condensing import condense
-from sb3_yann.control.mpc.problem import MPCProblem
+from sb3_yann.control.mpc.problem import MPCProblem, is_reachable
 from sb3_yann.control.online import Law, OnlineLaw
 
 LOOP_STEPS = 50  # of a closed loop on the model

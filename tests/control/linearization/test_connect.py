@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization.simulator import sample_time, to_vector
+from sb3_yann.control.simulator import sample_time, to_vector
 
 
 def box(low: Any, high: Any) -> gym.spaces.Box:

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization.differences import (
-    Jacobian,
-    NotSmoothError,
-    curvature,
-    jacobian,
-)
+from sb3_yann.control.linearization import Jacobian, curvature, jacobian
 from sb3_yann_envs import cstr
 
 NAN = np.nan
@@ -86,7 +81,7 @@ ONE = np.ones(1)
 
 def of(f: Any, at: float = 0.0, longest: float = 0.1, noise: float = EPS) -> Jacobian:
     """Return the derivative of a function of one number."""
-    return jacobian(lambda z: np.atleast_1d(f(z[0])), at * ONE, longest * ONE, noise * ONE)
+    return jacobian(lambda z: np.atleast_1d(f(z[0])), at * ONE, longest * ONE, noise * ONE, ["z"])
 
 
 @pytest.mark.parametrize(("k", "smooth"), [(0.0049, True), (0.0052, False), (-0.0052, False)])
@@ -95,15 +90,14 @@ def test_slopes_that_differ_by_a_hundredth_of_the_steepest_are_a_kink(k, smooth)
     if smooth:
         of(lambda z: z + k * abs(z))
     else:
-        with pytest.raises(NotSmoothError, match="slopes to the two sides differ") as caught:
+        with pytest.raises(ValueError, match=r"along z, its slopes to the two sides differ"):
             of(lambda z: z + k * abs(z))
-        assert caught.value.column == 0 and not caught.value.no_value
 
 
 def test_a_jump_has_no_slope() -> None:
-    with pytest.raises(NotSmoothError, match="no limit for short steps"):
+    with pytest.raises(ValueError, match="no limit for short steps"):
         of(lambda z: z + 0.01 * np.sin(1e5 * z), at=0.3)
-    with pytest.raises(NotSmoothError, match=r"differ|no limit"):
+    with pytest.raises(ValueError, match=r"differ|no limit"):
         of(lambda z: z + (z > 0))
 
 
@@ -111,10 +105,10 @@ def test_a_point_in_float32_is_differenced_between_what_is_evaluated() -> None:
     def single(z: np.ndarray) -> np.ndarray:
         return z.astype(np.float32).astype(np.float64)
 
-    found = jacobian(lambda z: z**2, 1.1 * ONE, 1e-2 * ONE, EPS * ONE, single)
+    found = jacobian(lambda z: z**2, 1.1 * ONE, 1e-2 * ONE, EPS * ONE, ["z"], single)
     assert found.value[0, 0] == pytest.approx(2 * float(np.float32(1.1)), rel=1e-6)
-    with pytest.raises(NotSmoothError, match="no finite value"):  # steps that rounding swallows
-        jacobian(lambda z: z**2, 1.1 * ONE, 1e-8 * ONE, EPS * ONE, single)
+    with pytest.raises(ValueError, match="no finite value"):  # steps that rounding swallows
+        jacobian(lambda z: z**2, 1.1 * ONE, 1e-8 * ONE, EPS * ONE, ["z"], single)
 
 
 def test_the_notes_tell_what_is_dropped_what_bends_and_what_has_no_effect() -> None:

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.control.linearization.simulator import noise_of
+from sb3_yann.control.simulator import noise_of
 from sb3_yann.wrappers import TruncateAtTimeLimit
 from sb3_yann_envs import cstr
 

@@ -1,0 +1,636 @@
+"""Linear models of equations and of simulators: the operating point, then differences about it."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann._validation import Array, check_array, check_positive, check_positive_vector, to_float
+from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
+from sb3_yann.control.lqr import unreached
+from sb3_yann.control.simulator import (
+    MOST,
+    Simulator,
+    borrow,
+    connect,
+    noise_of,
+    sample_time,
+    to_vector,
+)
+
+if TYPE_CHECKING:
+    from sb3_yann.control.simulator import Maker
+
+LEVELS = 6
+RATIO = 4.0
+"""Number of steps that approach a point, and how much shorter each is than the one before."""
+SHORTER = 64.0  # factor by which steps shrink where a function has no value next to the point
+NOISE_FLOOR = 100.0
+"""Effects below so many times the noise are none. Hundreds of operations of an integrator round
+ten times as much as one does, and a plant that forgets a state within a sample shows only that."""
+NO_VALUE = "it has no finite value on one of its sides"
+
+
+@dataclass(frozen=True, eq=False)
+class Jacobian:
+    """A Jacobian (r, c), and what its differences showed.
+
+    It is exactly zero where not above its own error; ``dropped`` is the largest entry set to zero.
+    ``change`` (c,) are errors of the longest ``steps`` (c,), relative to the column, NaN without a
+    value. ``doubt`` is the largest error left: how far two step sizes agree.
+    """
+
+    value: Array
+    dropped: float
+    steps: Array
+    change: Array
+    doubt: float
+
+
+def jacobian(
+    f: Callable[[Array], Array],
+    point: Array,
+    steps: Array,
+    noise: Array,
+    labels: list[str],
+    actual: Callable[[Array], Array] = lambda z: z,
+) -> Jacobian:
+    """Return the derivatives of f, from points (c,) to values (r,), by Richardson extrapolation.
+
+    Each entry takes the extrapolation that agrees best with its neighbor over shorter steps:
+    Ridders (1982), *Advances in Engineering Software* 4, 75-76. ``steps`` (c,) are the longest,
+    and shorter where f has no value, NaN; ``noise`` (r,) is the error of each value, and ``actual``
+    the point at which f is evaluated for a given one, e.g. its float32 rounding. ValueError where
+    it has a kink or a jump at the point, or no value next to it.
+    """
+    begin = actual(point)
+    center = f(begin)
+    steps = steps.copy()
+    columns = []
+    for i, label in enumerate(labels):
+        found = _column(f, center, begin, i, steps[i], noise, actual)
+        for _ in range(2):
+            if found == NO_VALUE:
+                steps[i] /= SHORTER
+                found = _column(f, center, begin, i, steps[i], noise, actual)
+        if isinstance(found, str):
+            raise ValueError(
+                f"The plant cannot be linearized at {point.tolist()}: along {label}, {found}, with "
+                f"steps up to {steps[i]:.3g}. Clipping, dry friction, angles that wrap and too "
+                "long steps do this: pass scale=..., move the operating point, or use "
+                "LinearModel.from_data."
+            )
+        columns.append(found)
+    value, error, change = (np.array(part) for part in zip(*columns, strict=True))
+    lost = np.abs(value) <= error
+    dropped = float(np.max(np.abs(value[lost]), initial=0.0))
+    largest = np.max(np.abs(value), axis=1)
+    doubt = np.max(np.max(error, axis=1) / np.where(largest > 0, largest, np.inf), initial=0.0)
+    return Jacobian(np.where(lost, 0.0, value).T, dropped, steps, change, float(doubt))
+
+
+def _column(
+    f: Callable[[Array], Array],
+    center: Array,
+    point: Array,
+    i: int,
+    longest: float,
+    noise: Array,
+    actual: Callable[[Array], Array],
+) -> tuple[Array, Array, float] | str:
+    """Return derivatives by coordinate i, their errors and the change; or why there are none."""
+    rows = []
+    for level in range(LEVELS):
+        offset = np.zeros(point.size)
+        offset[i] = longest / RATIO**level
+        above = actual(point + offset)
+        below = actual(point - offset)
+        up = above[i] - point[i]
+        down = point[i] - below[i]
+        if up <= 0 or down <= 0:
+            break  # the step is lost in the rounding of the point
+        rows.append(
+            (np.concatenate([(f(above) - center) / up, (center - f(below)) / down]), up + down)
+        )
+    far = bool(rows) and bool(np.all(np.isfinite(rows[0][0])))
+    rows = [each for each in rows if np.all(np.isfinite(each[0]))]
+    if len(rows) < 3:
+        return NO_VALUE
+    one, other = np.split(np.array([sides for sides, _ in rows]), 2, axis=1)
+    span = np.array([[width] for _, width in rows])
+    slope = (one + other) / 2
+    # Unequal sides (a point that is rounded) would leave a first-order error in the mean.
+    value, error = _extrapolated(slope, RATIO**2, 2 * noise / span)
+    kink, doubt = _extrapolated(one - other, RATIO, 4 * noise / span)
+    steepest = np.max(np.abs(value) + np.abs(kink) / 2)
+    floor = np.max(2 * noise / span[0])
+    if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
+        return "its slopes to the two sides differ (a kink)"
+    scale = np.max(np.abs(value))
+    if np.max(error) > max(0.2 * scale, NOISE_FLOOR * floor):
+        return "its slope has no limit for short steps (a jump or noise)"
+    change = np.max(np.abs(slope[0] - value)) / scale if scale > 0 else 0.0
+    return value, error, float(change) if far else np.nan
+
+
+def _extrapolated(levels: Array, power: float, rounding: Array) -> tuple[Array, Array]:
+    """Return the limits of the levels (k, r), whose errors fall by `power`, and their errors."""
+    limits = (power * levels[1:] - levels[:-1]) / (power - 1)
+    errors = np.abs(np.diff(limits, axis=0)) + 2 * rounding[1:-1]
+    best = np.argmin(errors, axis=0)
+    rows = np.arange(levels.shape[1])
+    return limits[best, rows], errors[best, rows]
+
+
+def _partly_known(name: str, value: ArrayLike) -> Array:
+    """Return a vector in which NaN stands for what is to be solved for."""
+    array = to_float(name, value)
+    if array.ndim != 1 or not array.size or np.any(np.isinf(array)):
+        raise ValueError(
+            f"{name} has shape {array.shape} and the entries {array.tolist()}; expected a vector "
+            "of finite numbers, or NaN where the steady state is to be solved for; one at least."
+        )
+    return array
+
+
+def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
+    """Return a note on inputs without effect, and warn of them."""
+    idle = np.flatnonzero(~np.any(B, axis=0))
+    if not idle.size:
+        return []
+    note = (
+        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. With a delay or an "
+        "actuator, make the inputs on their way part of the state; leave out an idle input."
+    )
+    warnings.warn(note, stacklevel=stacklevel)
+    return [note]
+
+
+def curvature(found: Jacobian, labels: list[str]) -> list[str]:
+    """Return notes on dropped entries, strong nonlinearity, and what has no effect."""
+    notes = []
+    if found.dropped > 0:
+        notes.append(
+            f"Derivatives that are not above their rounding error (at most {found.dropped:.1e}) "
+            "were set to zero."
+        )
+    for i, change in enumerate(found.change):
+        if not change <= 0.1:
+            what = "it has no value there" if np.isnan(change) else f"slopes differ by {change:.0%}"
+            notes.append(
+                f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
+                f"along {labels[i]}: {what}."
+            )
+        elif not np.any(found.value[:, i]) and not labels[i].startswith("u"):
+            notes.append(f"{labels[i]} has no effect on the next state.")
+    return notes
+
+
+def _least_moved(
+    moved: Callable[[Array], Array],
+    start: Array,
+    free: NDArray[np.bool_],
+    scale: Array,
+    xtol: float,
+    step: float = 0.0,
+    bounds: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
+) -> tuple[Array, float]:
+    """Return the point that moves least, its free entries changed, and its motion in scales."""
+    from scipy.optimize import least_squares
+
+    def at(z: Array) -> Array:
+        point = start.copy()
+        point[free] = z * scale[free]
+        return point
+
+    def finite(z: Array) -> Array:
+        # Where there is no value, the search turns back.
+        return np.asarray(np.nan_to_num(moved(at(z)), nan=1e3, posinf=1e3, neginf=-1e3))
+
+    def slopes(z: Array) -> Array:
+        steps = step * np.eye(z.size)
+        return np.array([(finite(z + h) - finite(z - h)) / (2 * step) for h in steps]).T
+
+    box = [np.broadcast_to(side, start.shape)[free] / scale[free] for side in bounds]
+    options: dict[str, Any] = {"xtol": xtol, "ftol": 1e-15, "gtol": 1e-15, "bounds": box}
+    options["jac"] = slopes if step else "2-point"
+    found = least_squares(finite, start[free] / scale[free], **options)
+    return at(found.x), float(np.max(np.abs(found.fun)))
+
+
+MOVED = 1e-3  # largest residual of a given steady state in one step, relative to the scale
+AWAY = 1e-2  # largest distance to the linear model's steady state, relative to the scale
+SOLVED = 1e-6  # largest residual of a steady state that was solved for
+NOTHING = 1e-9  # a solved entry that is smaller, relative to its scale, is zero
+SETTLES = 2_000  # steps in which a plant may come to rest by itself
+
+
+def _steady_state(
+    simulator: Simulator, start: Array, free: NDArray[np.bool_], scale: Array
+) -> Array:
+    """Return the steady state and its action, shape (n+m,), with the free entries solved for.
+
+    ``start`` (n+m,) holds the known entries, and a guess for the free ones. ``scale`` (n+m,) is the
+    range in which each moves in use.
+    """
+    if not np.any(free):
+        return start
+    space: Any = simulator.env.action_space
+    n = scale.size - space.shape[0]
+    low = np.concatenate([np.full(n, -np.inf), space.low.astype(np.float64)])
+    high = np.concatenate([np.full(n, np.inf), space.high.astype(np.float64)])
+
+    def moved(point: Array) -> Array:
+        return _residual(simulator, point, scale)
+
+    # Steps as long as a float32 state needs; SciPy's own would vanish in its rounding.
+    options: dict[str, Any] = {"step": 1e-3, "bounds": (low, high), "xtol": 1e-12}
+    point = _least_moved(moved, start, free, scale, **options)[0]
+    left = moved(point)
+    if not np.max(np.abs(left)) <= SOLVED and np.all(free[:n]) and not np.any(free[n:]):
+        # A search may run away from where the plant comes to rest by itself.
+        other = _least_moved(moved, _settled(simulator, start, scale), free, scale, **options)[0]
+        if np.max(np.abs(moved(other))) <= SOLVED:
+            point = other
+            left = moved(point)
+    if not np.max(np.abs(left)) <= SOLVED:
+        # What is left of the motion may be no more than the simulator's own error.
+        noise = noise_of(
+            lambda z: simulator.next_state(z[:n], z[n:]), point, scale * (np.arange(scale.size) < n)
+        )
+        noise = noise / scale[:n]
+        if not (np.all(np.abs(left) <= SOLVED + 5 * noise) and np.all(noise <= MOST)):
+            reason = (
+                simulator.refusal if np.any(np.isnan(left)) else f"{(left * scale[:n]).tolist()}"
+            )
+            at_bound = [
+                f"u[{i}] is at its {side} bound, {bound[i]:g}"
+                for side, bound in (("lower", space.low), ("upper", space.high))
+                for i in np.flatnonzero(np.abs(point[n:] - bound) <= 1e-6 * scale[n:])
+            ]
+            stuck = f" {', '.join(at_bound)}: the inputs do not hold it." if at_bound else ""
+            raise ValueError(
+                f"No steady state was found. The best is x_ss = {point[:n].tolist()}, u_ss = "
+                f"{point[n:].tolist()}, which moves in one step by {reason}.{stuck} Leave more "
+                "entries free (NaN), or start closer to it."
+            )
+    return np.where(free & (np.abs(point) <= NOTHING * scale), 0.0, point)
+
+
+def _settled(simulator: Simulator, start: Array, scale: Array) -> Array:
+    """Return the point that the plant comes to with its action held, the last one with values."""
+    n = scale.size - simulator.env.action_space.shape[0]
+    point = start
+    for _ in range(SETTLES):
+        moved = _residual(simulator, point, scale)
+        if not np.all(np.isfinite(moved)):
+            break
+        point = np.concatenate([point[:n] + moved * scale[:n], point[n:]])
+        if np.max(np.abs(moved)) <= SOLVED:
+            break
+    return point
+
+
+def _require_steady_state(simulator: Simulator, point: Array, slopes: Array, scale: Array) -> None:
+    """Raise ValueError if a given operating point is far from the linear model's steady states.
+
+    Its motion alone says little: in a short sample a plant hardly moves from anywhere. The
+    ``slopes`` (n, n+m) are those of the next state at the point (n+m,).
+    """
+    moved = _residual(simulator, point, scale)
+    n = moved.size
+    slopes = (slopes - np.eye(n, point.size)) * scale / scale[:n, None]
+    way = np.linalg.lstsq(slopes, -moved, rcond=1e-9)[0]
+    left = moved + slopes @ way
+    if np.max(np.abs(way)) > AWAY or np.max(np.abs(left)) > MOVED:
+        raise ValueError(
+            f"x_ss = {point[:n].tolist()}, u_ss = {point[n:].tolist()} is no steady state: one "
+            f"step moves it by {(moved * scale[:n]).tolist()}. Set entries to NaN to be solved for."
+        )
+
+
+def _residual(simulator: Simulator, point: Array, scale: Array) -> Array:
+    """Return the motion of the state (n,) in one step, relative to the scale."""
+    n = scale.size - simulator.env.action_space.shape[0]
+    return (simulator.next_state(point[:n], point[n:]) - point[:n]) / scale[:n]
+
+
+LONGEST_EPISODE = 400  # steps after which an episode counts as one without an end of its own
+SECONDS = 1.0  # after which a slow one does
+
+
+def _time_limit_fault(env: Any, action: Array) -> str:
+    """Return that every episode terminates after the same number of steps, empty if it does not.
+
+    The env is reset and stepped with an action (m,) and another one; pass a copy.
+    """
+    low = env.action_space.low
+    high = env.action_space.high
+    other = np.clip(action + 0.25 * np.minimum(high - low, 4.0), low, high)
+    try:
+        steps = _termination(env, 0, action)
+        if steps < 2 or steps != _termination(env, 1, other):
+            return ""
+    except Exception:  # whatever a simulator raises away from its operating point
+        return ""
+    return (
+        f"Episodes terminate after {steps} steps whatever happens: that is a time limit, but "
+        "terminated=True means to the learner that nothing costs anything afterwards. Return "
+        "truncated=True there, or wrap the environment in "
+        f"sb3_yann.wrappers.TruncateAtTimeLimit(env, {steps})."
+    )
+
+
+def _termination(env: Any, seed: int, action: Array) -> int:
+    """Return after how many steps an episode terminates, 0 if it does not or is cut before."""
+    env.reset(seed=seed)
+    begun = perf_counter()
+    for step in range(1, LONGEST_EPISODE + 1):
+        _, _, terminated, truncated, _ = env.step(action.astype(env.action_space.dtype))
+        if terminated:
+            return step
+        if truncated or perf_counter() - begun > SECONDS:
+            break
+    return 0
+
+
+LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
+LONGEST_SINGLE = 0.05  # the same where states are read in float32
+LONGEST_NOISY = 0.2  # the same where an adaptive integrator leaves noise
+# from where on noise counts: beside rounding, and in scales
+NOISY = 10.0
+LEAST = 1e-10
+
+
+def linearize_env(
+    env: Maker,
+    x_ss: ArrayLike | None,
+    u_ss: ArrayLike | None,
+    dt: float | None,
+    set_state: Callable[[Any, Array], object] | None,
+    get_state: Callable[[Any], ArrayLike] | None,
+    scale: ArrayLike | None,
+) -> LinearSystem:
+    """Return the linearized step of `LinearModel.from_env`, which says what None stands for."""
+    with contextlib.closing(borrow(env)) as borrowed:
+        step_time = sample_time(borrowed.env, dt)
+        simulator = Simulator(borrowed, set_state, get_state)
+        x = None if x_ss is None else _partly_known("x_ss", x_ss)
+        u = None if u_ss is None else _partly_known("u_ss", u_ss)
+        found = _linearize(simulator, x, u, step_time, scale)
+        moves = np.linalg.svd(found.A - np.eye(len(found.A)), compute_uv=False)
+        if x is None and moves[-1] <= 1e-6 * moves[0]:
+            warnings.warn(
+                f"The plant rests at other states too: x_ss = {found.x_ss.tolist()} is where a "
+                "reset led. Pass the state to hold, x_ss=[...].",
+                stacklevel=3,
+            )
+        fault = _time_limit_fault(borrowed.env, found.u_ss) if borrowed.private else ""
+        if not fault:
+            return found
+        warnings.warn(fault, stacklevel=3)
+        return replace(found, notes=(*found.notes, fault))
+
+
+def _linearize(
+    simulator: Simulator, x: Array | None, u: Array | None, dt: float, scale: ArrayLike | None
+) -> LinearSystem:
+    """Connect to the simulator, find its steady state, and take the differences there."""
+    space = simulator.env.action_space
+    bounded = (space.low > -1e6) & (space.high < 1e6)
+    low = np.where(bounded, space.low, -1.0)
+    high = np.where(bounded, space.high, 1.0)
+    middle = (low + high) / 2
+    if u is None:
+        # With a state to hold, the action is what holds it; with none, that at mid range.
+        u = middle if x is None else np.full(middle.size, np.nan)
+    elif u.shape != middle.shape:
+        raise ValueError(f"u_ss has shape {u.shape}, expected {middle.shape}.")
+    u_start = np.where(np.isnan(u), middle, u)
+    x_start, size = connect(simulator, x, u_start, scale)
+    scales = np.concatenate([size, (high - low) / 2])
+    n = size.size
+    free = np.isnan(np.concatenate([np.full(n, np.nan) if x is None else x, u]))
+    point = _steady_state(simulator, np.concatenate([x_start, u_start]), free, scales)
+    found, noise = _differentiate(simulator, point, scales)
+    if not np.any(free):
+        _require_steady_state(simulator, point, found.value, scales)
+    A = found.value[:, :n]
+    B = found.value[:, n:]
+    notes = [
+        *_idle_inputs(B, 5),
+        "Linearized by central differences over one step. The state was set by "
+        f"{simulator.setter} and read from {simulator.reader}.",
+        f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
+        "for and the others given or taken from the middle of the action space.",
+    ]
+    if noise:
+        notes.append(
+            f"The simulator's results carry an error of {noise:.1e} of a state's scale, as "
+            f"adaptive integrators do: steps went up to {np.max(found.steps):.3g}, and the "
+            f"derivatives of two step sizes agree within {found.doubt:.1%}. Tighten its tolerances "
+            "for better ones."
+        )
+    simulator.next_state(point[:n], point[n:])
+    if simulator.ended:
+        notes.append("The environment terminates the episode at the operating point.")
+    seen: Any = to_vector(simulator.observation)
+    state: Any = simulator.read()
+    if np.shape(seen) != np.shape(state) or not np.allclose(seen, state, rtol=1e-5, atol=1e-5):
+        notes.append(
+            "The observation is not this state. A policy needs a wrapper that makes it so."
+        )
+    notes += curvature(found, names((n, u.size)))
+    notes.append(f"The simulator was {simulator.origin}.")
+    none = np.zeros((n, 0))
+    return LinearSystem(A, B, dt, point[:n], point[n:], none, np.zeros(0), tuple(notes))
+
+
+def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Jacobian, float]:
+    """Return the Jacobian (n, n+m) of the next state, and the simulator's noise in scales."""
+    space = simulator.env.action_space
+    n = scale.size - space.shape[0]
+    room = np.minimum(point[n:] - space.low, space.high - point[n:]).astype(np.float64)
+    if np.any(room <= 1e-6 * scale[n:]):
+        i = int(np.argmin(room / scale[n:]))
+        raise ValueError(
+            f"u_ss = {point[n:].tolist()}: entry {i} lies on its bound in {space}, where the "
+            "plant cannot be linearized. Choose an operating point with room to both sides."
+        )
+
+    def step(point: Array) -> Array:
+        return simulator.next_state(point[:n], point[n:])
+
+    def actual(point: Array) -> Array:
+        return np.concatenate([point[:n], simulator.actual(point[n:])])
+
+    # What is read may be float32: then every number read is one, and steps have to be longer.
+    of_states = np.where(np.arange(scale.size) < n, scale, 0.0)
+    readings = [step(point), step(point + LONGEST / 3 * of_states)]
+    single = all(np.array_equal(r, r.astype(np.float32), equal_nan=True) for r in readings)
+    longest = (LONGEST_SINGLE if single else LONGEST) * scale
+    spacing = np.finfo(np.float32 if single else np.float64).eps
+    rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
+    noise = noise_of(lambda z: step(actual(z)), point, of_states)
+    noise = np.where(noise > np.maximum(NOISY * rounding, LEAST * scale[:n]), noise, 0.0)
+    if np.any(noise > MOST * scale[:n]):
+        noise = np.zeros(n)  # no noise that differences could cope with
+    rough = float(np.max(noise / scale[:n]))
+    longest = np.maximum(longest, np.minimum(1e6 * rough, LONGEST_NOISY) * scale)
+    longest[n:] = np.minimum(longest[n:], room)
+    labels = names((n, room.size))
+    return jacobian(step, point, longest, np.maximum(rounding, noise), labels, actual), rough
+
+
+STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
+MOVES = 0.01  # the same relative to its own size: beyond it, a state smaller than 1 gets a warning
+AT_REST = 1e-8  # largest motion in one sample of a steady state that was solved for
+STARTS = (0.0, 1.0, -1.0, 0.1, 10.0)
+"""Scales of the free entries from which the steady state is sought, in turn."""
+ANOTHER = 1e-3  # distance, in scales, from which two steady states are different ones
+Rate = Callable[[Array], Array]  # dx/dt (n,) at [x, u, d]
+
+
+def linearize_dynamics(
+    f: Callable[..., ArrayLike],
+    x_ss: ArrayLike,
+    u_ss: ArrayLike,
+    dt: float,
+    d_ss: ArrayLike | None,
+    scale: ArrayLike | None = None,
+) -> LinearSystem:
+    """Return the sampled linearization of `LinearModel.from_dynamics`, which documents the rest."""
+    x = _partly_known("x_ss", x_ss)
+    u = _partly_known("u_ss", u_ss)
+    d = check_array("d_ss", [] if d_ss is None else d_ss, ("d",))
+    dt = check_positive("dt", dt)
+    labels = ["x", "u"] if d_ss is None else ["x", "u", "d"]
+    if not callable(f):
+        raise TypeError(f"f = {f!r} must be a function ({', '.join(labels)}) -> dx/dt.")
+    sizes = (x.size, u.size, d.size)
+    ends = np.cumsum(sizes)[: len(labels) - 1]
+
+    def rate(point: Array) -> Array:
+        return _vector(f(*np.split(point, ends)), x.size)
+
+    given = np.concatenate([x, u, d])
+    size = _size(given, x.size, scale)
+    free = np.isnan(given)
+    point, notes = _rest_of(rate, given, size, dt, sizes) if np.any(free) else (given, [])
+    size = _size(point, x.size, scale)
+    check_array(f"f({', '.join(f'{name}_ss' for name in labels)})", rate(point), (x.size,))
+    _require_steady(rate, np.split(point, ends), size[: x.size], dt, scale is not None)
+    rounding = np.finfo(float).eps * np.maximum(np.abs(point), size)[: x.size] / dt
+    found = jacobian(rate, point, LONGEST * size, rounding, names(sizes))
+    A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
+    A, B, E = zero_order_hold(A, B, E, dt)
+    x, u, d = np.split(point, np.cumsum(sizes[:2]))
+    notes += [*_idle_inputs(B, 4), *curvature(found, names(sizes))]
+    return LinearSystem(A, B, dt, x, u, E, d, tuple(notes))
+
+
+def _vector(value: Any, size: int) -> Array:
+    """Return what f returned as a vector (n,): of shape (n,), (n, 1) or (1, n), or a list."""
+    try:
+        array = to_float("f(x, u)", value)
+    except TypeError:
+        if not isinstance(value, (list, tuple)):
+            raise
+        # A list of numbers and of arrays with one entry.
+        array = np.concatenate([np.ravel(to_float("f(x, u)", each)) for each in value])
+    if array.shape not in ((size,), (size, 1), (1, size)):
+        raise ValueError(
+            f"f returned the shape {array.shape}, expected ({size},) or ({size}, 1): dx/dt of each "
+            "state."
+        )
+    return array.reshape(size)
+
+
+def _rest_of(
+    rate: Rate, given: Array, scale: Array, dt: float, sizes: tuple[int, int, int]
+) -> tuple[Array, list[str]]:
+    """Return the steady state with the free entries solved for, and notes on how sure it is."""
+    free = np.isnan(given)
+    n = sizes[0]
+
+    def moved(point: Array) -> Array:
+        with np.errstate(all="ignore"):
+            return np.asarray(dt * rate(point) / scale[:n])
+
+    tried = []
+    for start in STARTS:
+        at = np.where(free, start * scale, given)
+        # Math functions raise where numpy's return NaN.
+        with contextlib.suppress(ArithmeticError, ValueError):
+            tried.append(_least_moved(moved, at, free, scale, xtol=1e-14))
+    found: list[Array] = []
+    for point, left in tried:
+        apart = [np.max(np.abs(point - other) / scale) > ANOTHER for other in found]
+        if left <= AT_REST and all(apart):
+            found.append(point)
+    if not found:
+        best, least = min(tried, key=lambda each: each[1], default=(given, np.inf))
+        raise ValueError(
+            f"No steady state was found. The best is x_ss = {best[:n].tolist()}, the rest "
+            f"{best[n:].tolist()}, which moves in one sample by {least:.2g} scales. Leave more "
+            "entries free (NaN), give one that you know, or pass scale=..., how far each moves."
+        )
+    # A bioreactor that is washed out is at rest too, and no input brings it back.
+    found.sort(key=lambda each: _is_lost(rate, each, _size(each, n, scale[:n]), dt, sizes))
+    solved = np.count_nonzero(free)
+    notes = [f"Solved for the steady state: {solved} {'entry' if solved == 1 else 'entries'}."]
+    if solved > n:
+        notes[0] += f" The equations determine {n}: it is one of many. Give more entries."
+    elif len(found) > 1:
+        others = "; ".join(str([float(f"{v:.4g}") for v in other]) for other in found[1:])
+        notes[0] += f" There are others, {others}: give an entry that separates them."
+    return found[0], notes
+
+
+def _is_lost(rate: Rate, point: Array, size: Array, dt: float, sizes: tuple[int, int, int]) -> bool:
+    """Tell whether a mode that does not decay is out of reach of the inputs at a steady state."""
+    steps = np.diag(1e-4 * size)
+    try:
+        slopes = np.array([(rate(point + h) - rate(point - h)) / (2 * h.max()) for h in steps]).T
+        A, B, E = np.split(slopes, np.cumsum(sizes[:2]), axis=1)
+        A, B, _ = zero_order_hold(A, B, E, dt)
+        return unreached(A, B) is not None
+    except (ArithmeticError, ValueError):  # no value next to it
+        return True
+
+
+def _require_steady(rate: Rate, parts: list[Array], size: Array, dt: float, scaled: bool) -> None:
+    """Raise if the operating point moves too far in one sample; warn if that is not certain."""
+    x = parts[0]
+    moved = dt * np.abs(rate(np.concatenate(parts)))
+    if np.any(moved > STEADY * size):
+        at = ", ".join(f"{k}_ss = {part.tolist()}" for k, part in zip("xud", parts, strict=False))
+        raise ValueError(
+            f"{at} is no steady state: in one sample of {dt:g} the state moves by "
+            f"{moved.tolist()}, with a scale of {size.tolist()}. Set entries to NaN to have them "
+            "solved for."
+        )
+    if not scaled and np.any((moved > MOVES * np.abs(x)) & (x != 0) & (moved > 1e-8)):
+        warnings.warn(
+            f"In one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
+            f"{moved.tolist()}, much beside itself. Pass scale=..., how far each state moves.",
+            stacklevel=4,
+        )
+
+
+def _size(point: Array, n: int, scale: ArrayLike | None) -> Array:
+    """Return the scale of each state, input and disturbance, completed by their sizes."""
+    size: Array = np.maximum(np.nan_to_num(np.abs(point), nan=1.0), 1.0)
+    if scale is None:
+        return size
+    given = to_float("scale", scale)
+    k = point.size if given.shape == point.shape else n
+    size[:k] = check_positive_vector("scale", given, k)
+    return size

@@ -1,1 +1,0 @@
-"""Linear models from equations and simulators, by finite differences."""
