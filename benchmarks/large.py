@@ -32,7 +32,7 @@ def large(bench: Bench) -> None:
     if bench.quick:
         return
     mpc = three_free_masses()
-    found = {SOLVED: bench.watch.once(lambda: mpc.explicit(progress=True))}
+    found = {SOLVED: bench.watch.once(lambda: mpc.explicit())}
     law = mpc.explicit()
     online = mpc.online()
     theta = np.random.default_rng(0).uniform(-4, 4, (16, 256, 6))

@@ -16,12 +16,10 @@ from benchmarks import (
     evaluation,
     exactness,
     large,
-    memory,
     networks,
     offline,
     online,
     peers,
-    suite,
 )
 from benchmarks.problems import PROBLEMS, SMALLEST
 from benchmarks.records import Bench, Figure, Figures, heading, times
@@ -39,14 +37,10 @@ ON_THE_PAGE = {
     "region as well. All find the same number of regions.",
     exactness.SECTION: "A third to a fifth of the points are random in the box, the others on "
     "faces of every dimension of all regions. A plain scan looks for them, region by region.",
-    memory.SECTION: "",
-    suite.SECTION: "",
     large.SECTION: "",
     online.LAW: "",
-    online.TRAIN: "With a shared network, at observations that the law has met before.",
     online.EXACT: "The plan is solved for again, and its optimality checked.",
     deployment.SECTION: "",
-    deployment.SMALL: "",
 }
 """The sections of the page, and what each has to say; `make bench` prints all."""
 LEGEND = (

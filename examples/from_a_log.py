@@ -61,7 +61,7 @@ def main() -> None:
     if not twin.trusted:
         return
     model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": problem}, device="cpu")
-    found = improve(model, twin, progress_bar=True)
+    found = improve(model, twin)
     model.save(OUT / "from_a_log")
     print(f"\n{found}")
     ours = evaluate(model, "CSTR-v0", TESTS)

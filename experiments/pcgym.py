@@ -48,6 +48,7 @@ IN_SIMULATOR = f"{OURS}, `improve` in a simulator"
 FROM_A_LOG = f"{OURS}, from a log"
 FIXED = MPC, OFFSET_FREE, REIDENTIFIED, NMPC
 RIVALS: dict[str, type[Any]] = {"DDPG": DDPG, "TD3": TD3, "SAC": SAC, "PPO": PPO}
+CONTROLLERS = (*FIXED, OURS, IN_SIMULATOR, FROM_A_LOG, *RIVALS)
 TESTS = range(3000, 3030)
 LOG = 10  # episodes
 EPISODES = 50
@@ -286,7 +287,7 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
         base = outcomes.get(Run(plant, OFFSET_FREE, 0, 0))
         if base is None:
             continue
-        for name in (*FIXED, OURS, IN_SIMULATOR, FROM_A_LOG, *RIVALS):
+        for name in CONTROLLERS:
             at: dict[int, dict[int, tuple[Outcome, int]]] = {}
             for run, each in outcomes.items():
                 if run.plant == plant and run.learner.removesuffix(LONG) == name:
@@ -311,11 +312,19 @@ def _row(
     return plant, name, f"{steps:,}" if steps else "", shown, f"{worst:+.2f}", number(ms, 2)
 
 
+def by_controller(found: Sequence[tuple[str, ...]]) -> str:
+    """Return the rows as a table of a line for each controller: its cost, and its worst episode."""
+    cells = {(plant, name): f"{cost}; {worst}" for plant, name, _, cost, worst, _ in found}
+    names = [name for name in CONTROLLERS if any((plant, name) in cells for plant in PLANTS)]
+    lines = [[name, *(cells.get((plant, name), "") for plant in PLANTS)] for name in names]
+    return table(("controller", *PLANTS.values()), lines)
+
+
 def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
     """Quote the table in ``environments.md`` if it is there; return the paths that were written."""
     found = rows(outcomes)
     page = folder / "environments.md"
-    return [page] if found and quote(table(HEADER, found, texts=2), page, BEGIN, END) else []
+    return [page] if found and quote(by_controller(found), page, BEGIN, END) else []
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

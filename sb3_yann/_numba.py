@@ -13,6 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_yann._progress import is_watched
+
 Integers = NDArray[np.int64]
 Single = NDArray[np.float32]
 F = TypeVar("F", bound=Callable[..., Any])
@@ -71,8 +73,8 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
 
 @cache
 def _say(keep: bool) -> None:
-    """Say once, to a person at a terminal, what takes the time."""
-    if not sys.stderr.isatty():
+    """Say once, at a terminal or in a notebook, what takes the time."""
+    if not is_watched():
         return
     how_often = (
         "once after an installation" if keep else "at each start, for its folder takes no file"

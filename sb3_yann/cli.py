@@ -121,9 +121,7 @@ def _solve(options: Namespace) -> None:
         if not path.parent.is_dir():
             raise FileNotFoundError(f"There is no folder {path.parent}: make it first.")
     problem = _problem(options.problem)
-    law = problem.explicit(
-        time_limit=options.time_limit, region_limit=options.region_limit, progress=True
-    )
+    law = problem.explicit(time_limit=options.time_limit, region_limit=options.region_limit)
     print(problem.report())
     if options.save:
         law.save(options.save)

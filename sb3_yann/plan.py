@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, lqr
 from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond, mixed_half
@@ -292,7 +293,7 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
     if not len(active):
         return plans
     failed: Rows = np.zeros(k, dtype=np.intp)
-    for _ in range(rounds):
+    for _ in bar(f"{k} plans: rounds, at most", range(rounds)):
         old = plans.of(active)
         corrections, gains = _backward(plant, task, old, rows[active], damping[active])
         plans.gains[:, active] = gains

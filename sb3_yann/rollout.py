@@ -20,6 +20,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array, check_int, check_type, half_widths
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
@@ -263,7 +264,7 @@ def rollout(
                     of_episode(controller, i),
                     _Envs(envs, resets[i : i + most], problem, pool.each),
                 )
-                for i in range(0, len(seeds), max(most, 1))
+                for i in _shown(range(0, len(seeds), max(most, 1)))
             ]
         if pool is not plant:
             pool.close()
@@ -389,11 +390,13 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
     inputs = list[Array]()
     steps = list[_Step]()
     states = [np.array(shown, dtype=np.float64)]
+    passed = bar(f"{n} episode{'s' * (n > 1)}: steps", total=limit_of(plant.envs[0]))
     while running.any():
         actions = np.asarray(controller(len(inputs), shown, rows))
         step = plant.step(actions, rows)
         inputs.append(_scattered(actions, rows, n).astype(np.float64))
         states.append(_scattered(step.observations, rows, n).astype(np.float64))
+        passed.update()
         steps.append(_Step(*(_scattered(each, rows, n) for each in step)))
         running[rows] &= ~(step.terminated | step.truncated)
         if running.any():
@@ -401,6 +404,7 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
         live = np.ones(len(rows), dtype=bool) if plant.steps_all else running[rows]
         shown = step.observations[live]
         rows = rows[live]
+    passed.close()
     _, rewards, terminated, truncated, violated, succeeded, changed = map(
         np.array, zip(*steps, strict=True)
     )
@@ -431,6 +435,18 @@ def _scattered(values: NDArray[Any], rows: Rows, n: int) -> NDArray[Any]:
     found = np.zeros((n, *values.shape[1:]), dtype=values.dtype)
     found[rows] = values
     return found
+
+
+def limit_of(env: Any) -> int | None:
+    """Return after how many steps an env ends an episode, None where that is not known."""
+    if isinstance(env, gym.Env) and env.has_wrapper_attr("_max_episode_steps"):
+        return int(env.get_wrapper_attr("_max_episode_steps"))
+    return getattr(env, "max_episode_steps", None)
+
+
+def _shown(lots: Sequence[Any]) -> Iterable[Any]:
+    """Return lots of episodes that are played one after the other, under a bar if there are two."""
+    return bar("episodes", lots) if len(lots) > 1 else lots
 
 
 def joined(parts: Sequence[Trajectories]) -> Trajectories:

@@ -16,7 +16,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {"sb3_yann": ROOT, "sb3_yann_envs": ROOT / "envs"}
 
 FLOORS = [
-    {"sb3_yann._archive", "sb3_yann._validation", "sb3_yann._numba", "sb3_yann._drawing"},
+    {"sb3_yann._archive", "sb3_yann._validation", "sb3_yann._drawing"},
+    {"sb3_yann._progress"},
+    {"sb3_yann._numba"},
     {"sb3_yann.log", "sb3_yann.units"},
     {"sb3_yann.control"},
     {"sb3_yann.compare"},
@@ -46,6 +48,7 @@ there is; the command line uses it as any other script does."""
 FORBIDDEN = {
     "sb3_yann._archive": {"torch", "stable_baselines3", "gymnasium", "numba", "scipy", "sb3_yann"},
     "sb3_yann._validation": {"torch", "stable_baselines3", "gymnasium"},
+    "sb3_yann._progress": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._numba": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._drawing": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann.units": {"torch", "stable_baselines3", "gymnasium"},

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._progress import bar, shown
 from sb3_yann._validation import Array, check_bool, check_int, check_range
 from sb3_yann.commissioning.journal import (
     MPC,
@@ -99,6 +100,8 @@ class Commissioning:
         Of the episodes, the twins and the improvements.
     verbose : int, default 0
         1 prints each batch.
+    progress_bar : bool, default True
+        Whether to show, on stderr, what takes more than three seconds and how long.
 
     Raises
     ------
@@ -130,6 +133,7 @@ class Commissioning:
         updates: int = 4000,
         seed: int = 0,
         verbose: int = 0,
+        progress_bar: bool = True,
     ) -> None:
         self.accepted = AcceptedPolicy(model)
         self.policy = self.accepted.policy
@@ -148,6 +152,7 @@ class Commissioning:
         self.rounds = check_int("rounds", rounds)
         self.updates = check_int("updates", updates)
         self.seed = check_int("seed", seed, 0)
+        self.progress_bar = check_bool("progress_bar", progress_bar)
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
         self.observer = observer_of(model.get_env()) or observer_of(plant_env)
@@ -192,12 +197,17 @@ class Commissioning:
         check_int("batches", batches)
         if len(self.batches) >= batches:
             return self.batches
-        with one_env(self.plant_env) as env:
+        with shown(self.progress_bar), one_env(self.plant_env) as env:
             plant = Plant(env, self.model)
             try:
                 while len(self.batches) < batches:
+                    size = self._size_of_batch()
+                    played = bar(f"batch {len(self.batches) + 1}: episodes", total=size)
+                    played.update(len(self.journal.batch))
                     while not self._batch_is_over():
                         self._play(plant)
+                        played.update()
+                    played.close()
                     self._decide(plant)
             finally:
                 self.accepted.show()

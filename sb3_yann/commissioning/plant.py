@@ -14,6 +14,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
@@ -30,7 +31,7 @@ from sb3_yann.policy.checkpoint import (
 from sb3_yann.policy.checks import LOST_STATISTICS
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
-from sb3_yann.rollout import preserve_rng
+from sb3_yann.rollout import limit_of, preserve_rng
 from sb3_yann.twin.dynamics import law_of
 
 Inputs = Callable[[Array], Array]
@@ -160,6 +161,7 @@ class Plant:
         step = -1
         over = False
         space = cast(Any, self.env.action_space)
+        passed = bar("an episode of the plant: steps", total=limit_of(self.env))
         while not over:
             u = act(known[None])[0].astype(np.float32)
             wanted = u if act == self.policy else self.policy(known[None])[0]
@@ -190,10 +192,12 @@ class Plant:
                     step = len(actions)
                     act = self.mpc
             known = after
+            passed.update()
             thetas.append(known)
             actions.append(u.astype(np.float64))
             if len(actions) >= LONGEST:
                 raise RuntimeError(f"An episode of the plant did not end in {LONGEST} steps.")
+        passed.close()
         played = np.array(thetas), np.array(actions)
         return PlantEpisode(*played, reward, violations, alarm, step, apart, excited)
 

@@ -118,7 +118,7 @@ def decide(
                 break  # a smaller part gains less
     after = replace(after, rejections=0 if restored else rejections)
     regions = _accepted_regions(before, candidate, after.accepted) if reason else []
-    return after, _decision(after, tried.cost, reason, restored, regions, share)
+    return after, _decision(after, tried.cost, tried.played, reason, restored, regions, share)
 
 
 def decide_at_end(
@@ -142,6 +142,7 @@ def decide_at_end(
         return replace(evidence, lost=tuple(trial.starts.seeds[i] for i in lost)), None
 
     cost = evidence.mean_cost(evidence.scores)
+    played = evidence.n_played(evidence.scores)
     after, _ = _with_hard_starts(evidence.without_passed(tried), trial.starts, scores)
     mpc = after = replace(after, accepted=after.mpc, scores=after.starts.mpc)
     of_mpc = None if scores is None else trial.mpc_scores
@@ -158,7 +159,7 @@ def decide_at_end(
     after = replace(after, next_seed=seeds.next)
     regions = _accepted_regions(evidence.mpc, tried, after.accepted)
     reason = f"at the end, {verdict.reason}; {_what_acts(after, tried)}"
-    return after, _decision(after, cost, reason, True, regions)
+    return after, _decision(after, cost, played, reason, True, regions)
 
 
 def try_before_training(
@@ -169,7 +170,8 @@ def try_before_training(
     if scores is not None and verdict.accepted:
         return evidence.with_visited(candidate, scores), None
     cost = evidence.mean_cost(scores)
-    return evidence, _decision(evidence, cost, f"before training, {verdict.reason}", True)
+    played = evidence.n_played(scores)
+    return evidence, _decision(evidence, cost, played, f"before training, {verdict.reason}", True)
 
 
 def try_on_known(
@@ -203,11 +205,15 @@ def try_on_known(
 
 
 class _Tried(NamedTuple):
-    """What came of a candidate: its mean cost, its scores, and those it was compared with."""
+    """What came of a candidate: its mean cost over the known starts that it has played.
+
+    Then its scores there and on new starts, and those that it was compared with.
+    """
 
     evidence: Evidence
     verdict: Verdict
     cost: float
+    played: int
     scores: Scores | None = None
     others: Scores | None = None
 
@@ -218,27 +224,28 @@ def _accept(
     """Accept a candidate that is no worse on the known starts, and confirmed on new ones."""
     evidence, scores, verdict = try_on_known(evidence, candidate, play, settings)
     cost = evidence.mean_cost(scores)
+    played = evidence.n_played(scores)
     if scores is None:
-        return _Tried(evidence, verdict, cost)
+        return _Tried(evidence, verdict, cost, played)
     others = evidence.scores.at(slice(len(scores.costs)))
     if not verdict.accepted:
-        return _Tried(evidence, verdict, cost, scores, others)
+        return _Tried(evidence, verdict, cost, played, scores, others)
     after = evidence.with_visited(candidate, scores)
     if settings.n_new_starts == 0 or not after.accepted.has_learned():
-        return _Tried(after, verdict, cost, scores, others)
+        return _Tried(after, verdict, cost, played, scores, others)
     seeds = NewSeeds(evidence.next_seed)
     trial = _new_trial(evidence, play, seeds)
     new, verdict = _confirm(trial, after.accepted, settings)
     if verdict.accepted:
         after = replace(after, next_seed=seeds.next, new=trial.starts)
         after = after.with_passed(after.accepted)
-        return _Tried(after, verdict, cost, scores, others)
+        return _Tried(after, verdict, cost, played, scores, others)
     if new is not None:
         scores = scores.extended_by(new)
         others = others.extended_by(trial.mpc_scores)
     evidence = replace(evidence, next_seed=seeds.next)
     after = _after_loss(evidence, trial.starts, new, play)
-    return _Tried(after, verdict, cost, scores, others)
+    return _Tried(after, verdict, cost, played, scores, others)
 
 
 def _new_trial(
@@ -357,6 +364,7 @@ def _parts(
 def _decision(
     evidence: Evidence,
     candidate_cost: float,
+    played: int,
     reason: str,
     restored: bool,
     regions: Sequence[int] = (),
@@ -375,6 +383,7 @@ def _decision(
         candidate_cost=candidate_cost,
         accepted_cost=evidence.mean_cost(evidence.scores),
         mpc_cost=evidence.mean_cost(starts.mpc),
+        played=(played, evidence.n_played(evidence.scores), evidence.n_played(starts.mpc)),
         worst_start=float(np.max(more, initial=-np.inf)),
         regions=tuple(regions),
         share=share,

@@ -67,6 +67,10 @@ class Evidence:
         more = (costs - own).sum() / np.abs(own).sum()
         return float(mpc.mean() + more * np.abs(mpc).mean())
 
+    def n_played(self, scores: Scores | None) -> int:
+        """Return on how many known starts but the hard ones a policy has played."""
+        return 0 if scores is None else max(0, len(scores.costs) - self.starts.n_hard)
+
     def known_up_to(self, count: int, play: Play) -> Evidence:
         """Return the evidence with the accepted policy's scores on so many starts at least."""
         had = len(self.scores.costs)
@@ -123,7 +127,11 @@ class Decision:
     candidate_cost, accepted_cost, mpc_cost : float
         Mean cost of the candidate, the policy accepted now and the MPC, over the first
         ``n_eval_episodes``: the same in each decision. The hard starts that joined them are left
-        out. That of a candidate that could not be played is nan; the reason says why.
+        out. One that was decided on before it had played all has the MPC's mean, times what it
+        costs of the MPC's where it has played. That of a candidate that could not be played is
+        nan; the reason says why.
+    played : tuple of int
+        On how many of these starts the candidate, the accepted policy and the MPC have played.
     timestep, episode : int
         Steps and episodes of training until then.
     reason : str
@@ -154,6 +162,7 @@ class Decision:
     candidate_cost: float
     accepted_cost: float
     mpc_cost: float
+    played: tuple[int, int, int] = (0, 0, 0)
     worst_start: float = 0.0
     regions: tuple[int, ...] = ()
     step: float = 1.0
@@ -162,22 +171,23 @@ class Decision:
     def __str__(self) -> str:
         """Return a line for a reader."""
         reason = f" ({self.reason})" if self.reason else ""
-        costs = [
-            f"{who} {_with_change(cost, self.mpc_cost)}"
-            for who, cost in (
-                ("candidate", self.candidate_cost),
-                ("accepted policy", self.accepted_cost),
-            )
-        ]
-        shown = ", ".join([*costs, f"MPC {self.mpc_cost:.6g}"])
+        names = ("candidate", "accepted policy", "MPC")
+        costs = zip(names, self.costs_in_words(), strict=True)
+        shown = ", ".join(f"{who} {cost}" for who, cost in costs)
         return f"Episode {self.episode}: {self.verdict}{reason}; mean costs: {shown}"
 
-
-def _with_change(cost: float, mpc_cost: float) -> str:
-    if not math.isfinite(cost):
-        return "not known"
-    change = relative_change(cost, mpc_cost)
-    return f"{cost:.6g} ({100 * change:+.3g} %)" if math.isfinite(change) else f"{cost:.6g}"
+    def costs_in_words(self) -> list[str]:
+        """Return the three costs; of how many starts where that is not all."""
+        found = list[str]()
+        costs = self.candidate_cost, self.accepted_cost, self.mpc_cost
+        for cost, played in zip(costs, self.played, strict=True):
+            change = relative_change(cost, self.mpc_cost)
+            said = [f"{100 * change:+.3g} %"] * (len(found) < 2 and math.isfinite(change))
+            if 0 < played < self.played[-1]:
+                said.append(f"estimated from {played} of {self.played[-1]} starts")
+            number = f"{cost:.6g}" if math.isfinite(cost) else "not known"
+            found.append(f"{number} ({', '.join(said)})" if said else number)
+        return found
 
 
 def relative_change(cost: float, mpc_cost: float) -> float:
@@ -275,7 +285,8 @@ def as_csv(decisions: list[Decision]) -> str:
     writer = csv.DictWriter(text, [each.name for each in fields(Decision)])
     writer.writeheader()
     for each in decisions:
-        writer.writerow({**asdict(each), "regions": " ".join(map(str, each.regions))})
+        several = {name: " ".join(map(str, getattr(each, name))) for name in ("regions", "played")}
+        writer.writerow({**asdict(each), **several})
     return text.getvalue()
 
 

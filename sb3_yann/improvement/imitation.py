@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, relative_costs
 from sb3_yann.control import LinearMPC
@@ -185,7 +186,7 @@ def fit_layer(
     to = th.as_tensor(wanted[finite], dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
-    for k in range(updates if len(at) else 0):
+    for k in bar("the policy learns from plans: steps of Adam", range(updates if len(at) else 0)):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()

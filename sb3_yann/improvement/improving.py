@@ -17,6 +17,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.compare import change_in_percent, summary_lines
 from sb3_yann.control import LinearMPC
@@ -40,6 +41,7 @@ from sb3_yann.improvement.simulator import (
     one_step_error,
 )
 from sb3_yann.networks.yann import LawLayer
+from sb3_yann.plan import value_at_end
 from sb3_yann.policy.checkpoint import all_or_nothing
 from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.policies import (
@@ -172,7 +174,7 @@ def improve(
     updates: int = 4000,
     confine: bool = True,
     seed: int = 0,
-    progress_bar: bool = False,
+    progress_bar: bool = True,
 ) -> Improvement:
     """Improve a model's policy in a twin of its plant, or with a simulator; the plant sees nothing.
 
@@ -217,8 +219,8 @@ def improve(
         :meth:`YannPolicy.confine_correction`.
     seed : int, default 0
         Of the starts, the models and the batches. No other random numbers are drawn.
-    progress_bar : bool, default False
-        Whether to print a line for each part that is done.
+    progress_bar : bool, default True
+        Whether to show, on stderr, what takes more than three seconds and how long.
 
     Raises
     ------
@@ -255,30 +257,30 @@ def improve(
         check_int("max_steps", max_steps)
     check_int("seed", seed, 0)
     check_bool("confine", confine)
-    check_bool("progress_bar", progress_bar)
-    if isinstance(model, LinearMPC):
-        with preserve_rng():  # a seed of Stable-Baselines3 is a global one
-            model = DDPG(
-                YannPolicy,
-                twin.env() if isinstance(twin, PlantTwin) else maker(twin)(),
-                gamma=min(model.gamma, 0.99),
-                seed=seed,
-                device="cpu",
-                policy_kwargs={"problem": model, "networks": "shared"},
-            )
-    policy = require_yann_policy(model.policy, "improve")
-    if isinstance(twin, PlantTwin):
-        require_problem_of_twin(policy, twin.problem)
-        twin.require_trust()
-    work = _Work(policy, n_starts, rounds, updates, seed, _Progress(progress_bar, rounds))
-    if isinstance(twin, PlantTwin):
-        work.layer.confine(*twin.starts.shown) if confine else work.layer.confine(None, None)
-        found = work.in_twin(twin)
-        found = replace(found, source=repr(twin), episodes=len(twin.episodes))
-    else:
-        # A simulator is not the env that VecNormalize normalizes.
-        seen = None if model.get_vec_normalize_env() else policy.observation
-        found = replace(work.with_simulator(twin, max_steps, seen), source=name_of(twin))
+    with shown(progress_bar):
+        if isinstance(model, LinearMPC):
+            with preserve_rng():  # a seed of Stable-Baselines3 is a global one
+                model = DDPG(
+                    YannPolicy,
+                    twin.env() if isinstance(twin, PlantTwin) else maker(twin)(),
+                    gamma=min(model.gamma, 0.99),
+                    seed=seed,
+                    device="cpu",
+                    policy_kwargs={"problem": model, "networks": "shared"},
+                )
+        policy = require_yann_policy(model.policy, "improve")
+        if isinstance(twin, PlantTwin):
+            require_problem_of_twin(policy, twin.problem)
+            twin.require_trust()
+        work = _Work(policy, n_starts, rounds, updates, seed, _Progress(rounds))
+        if isinstance(twin, PlantTwin):
+            work.layer.confine(*twin.starts.shown) if confine else work.layer.confine(None, None)
+            found = work.in_twin(twin)
+            found = replace(found, source=repr(twin), episodes=len(twin.episodes))
+        else:
+            # A simulator is not the env that VecNormalize normalizes.
+            seen = None if model.get_vec_normalize_env() else policy.observation
+            found = replace(work.with_simulator(twin, max_steps, seen), source=name_of(twin))
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}
     prints = fingerprint(policy.actor.state_dict())
@@ -298,36 +300,33 @@ def fingerprint(state: dict[str, th.Tensor]) -> str:
 
 
 class _Progress:
-    """Lines that say what is done: they read as well in a file as on a screen."""
+    """Lines that say what is done, and how long the rest takes at most."""
 
-    def __init__(self, shown: bool, rounds: int) -> None:
-        self.shown = shown
+    def __init__(self, rounds: int) -> None:
         self.rounds = rounds
-        self.begun = time.monotonic()
+        self.write = Progress()
         self.simulator: Simulator | None = None
         self.ends: list[float] = []  # when the data were there, and when each round was over
 
     def __call__(self, text: str, pairs: int = 0) -> None:
-        """Print a line; ``pairs`` of a confirmation have been played."""
-        if not self.shown:
-            return
-        now = time.monotonic() - self.begun
-        steps = ""
-        left = ""
-        if self.simulator:
-            steps = f" {self.simulator.steps:>9,} steps"
+        """Write a line; ``pairs`` of a confirmation have been played."""
+        left = None
         if len(self.ends) > 1:
             each = (self.ends[-1] - self.ends[0]) / (len(self.ends) - 1)
             over = self.rounds if pairs else len(self.ends) - 1
-            seconds = each * (self.rounds - over)
+            left = each * (self.rounds - over)
             if self.simulator:
-                seconds += self.simulator.seconds_of(2 * max(LOOKS[-1] - pairs, 0))
-            left = f", at most {seconds:.0f} s left"
-        print(f"[{now:5.0f} s{steps}{left}] {text}", flush=True)
+                left += self.simulator.seconds_of(2 * max(LOOKS[-1] - pairs, 0))
+        self.write(text, left)
+
+    def begin(self, simulator: Simulator) -> None:
+        """Count the steps of a simulator."""
+        self.simulator = simulator
+        self.write.steps = lambda: simulator.steps
 
     def end_of_round(self) -> None:
         """Note the time, from which what is left follows."""
-        self.ends.append(time.monotonic() - self.begun)
+        self.ends.append(time.monotonic())
 
 
 class _Work:
@@ -390,7 +389,6 @@ class _Work:
     def in_twin(self, twin: PlantTwin) -> Improvement:
         """Plan in the members of a twin, imitate, and check on every member."""
         self.keep_margin(twin.dynamics.row, twin.episodes)
-        self.say(f"the MPC from {self.n_starts} starts in each member; at first this compiles code")
         trial = Trial.draw(twin, self.n_starts, self.rng)
         before = self._check_in(trial) if self.has_learnt else None
         best = before.change if before is not None and before.accepted else 0.0
@@ -478,13 +476,13 @@ class _Work:
 
         ``seen`` makes theta of what it shows.
         """
-        self.say("episodes of the MPC; where it is the first time code is compiled, up to a minute")
         simulator = Simulator(self.problem, env, self.seed, max_steps, seen)
-        self.say.simulator = simulator
+        self.say.begin(simulator)
         before: Check | None = None
         note = ""
         accepted = False
         try:
+            value_at_end(self.problem)  # raises where the law cannot rest: no plan could be made
             simulator.begin()
             self.keep_margin(simulator.row, simulator.episodes)
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")

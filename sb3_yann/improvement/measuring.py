@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array, check_bool, check_int
+from sb3_yann._progress import Progress, shown
+from sb3_yann._validation import Array, check_int
 from sb3_yann.compare import change_in_percent, less_safe, paired_rows, summary_lines
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.augmented import SHARE
@@ -24,7 +25,7 @@ from sb3_yann.improvement.simulator import (
     of_law,
     task_of,
 )
-from sb3_yann.plan import PAUSE, Planning, TwinPlant
+from sb3_yann.plan import PAUSE, Planning, TwinPlant, value_at_end
 from sb3_yann.rollout import Controller, Rows, Source, Trajectories, maker
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import as_episodes
@@ -231,7 +232,7 @@ def headroom(
     n_starts: int = 30,
     seed: int = 0,
     max_steps: int | None = None,
-    progress_bar: bool = False,
+    progress_bar: bool = True,
 ) -> Headroom:
     """Return what a nearly optimal controller would gain over an MPC, and why.
 
@@ -261,8 +262,8 @@ def headroom(
         Of the first start.
     max_steps : int, optional
         Of the env, for everything. Where they do not suffice, the rest is left out.
-    progress_bar : bool, default False
-        Whether to print a line for each part that is done.
+    progress_bar : bool, default True
+        Whether to show, on stderr, what takes more than three seconds and how long.
 
     Raises
     ------
@@ -285,9 +286,8 @@ def headroom(
     check_int("seed", seed, 0)
     if max_steps is not None:
         check_int("max_steps", max_steps)
-    check_bool("progress_bar", progress_bar)
-    search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), max_steps, progress_bar)
-    with warnings.catch_warnings():
+    search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), max_steps)
+    with shown(progress_bar), warnings.catch_warnings():
         warnings.simplefilter("ignore", OnlineLawWarning)
         return search.found()
 
@@ -301,12 +301,9 @@ class _Search:
         given: Source | PlantTwin,
         seeds: range,
         max_steps: int | None,
-        shown: bool,
     ) -> None:
         self.mpc = mpc
         self.seeds = seeds
-        self.shown = shown
-        self.begun = time.monotonic()
         self.twin = given if isinstance(given, PlantTwin) else None
         if self.twin is not None:
             self.twin.require_trust()
@@ -320,6 +317,7 @@ class _Search:
                 )
         source = given.env if isinstance(given, PlantTwin) else maker(given)
         self.simulator = Simulator(mpc, source, seeds[0], max_steps)
+        self.progress = Progress(lambda: self.simulator.steps)
         self.source = "the twin" if self.twin is not None else self.simulator.name
         self.random = self.poor = False
         self.law: Controller = of_law(mpc)  # the better one, of the MPC and with another model
@@ -332,6 +330,7 @@ class _Search:
         """Play all of it, and return the figures."""
         note = ""
         try:
+            value_at_end(self.mpc)  # raises where the law cannot rest: no plan could be made
             self.play_mpc()
             for stage in (self.observe, self.reidentify, self.plan):
                 stage()
@@ -346,12 +345,10 @@ class _Search:
             self.simulator.close()
         return self.figures(note)
 
-    def say(self, text: str) -> None:
-        """Print a line with the time, the steps so far, and the gain that was found."""
-        if self.shown:
-            taken = f"[{time.monotonic() - self.begun:5.0f} s {self.simulator.steps:>9,} steps]"
-            gained = f"{0.0 - 100 * gain(self.base.costs, self.best):+.2f} %"
-            print(f"{taken} {text}; the best so far: {gained}", flush=True)
+    def say(self, text: str, left: float | None = None) -> None:
+        """Write a line with the gain that was found."""
+        gained = f"{0.0 - 100 * gain(self.base.costs, self.best):+.2f} %"
+        self.progress(f"{text}; the best so far: {gained}", left)
 
     @property
     def best(self) -> Array:
@@ -451,10 +448,10 @@ class _Search:
             costlier = loops.costs - planning.promised(len(now))
             kept = safe & (costlier <= KEPT * np.abs(base.costs).mean())
             todo = np.setdiff1d(todo, now[kept])
-            left = (ROUNDS - 1 - number) * (time.monotonic() - began) * bool(len(todo))
             self.say(
-                f"plans, round {number + 1} of at most {ROUNDS}, at most {left:.0f} s left: "
-                f"{kept.sum()} of {len(now)} kept what they promised"
+                f"plans, round {number + 1} of at most {ROUNDS}: {kept.sum()} of {len(now)} kept "
+                "what they promised",
+                (ROUNDS - 1 - number) * (time.monotonic() - began) * bool(len(todo)),
             )
             if not len(todo) or (number and self.random and not self.poor):  # noise is not learnt
                 break

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_yann._progress import bar, shown
 from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import (
     below_set_points,
@@ -103,7 +104,8 @@ def _play_there(
     count: _Count,
 ) -> tuple[Trajectories, int]:
     """Return episodes, and how many steps they took: in another process."""
-    played = rollout(controller, lambda: _Counted(make(), count), seeds, problem=problem)
+    with shown(False):  # many at once would write over each other
+        played = rollout(controller, lambda: _Counted(make(), count), seeds, problem=problem)
     return played, count.steps
 
 
@@ -492,7 +494,7 @@ class Scenarios:
         low = problem.deviations.u_min
         high = problem.deviations.u_max
         with np.errstate(all="ignore"):
-            for t in range(steps):
+            for t in bar(f"{k} episodes in the model: steps", range(steps)):
                 rows[t][:, row.given] = self.given[t]
                 u = np.asarray(controller(t, row.shown(rows[t]), numbers))
                 inputs[t] = np.clip(np.nan_to_num(u), low, high)

@@ -57,7 +57,7 @@ def report(
     plant and the problem in plant units, the register of constraints, the law and how it was
     checked, closed loops against the MPC, what they prove, where and how far the policy leaves the
     MPC, every decision of the guard, what `improve` did, the twin, the headroom, timing, versions
-    and seeds. A part whose evidence is not given says so in a sentence.
+    and seeds. A part without evidence is left out.
 
     Parameters
     ----------
@@ -148,15 +148,19 @@ def _body(title: str, parts: Sequence[Part]) -> list[Html]:
     written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     rows = []
     links = []
-    sections = []
+    sections = list[Html]()
     counts = Counter[str]()
-    for k, part in enumerate(parts, start=1):
-        links.append(tag("li", tag("a", part.title, href=f"#part-{k}")))
-        heading = tag("h2", f"{k}. {part.title}", id=f"part-{k}")
-        sections.append(tag("section", heading, part.content))
+    for part in parts:
+        k = len(sections) + 1
+        place: Html | str = ""
+        if part.content:
+            place = tag("a", str(k), href=f"#part-{k}")
+            links.append(tag("li", tag("a", part.title, href=f"#part-{k}")))
+            heading = tag("h2", f"{k}. {part.title}", id=f"part-{k}")
+            sections.append(tag("section", heading, part.content))
         for found in part.findings:
             verdict = tag("span", found.verdict, class_=found.verdict)
-            rows.append([verdict, found.text, tag("a", str(k), href=f"#part-{k}")])
+            rows.append([verdict, found.text, place])
             counts[found.verdict] += 1
     summary = f"{counts['passed']} checks passed, {counts['failed']} failed."
     if counts["look"]:

@@ -141,7 +141,7 @@ def statistics_part(subject: Subject) -> Part:
     """Return what the closed loops prove, in words."""
     title = "Statistics in words"
     if subject.loops is None:
-        return left_out(title, NO_ENV)
+        return left_out(title)
     mpc = subject.loops[MPC]
     policy = subject.loops[POLICY]
     change = policy.costs - mpc.costs
@@ -334,13 +334,9 @@ def guard_part(subject: Subject) -> Part:
     title = "Decisions of the guard"
     state = subject.state
     if state is None:
-        why = (
-            "No guard was at work on this model: nothing has confirmed the policy on new starts. "
-            "Pass an ImprovementGuard to learn."
-        )
         if subject.improved is not None:
-            why = "No guard was at work on this model. What confirmed the policy is the next part."
-        return left_out(title, why, Finding("note", "No guard was at work."))
+            return left_out(title)
+        return left_out(title, "No guard was at work: nothing has confirmed it on new starts.")
     passed: bool | None = state.accepted.is_actor_of(subject.policy)
     text = "The policy is the one that the guard accepted last."
     if not passed and subject.improved is not None:
@@ -388,8 +384,7 @@ def _decisions(decisions: Sequence[Decision]) -> list[Html]:
             reasons.append(f"accepted in regions {', '.join(map(str, each.regions))}")
         if 0 < each.share < 1:
             reasons.append(f"accepted {each.share:g} of the way")
-        costs = (each.candidate_cost, each.accepted_cost, each.mpc_cost)
-        row = [str(k), str(each.episode), each.verdict, *(f"{cost:.6g}" for cost in costs)]
+        row = [str(k), str(each.episode), each.verdict, *each.costs_in_words()]
         rows.append([*row, "yes" if each.restored else "", "; ".join(filter(None, reasons))])
     text = f"All {len(decisions)} decisions, with mean costs over the guard's starts."
     return [tag("h3", "Every decision"), paragraph(text), table(head, rows)]
@@ -400,7 +395,7 @@ def improve_part(subject: Subject) -> Part:
     title = "What improve did"
     found = subject.improvements
     if not found:
-        return left_out(title, "improve was not at work on this model.")
+        return left_out(title)
     now = subject.improved
     state = subject.state
     if now is not None:
@@ -444,7 +439,7 @@ def twin_part(subject: Subject) -> Part:
     twin = subject.twin
     title = "The twin and its verdict"
     if twin is None:
-        return left_out(title, "No twin was given: pass report(model, twin=...) to show it.")
+        return left_out(title)
     text = "The twin is trusted." if twin.trusted else "The twin is NOT trusted."
     caption = (
         "Left: costs of held-out episodes. Right: how the error of free runs grows with the steps "
@@ -460,8 +455,7 @@ def headroom_part(subject: Subject) -> Part:
     found = subject.headroom
     title = "Headroom"
     if found is None:
-        why = "No headroom was given: pass report(model, headroom=headroom(mpc, env)) to show it."
-        return left_out(title, why)
+        return left_out(title)
     caption = "The gain over the MPC part by part; the bar of the total has its standard error."
     shown = picture(partial(plot_headroom, found), caption)
     text = f"Headroom: {100 * found.total:.2f} % below the MPC's mean cost"

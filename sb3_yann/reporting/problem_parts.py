@@ -124,8 +124,6 @@ def constraints_part(subject: Subject) -> Part:
         f"{len(plans)} drawn at random from the box of parameters.",
         f"The terminal set has {len(last)} half-spaces." if len(last) else "No terminal set.",
     ]
-    if not loops:
-        sentences.append("Without an env, what closed loops do to the bounds is left out.")
     findings = _bound_findings(problem, loops) if loops else ()
     return Part("Constraints register", join([paragraph(*sentences), table(head, rows)]), findings)
 

@@ -218,9 +218,9 @@ class Part:
     findings: tuple[Finding, ...] = ()
 
 
-def left_out(title: str, why: str, *findings: Finding) -> Part:
-    """Return a part that says in a sentence why it is not there."""
-    return Part(title, tag("p", why, class_="said"), findings)
+def left_out(title: str, note: str = "") -> Part:
+    """Return a part that is not shown; the summary may have a note on that."""
+    return Part(title, join([]), (Finding("note", note),) if note else ())
 
 
 def _as_controller(act: Callable[[Any], Any]) -> Controller:

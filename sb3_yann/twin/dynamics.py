@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.twin.log import Episode
@@ -296,7 +297,7 @@ class Dynamics:
         rows = np.empty((steps + 1, *starts.shape))
         taken = np.empty((steps, *starts.shape[:2], self.m))
         rows[0] = starts
-        for t in range(steps):
+        for t in bar("episodes in a model: steps", range(steps)):
             if given is not None:
                 rows[t][..., self.row.given] = given[t]
             taken[t] = inputs(t, rows[t])

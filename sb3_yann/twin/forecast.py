@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.twin.dynamics import Dynamics, law_of
@@ -214,7 +215,7 @@ def forecast(
     begins = [np.stack([each.thetas[:1] for each in episodes]), drawn.reshape(count, some, -1)]
     found: list[tuple[float, float, float, str]] = []
     plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
-    for judge in judges:
+    for judge in bar("forecasts by models of the log", judges):
         law = law_of(judge.dynamics.problem)
         for remembers in (False, True):
             if (judge.refuted and not remembers) or (remembers and not own.explains):

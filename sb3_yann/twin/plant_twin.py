@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sb3_yann._progress import shown
 from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.linear_system import labels_of
@@ -126,6 +127,7 @@ class PlantTwin(LearntModel):
         updates: int = 3000,
         seed: int = 0,
         units_confirmed: bool = False,
+        progress_bar: bool = True,
     ) -> PlantTwin:
         """Return the twin of a plant that was logged.
 
@@ -157,6 +159,8 @@ class PlantTwin(LearntModel):
             1.7 times the model's looks like an input in other units, and a controller that is a
             multiple of the law like another zero or scale: such a log is not trusted unless you
             say so. Where the MPC made the log its inputs are proven, and nothing needs saying.
+        progress_bar : bool, default True
+            Whether to show what takes more than three seconds.
 
         Raises
         ------
@@ -193,33 +197,36 @@ class PlantTwin(LearntModel):
         blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
         draws = np.random.default_rng(seed).integers(len(blocks), size=(n_members - 1, len(blocks)))
         drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
-        # The model as it is comes first, to compare with, whether it may be chosen or not.
-        choices = candidates(coordinates, parts, residuals)
-        first = int("none" not in residuals and len(residuals) > 0)
-        alone = first == len(choices)
-        runs = held_out(coordinates, parts, choices)
-        chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
-        known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
-        long = sum(map(len, parts)) >= ROWS and len(parts) > 1
-        members: list[Residual] = []
-        if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
-            kept = without_each_fold(parts)
-            networks = fit_ensemble(
-                coordinates, [*kept, *drawn], seed, ahead=AHEAD, updates=updates
-            )
-            choices.append(Candidate("network", tuple(networks[: len(kept)])))
+        with shown(progress_bar):
+            # The model as it is comes first, to compare with, whether it may be chosen or not.
+            choices = candidates(coordinates, parts, residuals)
+            first = int("none" not in residuals and len(residuals) > 0)
+            alone = first == len(choices)
             runs = held_out(coordinates, parts, choices)
-            chosen = runs.choose(first) if len(parts) > 1 else first
-            members = networks[len(kept) :]
+            chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
             known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
-        choice = choices[chosen]
-        if choice.setting is not None:
-            members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
-        elif choice.name == "none":
-            members = [Residual.zero(len(coordinates.scale), problem.model.n_states)] * n_members
-        dynamics = Dynamics(problem, coordinates, tuple(members))
-        trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
-        found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
+            long = sum(map(len, parts)) >= ROWS and len(parts) > 1
+            members: list[Residual] = []
+            if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
+                kept = without_each_fold(parts)
+                networks = fit_ensemble(
+                    coordinates, [*kept, *drawn], seed, ahead=AHEAD, updates=updates
+                )
+                choices.append(Candidate("network", tuple(networks[: len(kept)])))
+                runs = held_out(coordinates, parts, choices)
+                chosen = runs.choose(first) if len(parts) > 1 else first
+                members = networks[len(kept) :]
+                known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
+            choice = choices[chosen]
+            if choice.setting is not None:
+                members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
+            elif choice.name == "none":
+                members = [
+                    Residual.zero(len(coordinates.scale), problem.model.n_states)
+                ] * n_members
+            dynamics = Dynamics(problem, coordinates, tuple(members))
+            trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
+            found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
         return cls(problem, log, dynamics, choice.name, trust, notes, found)
 
     @property
@@ -231,6 +238,7 @@ class PlantTwin(LearntModel):
         """Raise UntrustedTwinError, with its reasons, unless the twin is trusted."""
         if not self.trusted:
             said = " ".join([*self.trust.problems, *self.trust.advice])
+            said += " Until then the MPC stays: export(mpc, path) writes it."
             raise UntrustedTwinError(f"The twin is not to be trusted: {said}")
 
     def report(self) -> str:

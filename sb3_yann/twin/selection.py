@@ -16,6 +16,7 @@ import torch as th
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import linalg
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearModel, LinearMPC, Terminal
 from sb3_yann.control.linear_system import labels_of
@@ -154,7 +155,7 @@ class _Networks:
         """Yield before each gradient; then step."""
         adam = th.optim.Adam(self.weights, lr=rate)
         schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
-        for _ in range(updates):
+        for _ in bar("networks of a model: steps of Adam", range(updates)):
             adam.zero_grad()
             yield
             th.nn.utils.clip_grad_norm_(self.weights, 10.0)
@@ -353,7 +354,7 @@ def held_out(
     longest = min(LONGEST, int(np.median([*map(len, parts)])))
     horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
     errors = np.empty((len(choices), len(parts), len(horizons)))
-    for i, episode in enumerate(parts):
+    for i, episode in enumerate(bar("candidates on held-out episodes", parts)):
         for same in _alike(choices):
             made = [choices[j].by_fold[i % FOLDS] for j in same]
             errors[same, i] = _errors(coordinates, episode, made, horizons)

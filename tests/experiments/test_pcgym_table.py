@@ -39,7 +39,7 @@ def test_rows_are_medians_against_the_offset_free_mpc(tmp_path):
     page = tmp_path / "environments.md"
     page.write_text(f"before\n{pcgym.BEGIN}old\n{pcgym.END}after\n", encoding="utf-8")
     assert pcgym.write_report(OUTCOMES, tmp_path) == [page]
-    assert "-1.00 (-2.00 to +0.00)" in page.read_text(encoding="utf-8")
+    assert "-1.00 (-2.00 to +0.00); +1.00 |" in page.read_text(encoding="utf-8")
     assert pcgym.write_report({}, tmp_path) == pcgym.rows({}) == []
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from sb3_yann import Controller, export
 from sb3_yann.commissioning.journal import Record
@@ -30,9 +28,8 @@ LONGEST_WRITE = 0.08  # s
 
 
 @pytest.fixture(autouse=True, scope="module")
-def no_lock_is_shared() -> None:
-    """Solve the laws before any fork: a child that is killed keeps tqdm's lock."""
-    tqdm.set_lock(threading.RLock())
+def laws_are_solved() -> None:
+    """Solve the laws before any fork."""
     for version in range(2):
         law(version)
 

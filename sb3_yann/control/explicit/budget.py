@@ -1,14 +1,14 @@
-"""Limits of the search for the regions of a law, and its progress."""
+"""Limits of the search for the regions of a law."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
-from tqdm import tqdm  # type: ignore[import-untyped]
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import check_int, check_positive
 
 _ADVICE = (
@@ -35,12 +35,11 @@ class ExplicitLimitError(RuntimeError):
 class SolveBudget:
     """How long a search may take: in seconds, regions, and effort, see :class:`BudgetTimer`.
 
-    None is no limit. ``progress`` shows a bar that counts regions.
+    None is no limit.
     """
 
     time_limit: float | None = None
     region_limit: int | None = None
-    progress: bool = False
     effort_limit: float | None = None
 
     def __post_init__(self) -> None:
@@ -72,7 +71,7 @@ class BudgetTimer:
         self.found = 0
         self._start = time.monotonic()
         self._done = ""
-        self._bar = self._new_bar("Critical regions", None)
+        self._bar = bar("critical regions")
 
     def __enter__(self) -> BudgetTimer:
         return self
@@ -93,7 +92,7 @@ class BudgetTimer:
         """Begin to show another stage, of so many steps; ``done`` says what has been before."""
         self._bar.close()
         self._done = f" {done}"
-        self._bar = self._new_bar(name, steps)
+        self._bar = bar(name, total=steps)
 
     def advance(self, more: int = 1, effort: float = 0.0) -> None:
         """Count steps of a stage; raise ExplicitLimitError if the time is over."""
@@ -114,10 +113,6 @@ class BudgetTimer:
         """Return for how many seconds the search may go on, infinite without a limit."""
         most = self.budget.time_limit
         return np.inf if most is None else max(0.0, self._start + most - time.monotonic())
-
-    def _new_bar(self, name: str, total: int | None) -> Any:
-        hidden = not self.budget.progress
-        return tqdm(desc=name, total=total, unit=" regions", leave=False, disable=hidden)
 
     def _stop(self, what: str) -> NoReturn:
         found = f"{self.found} regions were found in {time.monotonic() - self._start:.1f} s"

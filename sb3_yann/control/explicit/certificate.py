@@ -77,7 +77,7 @@ class Certificate:
         self._collect()
         self.balls = [region.ball() for region in self.regions]
         # Two looks at each region.
-        self.timer.stage("Checked", "and not all were checked", 2 * len(self.balls))
+        self.timer.stage("regions checked", "and not all were checked", 2 * len(self.balls))
         for i, (middle, _) in enumerate(self.balls):
             if not self._is_right(i, middle):
                 self._fail(f"the law of region {i} is not optimal inside it", middle)

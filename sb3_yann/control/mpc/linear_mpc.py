@@ -399,7 +399,6 @@ class LinearMPC(MPCProblem):
         *,
         time_limit: float | None = None,
         region_limit: int | None = None,
-        progress: bool = False,
     ) -> PiecewiseAffine:
         """Return the explicit law theta -> u_0, solved once, checked, and kept.
 
@@ -416,8 +415,6 @@ class LinearMPC(MPCProblem):
             does not count. A law that was kept takes none.
         region_limit : int, optional
             The most regions that the law may have. ppopt counts them only at its end.
-        progress : bool, default False
-            Show how many regions were found so far.
 
         Raises
         ------
@@ -428,7 +425,7 @@ class LinearMPC(MPCProblem):
         ExplicitSolutionError
             If the solution fails its check; the message says where.
         """
-        return self._solved(SolveBudget(time_limit, region_limit, progress), solver)
+        return self._solved(SolveBudget(time_limit, region_limit), solver)
 
     def _solved(self, budget: SolveBudget, solver: str = "walk") -> PiecewiseAffine:
         """Return the explicit law, solved within a budget unless it is there."""

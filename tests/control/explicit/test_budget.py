@@ -1,4 +1,4 @@
-"""The choice of a solver, limits and progress of `LinearMPC.explicit`."""
+"""The choice of a solver and limits of `LinearMPC.explicit`."""
 
 from __future__ import annotations
 
@@ -49,15 +49,6 @@ def test_too_long_a_search_is_an_error_that_says_what_to_change(solver: str) -> 
 def test_bad_limit_is_named(limits: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         benchmark().explicit(**limits)
-
-
-def test_progress_goes_to_the_error_stream_and_only_if_asked_for(capfd: Any) -> None:
-    benchmark().explicit()
-    assert capfd.readouterr() == ("", "")
-    benchmark().explicit(progress=True)
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert all(stage in err for stage in ("Critical regions", "Checked"))
 
 
 def test_a_law_that_is_there_keeps_to_the_limit_of_regions() -> None:

@@ -1,0 +1,102 @@
+"""What is waited for, on stderr: nothing for three seconds, then a bar; in a file a few lines."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+from tqdm import tqdm  # type: ignore[import-untyped]
+
+from sb3_yann._validation import check_bool
+
+DELAY = 3.0  # seconds that pass without a word
+APART = 30.0  # seconds between two states of bars in a file
+
+_silent = ContextVar("silent", default="TQDM_DISABLE" in os.environ)
+
+
+def is_watched() -> bool:
+    """Return whether stderr is a terminal or a notebook, rather than a file or another's bar."""
+    if type(sys.stderr).__module__.startswith("ipykernel"):
+        return True
+    own = sys.__stderr__
+    return own is not None and sys.stderr is own and own.isatty()
+
+
+@contextmanager
+def shown(progress_bar: bool) -> Iterator[None]:
+    """Show what takes long, unless it is False here or further out."""
+    check_bool("progress_bar", progress_bar)
+    token = _silent.set(_silent.get() or not progress_bar)
+    try:
+        yield
+    finally:
+        _silent.reset(token)
+
+
+class _Bar(tqdm):  # type: ignore[misc]
+    """A bar without tqdm's thread; a process that is killed leaves no lock behind."""
+
+    monitor_interval = 0
+
+
+_Bar.set_lock(threading.RLock())
+
+
+class _Lines:
+    """A file in which bars leave their state, a line every thirty seconds."""
+
+    def __init__(self) -> None:
+        self.latest = -APART
+
+    def write(self, text: str) -> None:
+        """Write what a bar shows, unless there was a line of late."""
+        now = time.monotonic()
+        if text.strip() and now >= self.latest + APART:
+            self.latest = now
+            print(text.strip(), file=sys.stderr)
+
+    def flush(self) -> None:
+        """Make it seen."""
+        sys.stderr.flush()
+
+
+_LINES = _Lines()
+
+
+def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None) -> Any:
+    """Return a bar over items, or one to ``update``; those inside each other share a line."""
+    return _Bar(
+        items,
+        desc=what,
+        total=total,
+        delay=DELAY,
+        leave=False,
+        miniters=1,
+        position=0,
+        file=sys.stderr if is_watched() else _LINES,
+        disable=_silent.get(),
+    )
+
+
+class Progress:
+    """Lines with the time and the steps so far, once a call has taken three seconds."""
+
+    def __init__(self, steps: Callable[[], int] | None = None) -> None:
+        self.begun = time.monotonic()
+        self.steps = steps
+
+    def __call__(self, text: str, left: float | None = None) -> None:
+        """Write a line; ``left`` are the seconds that the rest takes at most."""
+        passed = time.monotonic() - self.begun
+        if _silent.get() or passed < DELAY:
+            return
+        steps = "" if self.steps is None else f" {self.steps():>9,} steps"
+        most = "" if left is None else f", at most {left:.0f} s left"
+        _Bar.write(f"[{passed:5.0f} s{steps}{most}] {text}", file=sys.stderr)
