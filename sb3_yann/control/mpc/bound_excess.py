@@ -79,8 +79,7 @@ class Bounds:
         if np.any(L) or np.any(H):
             low = np.maximum(low, own_low + thetas @ L.T)
             high = np.minimum(high, own_high + thetas @ H.T)
-        above = np.maximum((y - high) / self.half - room, 0)
-        return np.asarray(above - np.maximum((low - y) / self.half - room, 0))
+        return _beyond(y, low, high, self.half, room)
 
 
 def mixed_half(problem: MPCProblem) -> Array:
@@ -99,8 +98,12 @@ def mixed_beyond(problem: MPCProblem, thetas: Array, inputs: Array, room: float 
     half = mixed_half(problem)
     low, high = problem.limits_at("mixed", thetas)
     made = thetas[..., problem.layout.state] @ mixed.F.T + inputs @ mixed.G.T
-    above = np.maximum((made - high) / half - room, 0)
-    return np.asarray(above - np.maximum((low - made) / half - room, 0))
+    return _beyond(made, low, high, half, room)
+
+
+def _beyond(values: Array, low: Array, high: Array, half: Array, room: float) -> Array:
+    above = np.maximum((values - high) / half - room, 0)
+    return np.asarray(above - np.maximum((low - values) / half - room, 0))
 
 
 class BoundNames(NamedTuple):
@@ -201,24 +204,15 @@ def bound_excess(
     if not counts.any():  # mostly
         return BoundExcess(nothing, nothing, nothing, nothing, nothing - 1)
     over = np.where(counts, np.where(np.isnan(over), np.inf, over), 0.0)
-    first = len(bounds.half)
-    count = over.shape[-1]
-    softness = np.zeros(count)
-    half = np.ones(count)
-    own = np.zeros((3, count), dtype=bool)
-    softness[:first] = bounds.softness
-    half[:first] = bounds.half
-    own[0, :first] = bounds.of_states
-    own[1, :first] = ~bounds.of_states
-    if len(problem.mixed.F):
-        last = np.arange(count - len(problem.mixed.F), count)
-        softness[last] = problem.mixed.soft
-        half[last] = mixed_half(problem)
-        own[2, last] = True
+    mixed = problem.mixed.soft
+    of_inputs = over.shape[-1] - len(bounds.half) - len(mixed)
+    softness = np.concatenate([bounds.softness, np.zeros(of_inputs), mixed])
+    half = np.concatenate([bounds.half, np.ones(of_inputs), mixed_half(problem)])
+    slacks = np.concatenate([~bounds.of_states, np.full(of_inputs, -1), np.full(len(mixed), 2)])
     hard = softness <= 0
     penalty = nothing
-    for part in own:  # each of them shares a slack
-        soft = part & ~hard
+    for slack in range(3):  # of states, of outputs, of mixed bounds
+        soft = (slacks == slack) & ~hard
         if np.any(soft):
             s = np.max(over[..., soft] * (half[soft] / softness[soft]), axis=-1)
             penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
