@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -37,13 +37,6 @@ Controller = Callable[[int, NDArray[Any], Rows], NDArray[Any]]
 LONG_EPISODE = 100_000  # steps of an episode after which a warning is given
 MAX_EPISODE_STEPS = 1_000_000
 """Steps of an episode after which it counts as endless, which is an error."""
-
-
-class Predictor(Protocol):
-    """What Stable-Baselines3's models and policies offer."""
-
-    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
-        """Return the actions for a batch of observations, and a recurrent state."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +173,7 @@ class EnvPool:
 
 
 def evaluate(
-    policy: Predictor | Callable[[Any], Any],
+    policy: Any,
     env: Source | EnvPool,
     seeds: Iterable[int],
     starts: Sequence[ArrayLike] | None = None,
@@ -272,7 +265,7 @@ def rollout(
     return played if problem is None else _with_stage_costs(played, problem)
 
 
-def as_controller(policy: Predictor | Callable[[Any], Any]) -> Controller:
+def as_controller(policy: Any) -> Controller:
     """Return a model, a law, or a function from an observation to an action as a controller."""
     if isinstance(policy, LinearMPC):
         raise TypeError(

@@ -79,10 +79,6 @@ class Evidence:
         more = play(self.accepted, self.starts.seeds[had:count])
         return replace(self, scores=self.scores.extended_by(more))
 
-    def with_accepted(self, checkpoint: ActorCheckpoint, scores: Scores) -> Evidence:
-        """Return the evidence with another accepted policy."""
-        return replace(self, accepted=checkpoint, scores=scores, lost=())
-
     def with_visited(self, candidate: ActorCheckpoint, scores: Scores) -> Evidence:
         """Return the evidence with a candidate accepted in the regions that its episodes visit.
 
@@ -92,7 +88,7 @@ class Evidence:
         changed = self.accepted.changed_regions(candidate)
         if self.accepted.is_confined_as(candidate) and np.any(changed & ~visited):
             candidate = self.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
-        return self.with_accepted(candidate, scores)
+        return replace(self, accepted=candidate, scores=scores, lost=())
 
     def earlier(self) -> Iterator[tuple[ActorCheckpoint, Scores]]:
         """Yield the accepted policy and earlier ones, the latest first, with their known scores."""

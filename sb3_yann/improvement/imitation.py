@@ -66,8 +66,10 @@ class Teacher:
         return self.saved(self.best)
 
     def saved(self, costs: Array) -> float:
-        """Return what costs (k,) are below the MPC's on average."""
-        return gain_of(costs, self.mpc.costs)
+        """Return what costs (k,) are below the MPC's on average, relative to those."""
+        finite = np.isfinite(self.mpc.costs)
+        mpc = self.mpc.costs[finite]
+        return float(-relative_costs(costs[finite] - mpc, mpc).mean()) if finite.any() else 0.0
 
     def show(self, act: Inputs | None = None, played: Imagined | None = None) -> None:
         """Plan the scenarios; those that a policy ``played``, from where it had got to.
@@ -157,13 +159,6 @@ def imitate(
         teacher.show(act, played)
     layer.load_state_dict(best)
     return most
-
-
-def gain_of(costs: Array, mpc: Array) -> float:
-    """Return what costs (k,) are below the MPC's (k,) on average, relative to those."""
-    finite = np.isfinite(mpc)
-    more = relative_costs((costs - mpc)[finite], mpc[finite])
-    return float(-more.mean()) if finite.any() else 0.0
 
 
 def fit_layer(

@@ -39,8 +39,6 @@ LEAST_GAIN = 0.6
 RUN = 10
 MUCH_BETTER = 0.8
 """Steps of a run of the model; share of its squared error that a unit's factor leaves at most."""
-ROUNDING = 1e-9  # of what a state moves: an error that is smaller is rounding
-PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
 LEAST_ROWS = 20  # rows of a regression on the law, at least
 CONFIRM = (
     "If its units were checked, and the plant or its controller is so: "
@@ -66,8 +64,8 @@ def objections(
 ) -> list[str]:
     """Return what speaks against the rows, columns, signs or units of a log.
 
-    Where its units are confirmed another gain, zero or pace than the model's is the plant's own,
-    and another law is another controller's.
+    Where its units are confirmed another gain than the model's is the plant's own, and another law
+    is another controller's.
     """
     log = _Log(problem, coordinates, episodes, units_confirmed)
     readings = {s: _on_law(log, s) for s in ROW_NAMES}
@@ -76,10 +74,9 @@ def objections(
     for s in (-1, 1):
         clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
         proven &= ~(clearly & np.diagonal(_is_one(readings[s]) & readings[s].alone))
-    found = [] if units_confirmed else [*_other_pace(log)]
     if np.all(proven & (logged < EXACT_SHARE)):
-        return found
-    found += [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
+        return []
+    found = [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
     return found or [*_against_plant(log, proven)]
 
 
@@ -259,39 +256,6 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
                 f"The log fits the MPC, or its model, clearly better where {what}: look at the "
                 "columns and signs of the states."
             )
-
-
-def _other_pace(log: _Log) -> Iterator[str]:
-    """Yield where the states move as the model's do in several samples: rows are missing.
-
-    The gains are left open, and the zeros: a plant may have others.
-    """
-    row = log.coordinates.row
-    model = log.problem.model
-    unit = log.coordinates.units
-    z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes])
-    after = np.concatenate([e.thetas[1:, row.state] for e in log.episodes])
-    x = z[:, : model.n_states]
-    n = model.n_states
-    m = model.n_inputs
-    power: Array = np.eye(n)
-    driven: Array = np.zeros((n, m))
-    left = []
-    for _ in PACES:
-        driven = driven + power @ model.B
-        power = model.A @ power
-        rest = (after - x @ power.T) / unit
-        rest -= rest.mean(axis=0)
-        u = (z[:, -m:] - z[:, -m:].mean(axis=0))[:, None] * (driven / unit[:, None])
-        gains = np.linalg.lstsq(u.reshape(-1, m), rest.ravel(), rcond=1e-9)[0]
-        left.append(np.var(rest - u @ gains, axis=0) + ROUNDING)
-    ratio = np.array(left) / left[0]
-    best = int(np.argmin(ratio.mean(axis=1)))
-    if ratio[best].min() < CLEARLY_BETTER and ratio[best].max() < 1.5:
-        yield (
-            f"From row to row the states move as the model's do in {PACES[best]} samples: are "
-            f"rows missing, or is dt = {model.dt:g} another plant's? {CONFIRM}"
-        )
 
 
 def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:

@@ -105,16 +105,6 @@ def test_the_report_says_what_is_wrong_with_a_log_of_the_mpc(fault, said) -> Non
     assert said in fitted([FAULTS[fault](x, u) for x, u in logged("the MPC")]).report()
 
 
-@pytest.mark.parametrize("samples", [2, 3])
-def test_a_log_whose_rows_are_samples_apart_says_so(samples) -> None:
-    log = [
-        (x[::samples], u[::samples][: len(x[::samples]) - 1])
-        for x, u in logged("the MPC", noise=0.003)
-    ]
-    assert f"as the model's do in {samples} samples" in fitted(log).report()
-    assert fitted(logged("the MPC", noise=0.003)).trusted
-
-
 def test_consecutive_pieces_of_a_record_are_tested_as_episodes() -> None:
     rng = np.random.default_rng(1)
     u = np.repeat(rng.uniform(-0.8, 0.8, (60, 2)), 10, axis=0)
