@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -206,7 +205,7 @@ class Watchdog:
     dynamics: Dynamics
     bands: Bands
     alarm: Alarm | None = None
-    _episode: _Episode | None = field(default=None, init=False)
+    _row: Array | None = field(default=None, init=False)
 
     @classmethod
     def of(cls, twin: PlantTwin) -> Watchdog:
@@ -240,9 +239,16 @@ class Watchdog:
         ValueError
             If theta has another shape, or is not finite.
         """
-        first = check_array("theta", theta, (self.dynamics.problem.n_theta,))
+        dynamics = self.dynamics
+        first = check_array("theta", theta, (dynamics.problem.n_theta,))
+        n = dynamics.problem.model.n_states
         self.alarm = None
-        self._episode = _Episode(self.dynamics, self.dynamics.row.begin(first))
+        self._first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
+        self._row = dynamics.row.begin(first)
+        self._charts = _Charts(n)
+        self._steps = 0
+        self._stands = np.zeros(n, np.int64)  # samples for which a reading has repeated itself
+        self._moved = np.zeros(n)  # how far the twin would have moved it meanwhile
 
     def watch(self, theta: Array, u: Array, after: Array) -> Alarm | None:
         """Return an alarm, or None: after one the episode's alarm stays as it is.
@@ -259,40 +265,48 @@ class Watchdog:
         RuntimeError
             Before :meth:`start`.
         """
-        if self._episode is None:
+        if self._row is None:
             raise RuntimeError("No episode has begun: call start(theta) first.")
         if self.alarm is None:
             theta, u, after = (np.array(each, np.float64) for each in (theta, u, after))
             with np.errstate(all="ignore"):
-                found = self._seen(self._episode, theta, u, after)
+                found = self._seen(theta, u, after)
             if found is not None:
                 kind, said = found
-                self.alarm = Alarm(kind, f"Step {self._episode.steps}: {said}.")
+                self.alarm = Alarm(kind, f"Step {self._steps}: {said}.")
         return self.alarm
 
-    def _seen(
-        self, episode: _Episode, theta: Array, u: Array, after: Array
-    ) -> tuple[str, str] | None:
+    def _seen(self, theta: Array, u: Array, after: Array) -> tuple[str, str] | None:
         """Return what is wrong with a transition: the kind, and what is said."""
         for name, values in (("theta", theta), ("the input", u), ("the reading", after)):
             if not np.isfinite(values).all():
                 return "not a number", f"{name} is {np.asarray(values).tolist()}"
-        episode.take(theta, u, after, self.bands.known.doubt)
-        return self._frozen(episode) or self._beyond(episode)
+        layout = self.dynamics.row
+        before = self._row
+        if before is None or not np.array_equal(layout.shown(before), theta):
+            before = layout.begin(theta)  # it does not follow the last one
+        self._row = layout.after(before, u, after)
+        predicted = self._first.step(before[None, None], u[None, None])[0, 0]
+        innovation = (self._row - predicted)[layout.state]
+        self._charts.take(innovation, self.bands.known.doubt(before, u))
+        self._steps += 1
+        same = self._row[layout.state] == before[layout.state]
+        self._stands = (self._stands + 1) * same
+        self._moved = (self._moved + innovation) * same
+        return self._frozen(self._row[layout.state]) or self._beyond()
 
-    def _frozen(self, episode: _Episode) -> tuple[str, str] | None:
+    def _frozen(self, reading: Array) -> tuple[str, str] | None:
         """Return an alarm where a reading repeats itself as it would not.
 
         A noisy sensor does so never, or as the log shows. A settled one may for ever: there the
         twin must say that the state moves.
         """
-        stands = episode.stands
+        stands = self._stands
         bands = self.bands
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
-        unsure = np.hypot(bands.error, episode.charts.doubts[0])  # what is not familiar counts
-        moving = np.abs(episode.moved) > MOVED * stands * unsure
+        unsure = np.hypot(bands.error, self._charts.doubts[0])  # what is not familiar counts
+        moving = np.abs(self._moved) > MOVED * stands * unsure
         problem = self.dynamics.problem
-        reading = episode.row[self.dynamics.row.state]
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             name = problem.model.state_names
             shown = problem.units.to_plant(reading)[i]
@@ -301,46 +315,16 @@ class Watchdog:
             return "frozen sensor", said
         return None
 
-    def _beyond(self, episode: _Episode) -> tuple[str, str] | None:
+    def _beyond(self) -> tuple[str, str] | None:
         """Return an alarm where a chart leaves its band."""
-        ratios = np.abs(self.bands.ratios(episode.charts))
+        ratios = np.abs(self.bands.ratios(self._charts))
         if not ratios.max() > 1.0:
             return None
         at_once = ratios[:1] if ratios[0].max() > 1.0 else ratios
         gain, i = np.unravel_index(int(np.argmax(at_once)), at_once.shape)
         name = labels_of(self.dynamics.problem.model)[0][int(i)]
-        said = f"{name} is off the twin's prediction by {episode.charts.means[gain, i]:.3g}"
+        said = f"{name} is off the twin's prediction by {self._charts.means[gain, i]:.3g}"
         if GAINS[gain] < 1.0:
             said += f" on an average of {1 / GAINS[gain]:.0f} samples"
         kind = "outside the band" if GAINS[gain] == 1.0 else "drift"
         return kind, f"{said}, {ratios[gain, i]:.3g} bands"
-
-
-class _Episode:
-    """What is remembered within an episode."""
-
-    def __init__(self, dynamics: Dynamics, row: Array) -> None:
-        n = dynamics.problem.model.n_states
-        self.first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
-        self.row = row
-        self.charts = _Charts(n)
-        self.steps = 0
-        self.stands = np.zeros(n, np.int64)
-        self.moved = np.zeros(n)
-
-    def take(
-        self, theta: Array, u: Array, after: Array, doubt: Callable[[Array, Array], Array]
-    ) -> None:
-        """Take in a transition, of which all is finite."""
-        layout = self.first.row
-        if not np.array_equal(layout.shown(self.row), theta):  # one that does not follow the last
-            self.row = layout.begin(theta)
-        before = self.row
-        self.row = layout.after(self.row, u, after)
-        predicted = self.first.step(before[None, None], u[None, None])[0, 0]
-        innovation = (self.row - predicted)[layout.state]
-        self.charts.take(innovation, doubt(before, u))
-        self.steps += 1
-        same = self.row[layout.state] == before[layout.state]
-        self.stands = (self.stands + 1) * same
-        self.moved = (self.moved + innovation) * same
