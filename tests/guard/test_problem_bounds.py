@@ -154,18 +154,6 @@ def test_the_page_to_sign_fails_and_names_the_bound_its_excess_and_the_unit(
     assert any(re.search(says[kind], row) for row in failed)
 
 
-def test_stage_cost_tells_the_excess_and_the_penalty() -> None:
-    for kind, hard in (("hard states", True), ("hard outputs", True), ("soft states", False)):
-        _, make = carriage(kind)
-        env = make()
-        env.reset(seed=1)
-        infos = [env.step(np.array([2.0]))[4] for _ in range(4)]
-        assert (infos[-1]["excess"] > 0.1) == hard
-        assert infos[-1].get("violation", False) == hard
-        assert (infos[-1]["penalty"] > 0) != hard
-        assert infos[0]["excess"] == infos[0]["penalty"] == 0
-
-
 OHM, BACK, HENRY, DT = 1.0, 0.1, 0.25, 0.05
 
 

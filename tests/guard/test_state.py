@@ -280,14 +280,6 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
     ]
 
 
-def test_the_final_starts_that_the_rule_lets_it_lose_are_listed() -> None:
-    said = said_of([decision("accepted", 30.0)], lost=(7, 12))
-    assert said[3].endswith(
-        "of the final starts 2 cost more by more than the margin, which the rule allows: seeds 7, "
-        "12"
-    )
-
-
 def test_nothing_was_tried_and_why() -> None:
     said = said_of([], is_mpc=True)
     assert said[0] == "The policy accepted last is the MPC."

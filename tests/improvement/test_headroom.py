@@ -24,7 +24,6 @@ from sb3_yann import (
 from sb3_yann.audit.meaning import in_deviations
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import simulator
-from sb3_yann.improvement.measuring import verdict_of
 from sb3_yann.twin.selection import fit_ensemble
 from sb3_yann.wrappers import ObserveDisturbance, SetPoint, StageCost
 from sb3_yann_envs import problems
@@ -182,25 +181,6 @@ def test_the_re_identified_mpc_is_handed_over() -> None:
     assert "take the MPC headroom(...).reidentified" in advice.report()
 
 
-@pytest.mark.parametrize(
-    ("parts", "doubt", "verdict"),
-    [
-        ((0.0, 0.0, 0.019), 0.0, "keep the MPC"),  # learning would find a part of it
-        ((0.0, 0.0, 0.021), 0.0, "learn"),
-        ((0.004, 0.003, 0.014), 0.0, "learn"),
-        ((0.006, 0.0, 0.001), 0.0, "add ObserveDisturbance first"),
-        ((0.004, 0.0, 0.0), 0.0, "keep the MPC"),
-        ((0.0, 0.3, 0.1), 0.5, "not known"),  # it may be chance
-        ((0.0, 0.0, 0.021), 0.03, "not known"),
-        ((0.0, 0.015, 0.004), 0.02, "keep the MPC"),  # little, and that may be chance
-        ((0.006, 0.0, 0.012), 0.0, "add ObserveDisturbance first"),  # too little to learn
-        ((0.0, 0.3, 0.1), 0.3, "re-identify"),
-    ],
-)
-def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None:
-    assert verdict_of(*parts, doubt=doubt) == verdict
-
-
 def test_changes_of_a_set_point_are_not_known_before() -> None:
     """With preview the optimum would move before the change; the plan costs what the MPC costs."""
     found = headroom(heater(), Heater(steps=40), n_starts=6, seed=20)
@@ -295,17 +275,6 @@ def test_what_it_cannot_use_is_named() -> None:
 
     with pytest.raises(ValueError, match="from the seed 0 costs nan: what the env shows"):
         headroom(heater(), Failing())
-
-
-def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:
-    mpc, observer = offset_free(heater())
-    with pytest.raises(ValueError, match="1 estimated disturbances already"):
-        offset_free(mpc)
-    with pytest.raises(ValueError, match="d_max"):
-        offset_free(heater(), -1.0)
-    env = ObserveDisturbance(Heater(load=0.1), observer, -0.25, 0.25)
-    found = headroom(mpc, env, n_starts=3)
-    assert found.offset == 0 and np.array_equal(found.observer_costs, found.mpc_costs)
 
 
 def test_what_an_observer_loses_is_shown_as_a_loss() -> None:

@@ -14,7 +14,7 @@ from sb3_yann import LinearModel, LinearMPC, PlantTwin, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import plant_twin
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.forecast import _Replays, surely_worse
+from sb3_yann.twin.forecast import _Replays
 from sb3_yann.twin.trust import costs_of
 from sb3_yann_envs import ProblemBox
 from twin_samples import POLYNOMIALS, Cart, problem
@@ -96,13 +96,6 @@ def test_where_it_may_cost_more_it_is_said_what_would_settle_it() -> None:
     law = law_of(MPC)
     _, low, high, cure = found.forecast(lambda x: np.clip(1.05 * law(x), -1, 1))
     assert low < 0 < high and ("held steps of u[0]" in cure or "episodes more" in cure)
-
-
-def test_what_is_two_standard_errors_behind_is_surely_worse() -> None:
-    behind = np.array([[0.1, 0.2, 0.3, 0.4], [-1.0, 1.0, 2.0, -1.5], [0.0, 0.0, 0.0, 0.0]])
-    assert surely_worse(behind).tolist() == [True, False, False]
-    assert surely_worse(np.array([[1.0, 1.1, np.nan]])).tolist() == [True]
-    assert surely_worse(np.array([[0.1, 0.1, 0.1, 0.1, 20.0]])).tolist() == [True]
 
 
 @pytest.mark.slow

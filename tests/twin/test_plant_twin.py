@@ -20,7 +20,6 @@ from sb3_yann import (
     UntrustedTwinError,
     YannPolicy,
 )
-from sb3_yann.twin.selection import candidates, ridge
 from twin_samples import DT, POLYNOMIALS, Cart, log, problem, twin
 
 
@@ -99,14 +98,6 @@ def test_a_model_that_is_far_worse_than_none_is_that_of_another_plant() -> None:
     assert not found.trusted and "far worse than 'nothing moves'" in found.report()
 
 
-def test_the_model_as_it_is_is_looked_at_even_where_it_may_not_be_chosen() -> None:
-    found = PlantTwin.fit(problem(), log(3), residuals=["quadratic"])
-    assert found.kind.startswith("quadratic")
-    assert found.trust.runs.errors[0][0] > found.trust.runs.errors[found.trust.chosen][0]
-    with pytest.raises(ValueError, match="must be a list of some of"):
-        PlantTwin.fit(problem(), log(3), residuals=[])
-
-
 def test_a_theta_that_forgets_the_input_before_it_is_not_trusted() -> None:
     limited = dataclasses.replace(problem(), rate=RateLimits(-2, 2), terminal=None)
     whole = [(np.hstack([x, np.vstack([[0.0], u])]), u) for x, u in log(4)]
@@ -128,19 +119,6 @@ def test_what_is_no_list_of_a_log_is_named() -> None:
         PlantTwin.fit(problem(), huge)
     with pytest.raises(ValueError, match="seed = -1"):
         PlantTwin.fit(problem(), log(2), seed=-1)
-
-
-def test_the_members_other_than_the_first_know_episodes_drawn_with_replacement() -> None:
-    episodes, kinds = log(6), ["linear"]
-    found = PlantTwin.fit(problem(), episodes, residuals=kinds, n_members=3, seed=7)
-    drawn = np.random.default_rng(7).integers(6, size=(2, 6))
-    setting = candidates(found.dynamics.coordinates, found.episodes, kinds)
-    (setting,) = [each.setting for each in setting if each.name == found.kind]
-    for member, which in zip(found.dynamics.members, [range(6), *drawn], strict=True):
-        own = [found.episodes[i] for i in which]
-        (expected,) = ridge(found.dynamics.coordinates, own, [setting])
-        for ours, theirs in zip(member.weights, expected.weights, strict=True):
-            np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize(

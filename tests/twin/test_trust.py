@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,10 +12,10 @@ from general_problems import solved
 from sb3_yann import PlantTwin
 from sb3_yann.evaluation.plots import plot_twin
 from sb3_yann.twin import trust as trusts
-from sb3_yann.twin.log import Episode, as_episodes, records
+from sb3_yann.twin.log import as_episodes
 from sb3_yann.twin.selection import FreeRuns
 from sb3_yann.twin.trust import report
-from twin_samples import log, problem, random_episode, twin
+from twin_samples import problem, random_episode, twin
 
 
 def runs(*errors: list[float]) -> FreeRuns:
@@ -84,19 +83,6 @@ def test_the_edges_of_what_is_trusted() -> None:
     assert "reflux never moves" in named[0] and "step test on reflux" in named[1]
 
 
-def test_every_other_piece_of_a_record_is_independent() -> None:
-    one, two = (random_episode(problem(), 40, seed) for seed in range(2))
-    edges = (0, 10, 20, 30, 40)
-    parts = [Episode(one.thetas[a : b + 1], one.actions[a:b]) for a, b in pairwise(edges)]
-    assert records((one, two)) == [range(1), range(1, 2)]
-    assert records((two, *parts)) == [range(1), range(1, 5)]
-    almost = Episode(parts[1].thetas + np.array([0.0, 1e-9]), parts[1].actions)
-    assert len(records((parts[0], almost))) == 2
-    said = report(problem(), (two, *parts), "", twin().trust).splitlines()[1]
-    assert said.startswith("Episodes 1 to 4 are consecutive pieces of one record.")
-    assert said.endswith("2 of 4.")
-
-
 def test_the_noise_of_the_sensors_is_what_one_step_s_errors_amount_to() -> None:
     """Noise e of the states leaves e+ - A e of a step."""
     mpc, rng, sizes = problem(), np.random.default_rng(0), np.array([0.02, 0.005])
@@ -111,17 +97,6 @@ def test_the_noise_of_the_sensors_is_what_one_step_s_errors_amount_to() -> None:
         logs.append((np.array(rows) + sizes * rng.standard_normal((401, 2)), u))
     found = PlantTwin.fit(mpc, logs, residuals=["none"], n_members=1)
     np.testing.assert_allclose(found.trust.noise, sizes, rtol=0.1)
-
-
-def test_the_evidence_names_the_entry_of_theta_that_lies_beyond_its_box() -> None:
-    mpc = dataclasses.replace(problem(), model=problem().model.named(["place", "speed"]))
-    episodes = log(5)
-    for states, _ in episodes:
-        states[::8, 1] = 3.5
-    found = PlantTwin.fit(mpc, episodes, residuals=["none"], n_members=1)
-    share = 100 * 8 / 61
-    wanted = f"{share:.3g} % of the logged speed lie beyond the problem's box of theta."
-    assert wanted in found.trust.problems
 
 
 def test_the_report_counts_what_it_leaves_out_and_says_what_the_log_does_not_show() -> None:
