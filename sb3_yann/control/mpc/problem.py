@@ -539,7 +539,7 @@ def gain_at_rest(problem: MPCProblem, law: Law) -> Array:
     unit = 2 * problem.u_half
     if not law.in_domain(rest) or np.any(np.abs(law(rest)) > 1e-9 * unit):
         raise ValueError(
-            "The law does not rest at the origin: theta = 0 must be feasible with u = 0. "
+            "The law does not rest at the operating point: x_ss and u_ss must keep all bounds. "
             "Choose an operating point inside the bounds, and boxes of parameters that hold 0."
         )
     gains = law.gain(rest)
