@@ -119,8 +119,9 @@ def _entries(content: bytes) -> dict[str, Any]:
 def _array(name: str, content: bytes) -> Any:
     """Return the array of an entry; its header must fit what follows."""
     file = BytesIO(content)
-    np.lib.format.read_magic(file)
-    shape, by_columns, kind = np.lib.format.read_array_header_1_0(file)
+    formats: Any = np.lib.format
+    formats.read_magic(file)
+    shape, by_columns, kind = formats.read_array_header_1_0(file)
     if kind.kind not in "biufU":
         raise ValueError(f"{name} is no array of numbers, truth values or text")
     if len(content) - file.tell() != math.prod(shape) * kind.itemsize or not kind.itemsize:

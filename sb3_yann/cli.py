@@ -144,7 +144,7 @@ def _evaluate(options: Namespace) -> None:
 
 def _plot(options: Namespace) -> None:
     """Draw the regions of a law."""
-    from sb3_yann._drawing import new_figure, save_figure
+    from sb3_yann.control.law_plot import new_figure, save_figure
 
     figure = new_figure()
     _law(options.law).plot(figure.subplots(), entries=tuple(options.axes))

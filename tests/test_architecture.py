@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {"sb3_yann": ROOT, "sb3_yann_envs": ROOT / "envs"}
 
 FLOORS = [
-    {"sb3_yann._archive", "sb3_yann._validation", "sb3_yann._drawing"},
+    {"sb3_yann._archive", "sb3_yann._validation"},
     {"sb3_yann._progress"},
     {"sb3_yann._numba"},
     {"sb3_yann.log", "sb3_yann.units"},
@@ -32,7 +32,7 @@ FLOORS = [
     {"sb3_yann.callbacks", "sb3_yann.wrappers"},
     {"sb3_yann.audit"},
     {"sb3_yann.guard"},
-    {"sb3_yann.deployment", "sb3_yann.tuning"},
+    {"sb3_yann.deployment"},
     {"sb3_yann.improvement"},
     {"sb3_yann.commissioning"},
     {"sb3_yann.reporting"},
@@ -50,7 +50,6 @@ FORBIDDEN = {
     "sb3_yann._validation": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._progress": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._numba": {"torch", "stable_baselines3", "gymnasium"},
-    "sb3_yann._drawing": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann.units": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann.control": {"torch", "stable_baselines3", "sb3_contrib", "rl_zoo3"},
     "sb3_yann.networks": {

@@ -31,7 +31,6 @@ from sb3_yann.deployment.code import (
     insensitive,
     literal,
     room_of,
-    room_outside,
     sample_observations,
     table,
 )
@@ -89,7 +88,7 @@ def known_answers(data: Arrays, precision: str) -> dict[str, str]:
         "VECTORS": "\n".join(texts),
         **{key: str(size) for key, size in sizes.items()},
         "ROOM_INSIDE": f"{room:g}",
-        "ROOM_OUTSIDE": f"{room_outside(data, precision):g}",
+        "ROOM_OUTSIDE": f"{room_of(data, precision, inside=False):g}",
         "ROOM_IN_LOOP": f"{room_in_loop:.2g}",
     }
 

@@ -18,14 +18,14 @@ ROOM = {"double": 1e-12, "float": 1e-5}
 """How far exported code may be off, in parts of an input's range, by its precision."""
 
 
-def room_of(data: Arrays, precision: str) -> float:
-    """Return how far code of a controller may be off, in parts of an input's range."""
-    return 1e-9 if "qp_gram" in data else ROOM[precision]
+def room_of(data: Arrays, precision: str, inside: bool = True) -> float:
+    """Return how far code of a controller may be off, in parts of an input's range.
 
-
-def room_outside(data: Arrays, precision: str) -> float:
-    """Return the same where the MPC has no solution: constraints that give way cost digits."""
-    return 1e-6 if "qp_gram" in data else ROOM[precision]
+    Where the MPC has no solution, constraints that give way cost an online law more digits.
+    """
+    if "qp_gram" not in data:
+        return ROOM[precision]
+    return 1e-9 if inside else 1e-6
 
 
 def scale_within(
@@ -275,8 +275,8 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     actions = controller.evaluate(obs)
     kept = np.ones(len(obs), bool)
     half = input_ranges(controller, actions) / 2
-    rooms = room_outside(controller.data, precision), room_of(controller.data, precision)
     inside = controller.in_domain(obs)
+    rooms = [room_of(controller.data, precision, is_inside) for is_inside in (False, True)]
     room = np.where(inside, rooms[1], rooms[0])[:, None]
     is_online = "qp_gram" in controller.data  # and continuous: all readings move at once
     for sign in (-1, 1):

@@ -12,11 +12,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._drawing import COLORS, LIMIT, SET_POINT, axes_or_new, legend_beside, new_figure
 from sb3_yann._validation import Array, check_array, check_choice, check_type
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.explicit.solve import ProgramUnits
-from sb3_yann.control.law_plot import plot_law
+from sb3_yann.control.law_plot import (
+    COLORS,
+    LIMIT,
+    SET_POINT,
+    axes_or_new,
+    legend_beside,
+    new_figure,
+    plot_law,
+)
 from sb3_yann.control.linear_system import labels_of, with_units
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.rollout import Trajectories, as_played

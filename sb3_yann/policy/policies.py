@@ -60,6 +60,10 @@ from sb3_yann.policy.sb3_hooks import (
 
 NOT_OURS = "use_sde log_std_init use_expln clip_mean full_std squash_output ortho_init".split()
 """Of the arguments of SB3's policies that draw actions: of how they do."""
+OF_THE_LAYER = (
+    "max_correction", "pin_equilibrium", "law", "networks", "keep_bounds", "bounds_margin",
+)  # fmt: skip
+"""Keywords of an actor, and of its policy, that are of its layer around the law."""
 if TYPE_CHECKING:
     _AnyPolicy = TD3Policy
 else:
@@ -302,9 +306,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
     def _actor(self, kind: Any, features_extractor: Any, **own: Any) -> Any:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor) | own
         kwargs = {name: each for name, each in kwargs.items() if name not in NOT_OURS}
-        kwargs |= {"max_correction": self.max_correction, "pin_equilibrium": self.pin_equilibrium}
-        kwargs |= {"law": self.law, "networks": self.networks}
-        kwargs |= {"keep_bounds": self.keep_bounds, "bounds_margin": self.bounds_margin}
+        kwargs |= {name: getattr(self, name) for name in OF_THE_LAYER}
         with single_precision():
             return kind(self.problem, **kwargs).to(self.device)
 
@@ -361,21 +363,12 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             actor.mu.keep(self.bounds_margin)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
+        same = ("problem", "gamma", "critic_warmup", "observation", *OF_THE_LAYER)
         return {
             **super()._get_constructor_parameters(),
-            "problem": self.problem,
-            "gamma": self.gamma,
-            "actor_lr_mult": self.lr_mult["actor"],
-            "critic_lr_mult": self.lr_mult["critic"],
+            **{name: getattr(self, name) for name in same},
+            **{f"{name}_lr_mult": multiple for name, multiple in self.lr_mult.items()},
             "critic": self.critic_options,
-            "critic_warmup": self.critic_warmup,
-            "max_correction": self.max_correction,
-            "pin_equilibrium": self.pin_equilibrium,
-            "observation": self.observation,
-            "law": self.law,
-            "networks": self.networks,
-            "keep_bounds": self.keep_bounds,
-            "bounds_margin": self.bounds_margin,
         }
 
 

@@ -105,34 +105,6 @@ Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
 
 
-class PreviousInput(Appending):
-    """Appends the input of the step before, ``u_prev`` (m,), for bounds or weights on its rate.
-
-    Parameters
-    ----------
-    env : gymnasium.Env, with one-dimensional Box spaces
-    initial : array_like, shape (m,), optional
-        What counts as the previous input at the start of an episode, as the env takes it: zeros by
-        default. An env with an operating point needs it: ``model.u_ss``. So does one whose bounds
-        leave zero out, or begin or end there.
-
-    Examples
-    --------
-    >>> import gymnasium as gym
-    >>> env = PreviousInput(gym.make("CSTR-v0"))
-    >>> env.reset(seed=0)[0].shape, float(env.step(np.float32([1]))[0][-1])
-    ((5,), 1.0)
-    """
-
-    def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
-        bounds = require_vector(env, "action_space")
-        super().__init__(env, bounds.low, bounds.high)
-        self.initial = _as_initial(initial, bounds, np.ones(bounds.shape, dtype=bool))
-
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        return joined(observation, self.initial if u is None else u)
-
-
 class PastInputs(Appending):
     """Appends the inputs on their way, which are states of a model with dead time.
 
@@ -183,6 +155,30 @@ class PastInputs(Appending):
             self.past = [u, *self.past][:longest]
         shown = [self.past[k][j] for j, delay in enumerate(self.delays) for k in range(delay)]
         return joined(observation, np.array(shown, np.float64))
+
+
+class PreviousInput(PastInputs):
+    """Appends the input of the step before, ``u_prev`` (m,), for bounds or weights on its rate.
+
+    Parameters
+    ----------
+    env : gymnasium.Env, with one-dimensional Box spaces
+    initial : array_like, shape (m,), optional
+        What counts as the previous input at the start of an episode, as the env takes it: zeros by
+        default. An env with an operating point needs it: ``model.u_ss``. So does one whose bounds
+        leave zero out, or begin or end there.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> env = PreviousInput(gym.make("CSTR-v0"))
+    >>> env.reset(seed=0)[0].shape, float(env.step(np.float32([1]))[0][-1])
+    ((5,), 1.0)
+    """
+
+    def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
+        bounds = require_vector(env, "action_space")
+        super().__init__(env, [1] * bounds.shape[0], initial)
 
 
 def _as_initial(initial: ArrayLike | None, bounds: spaces.Box, needed: NDArray[np.bool_]) -> Array:

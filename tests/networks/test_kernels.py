@@ -113,11 +113,6 @@ def test_weights_that_change_before_the_backward_pass_are_noticed() -> None:
         actions.sum().backward()
 
 
-@pytest.mark.parametrize("x", [0.0, -0.0])
-def test_tanh_is_exactly_zero_at_zero(x: float) -> None:
-    assert tanh(np.float32(x)) == 0
-
-
 def test_tanh_is_exact_to_two_units_in_the_last_place_odd_and_bounded() -> None:
     x = np.concatenate([np.logspace(-30, 2, 20_001), np.linspace(0, 12, 20_001)])
     x = x.astype(np.float32)

@@ -1,4 +1,4 @@
-"""The YANN layer: the explicit law, exactly, and a network for each region."""
+"""The YANN layer: the explicit law, exactly, and a network for each region, which trains."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sample_laws import (
     solved,
     to_action,
 )
-from sample_layers import EVERY_LAW, INFEASIBLE, region_of, scrambled
+from sample_layers import EVERY_LAW, INFEASIBLE, region_of, scrambled, train
 from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import clamp_with_inward_gradient
-from weights import last_layer
+from weights import last_layer, network_of
 
 # --- the law -----------------------------------------------------------------------------------
 
@@ -158,3 +158,42 @@ def test_law_without_input_bounds_is_refused() -> None:
     )
     with pytest.raises(ValueError, match=r"u_min = \[-1\.0, -inf\].*Pass u_min and u_max"):
         YannLayer(free.explicit())
+
+
+# --- training ----------------------------------------------------------------------------------
+
+
+@EVERY_LAW
+def test_training_one_region_leaves_the_others_bit_for_bit(name: str) -> None:
+    law = law_of(name)
+    layer = YannLayer(law)
+    theta = box_points(law, 4000, stretch=1.5)
+    region = region_of(layer, theta)
+    trained = region == region.mode().values
+    before = layer(theta).detach()
+    train(layer, theta[trained], target=0.3)
+    after = layer(theta).detach()
+    assert th.equal(after[~trained], before[~trained])
+    assert not th.equal(after[trained], before[trained])
+
+
+@INFEASIBLE
+@EVERY_LAW
+def test_equilibrium_is_where_it_was_after_training(name: str, infeasible: str) -> None:
+    law = law_of(name, infeasible)
+    layer = YannLayer(law)
+    origin = th.zeros(1, law.n_theta)
+    at_rest = to_action(law, np.zeros((1, law.n_inputs))).float()
+    th.testing.assert_close(layer(origin), at_rest, rtol=0, atol=1e-7)
+    before = layer(origin).detach()
+    theta = th.cat([box_points(law, 500), 0.01 * box_points(law, 500), origin])
+    train(layer, theta, target=0.3, steps=50)
+    assert th.equal(layer(origin), before)
+    assert (layer(theta) - layer.law(theta)).abs().max() > 0.01  # it has learnt something
+
+
+def test_region_away_from_the_origin_is_not_pinned() -> None:
+    law = law_of("pendulum")
+    pinned = network_of(YannLayer(law)).pinned.flatten().bool()
+    assert int(pinned.sum()) == 1
+    assert bool(pinned[law.locate(np.zeros(2))])

@@ -7,8 +7,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann._drawing import COLORS, REST
-from sb3_yann.control.law_plot import area, slices
+from sb3_yann.control.law_plot import COLORS, REST, area, slices
 from sb3_yann_envs import problems
 
 
