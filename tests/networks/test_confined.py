@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3 import DDPG
 
 from general_problems import solved
-from sample_layers import scrambled
+from sample_layers import by_loops_and_by_torch, scrambled
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from twin_samples import problem
 
@@ -49,17 +49,10 @@ def test_within_the_box_nothing_changes_and_far_beyond_it_the_law_acts(kind) -> 
 def test_loops_and_operations_of_torch_agree_forward_and_backward(kind) -> None:
     mpc, layer = layer_of(kind)
     layer.confine(-0.4 * mpc.theta_half, 0.2 * mpc.theta_half)
-    theta, found = drawn(mpc, 0.6), []
+    theta = drawn(mpc, 0.6)
     part = layer.confined(theta)
     assert bool(((part > 0) & (part < 1)).any() and (part == 0).any() and (part == 1).any())
-    for compiles in (True, False):
-        layer.network.has_loops = compiles
-        layer.zero_grad()
-        actions = layer(theta)
-        (actions - 0.3).square().sum().backward()
-        found.append([actions, *[each.grad.clone() for each in layer.network.weights()]])
-    for ours, theirs in zip(*found, strict=True):
-        th.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+    by_loops_and_by_torch(layer, theta)
 
 
 def test_where_the_law_acts_alone_nothing_is_learnt() -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 
 from general_problems import servo, solved
-from sample_layers import scrambled, train
+from sample_layers import by_loops_and_by_torch, scrambled, train
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import SharedYannLayer
 from sb3_yann_envs import problems
@@ -44,15 +44,7 @@ def test_loops_and_operations_of_torch_agree(kind) -> None:
     theta = drawn(mpc)
     for limit in (None, 0.1):
         layer = scrambled(layer_of(mpc, kind, max_correction=limit))
-        target, found = th.linspace(-1, 1, len(theta))[:, None], []
-        for compiles in (True, False):
-            layer.network.has_loops = compiles
-            layer.zero_grad()
-            actions = layer(theta)
-            (actions - target).square().sum().backward()
-            found.append([actions, *[each.grad.clone() for each in layer.network.weights()]])
-        for ours, theirs in zip(*found, strict=True):
-            assert th.allclose(ours, theirs, atol=1e-4, rtol=1e-4)
+        by_loops_and_by_torch(layer, theta)
 
 
 def test_the_equilibrium_stays_where_it_is_unless_it_is_not_pinned() -> None:

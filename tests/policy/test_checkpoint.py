@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import TQC
+from stable_baselines3 import DDPG, PPO, SAC, TD3
 
 from guard_samples import LEFT, REGION, RIGHT, actor_bits, build, correct, randomize
+from sb3_yann import retarget
 from sb3_yann.compare import Scores, Starts, Tolerance
 from sb3_yann.guard import state
 from sb3_yann.guard.state import Evidence
@@ -146,3 +152,87 @@ def test_a_checkpoint_knows_whether_it_has_learned_anything() -> None:
     assert not after.shrunk(0.0).has_learned()
     randomize(policy, 0.3)
     assert ActorCheckpoint.of(policy).has_learned()
+
+
+# ---- Another MPC for a model, with what a shared network has learnt ----
+
+
+def learnt(algorithm: Any = DDPG, **options: Any) -> Any:
+    """A model whose network has moved, without learning."""
+    options = {"networks": "shared", "pin_equilibrium": False, **options}
+    model = algorithm(
+        "YannPolicy", "CSTR-v0", policy_kwargs=options, device="cpu", gamma=0.98, batch_size=32
+    )
+    with th.no_grad():
+        for weight in model.policy.actor.mu.network.weights():
+            weight.add_(0.1 * th.randn(weight.shape, generator=th.Generator().manual_seed(0)))
+    return model
+
+
+def explores(algorithm: Any) -> dict[str, Any]:
+    """Options of an algorithm whose policy draws its actions."""
+    return {} if issubclass(algorithm, TD3) else {"initial_std": 0.1, "simulator": True}
+
+
+def correction(model: Any, theta: Any) -> Any:
+    """What the policy adds to its law, in units of the input."""
+    u, law = model.predict(theta, deterministic=True)[0], model.policy.problem.online()(theta)
+    inside = np.abs(u) < model.policy.problem.u_max - 1e-3
+    return u - law, inside & (np.abs(law) < model.policy.problem.u_max - 1e-3)
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3, SAC, TQC, PPO])
+def test_a_shared_correction_stays_under_other_weights_and_bounds(algorithm: Any) -> None:
+    model = learnt(algorithm, **explores(algorithm))
+    old = model.policy.problem
+    states = old.theta_max * np.array([0.5, 1, 2, 1])
+    bounds = {"x_min": -states, "x_max": states, "theta_min": -states, "theta_max": states}
+    mpc = replace(old, R=5 * old.R, **bounds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        other = retarget(model, mpc)
+    assert type(other) is type(model) and (other.gamma, other.batch_size) == (0.98, 32)
+    theta = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 4)) * old.theta_max
+    theta = theta.astype(np.float32)
+    (one, inside), (two, also) = correction(model, theta), correction(other, theta)
+    both = (inside & also).all(axis=1)
+    assert both.sum() > 20 and np.abs(one[both]).max() > 1e-3
+    assert np.abs(one - two)[both].max() < 1e-4
+    other.learn(20)
+
+
+@pytest.mark.parametrize("algorithm", [SAC, PPO])
+def test_the_spread_stays_in_units_of_the_inputs(algorithm: Any) -> None:
+    model = learnt(algorithm, **explores(algorithm))
+    old = model.policy.problem
+    with th.no_grad():
+        model.policy.actor.log_std.sub_(1.0)
+        if algorithm is SAC:
+            model.log_ent_coef.add_(2.0)
+    env = gym.make("CSTR-v0")
+    env.action_space = gym.spaces.Box(-old.u_max[0] / 2, old.u_max[0] / 2, (1,), np.float32)
+    other = retarget(model, replace(old, u_min=old.u_min / 2, u_max=old.u_max / 2), env)
+    assert th.allclose(
+        other.policy.actor.log_std, model.policy.actor.log_std + np.log(2), atol=1e-6
+    )
+    if algorithm is SAC:
+        assert th.equal(other.log_ent_coef, model.log_ent_coef)
+
+
+def test_what_is_not_kept_is_named() -> None:
+    model = learnt(networks="per_region")
+    model.learn(150)
+    model.guard_state = object()
+    problem = model.policy.problem
+    with pytest.warns(UserWarning, match="not kept: the networks of single regions") as found:
+        other = retarget(model, replace(problem, R=3 * problem.R))
+    text = str(found[0].message)
+    assert all(word in text for word in ("the critic", "replay buffer", "guard's accepted"))
+    assert other.policy.actor.mu.network.is_zero() and not hasattr(other, "guard_state")
+    with pytest.raises(ValueError, match="a correction needs the same entries"):
+        retarget(model, replace(problem, parametric_bounds=["u_max"]))
+    moved = replace(problem.model, x_ss=np.ones(4))
+    bounds = {"x_min": problem.x_min + 1, "x_max": problem.x_max + 1}
+    bounds |= {"theta_min": problem.theta_min + 1, "theta_max": problem.theta_max + 1}
+    with pytest.raises(ValueError, match="Keep x_ss and u_ss"):
+        retarget(model, replace(problem, model=moved, **bounds))

@@ -31,3 +31,17 @@ def train(layer: YannLayer, theta: th.Tensor, target: float, steps: int = 20) ->
         optimizer.zero_grad()
         (layer(theta) - target).square().mean().backward()
         optimizer.step()
+
+
+def by_loops_and_by_torch(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
+    """Assert that compiled loops and torch give the same actions and gradients; return actions."""
+    found = []
+    for compiles in (True, False):
+        layer.network.has_loops = compiles
+        layer.zero_grad()
+        actions = layer(theta)
+        (actions - 0.3).square().sum().backward()
+        found.append([actions, *[each.grad.clone() for each in layer.network.weights()]])
+    for ours, theirs in zip(*found, strict=True):
+        th.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+    return found[0][0]
