@@ -32,7 +32,7 @@ FLOORS = [
     {"sb3_yann.callbacks", "sb3_yann.wrappers"},
     {"sb3_yann.audit"},
     {"sb3_yann.guard"},
-    {"sb3_yann.deployment"},
+    {"sb3_yann.deployment", "sb3_yann.tuning"},
     {"sb3_yann.improvement"},
     {"sb3_yann.commissioning"},
     {"sb3_yann.reporting"},

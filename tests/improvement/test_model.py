@@ -168,7 +168,7 @@ def test_an_accepted_policy_has_that_margin_unless_another_was_given(given: floa
     twin = bounded()
     options = {"problem": twin.problem, "bounds_margin": given}
     model = DDPG(YannPolicy, Cart(), device="cpu", seed=0, policy_kwargs=options)
-    work = _Work(model.policy, 4, 1, 10, 0, _Progress(False, 1))
+    work = _Work(model.policy, 4, 1, 10, 0, _Progress(1))
     work.keep_margin(twin.dynamics.row, twin.episodes)
     work.accept(twin)
     error = one_step_error(twin.dynamics.row, twin.episodes)
