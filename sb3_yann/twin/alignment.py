@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import least_squares, linear_sum_assignment
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
@@ -39,6 +39,9 @@ LEAST_GAIN = 0.6
 RUN = 10
 MUCH_BETTER = 0.8
 """Steps of a run of the model; share of its squared error that a unit's factor leaves at most."""
+ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
+MOVING = 1e-3  # of a standard deviation: a state that moves by more in a step moves
+PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
 LEAST_ROWS = 20  # rows of a regression on the law, at least
 CONFIRM = (
     "If its units were checked, and the plant or its controller is so: "
@@ -64,8 +67,8 @@ def objections(
 ) -> list[str]:
     """Return what speaks against the rows, columns, signs or units of a log.
 
-    Where its units are confirmed another gain than the model's is the plant's own, and another law
-    is another controller's.
+    Where its units are confirmed another gain, zero or pace than the model's is the plant's own,
+    and another law is another controller's.
     """
     log = _Log(problem, coordinates, episodes, units_confirmed)
     readings = {s: _on_law(log, s) for s in ROW_NAMES}
@@ -74,9 +77,12 @@ def objections(
     for s in (-1, 1):
         clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
         proven &= ~(clearly & np.diagonal(_is_one(readings[s]) & readings[s].alone))
+    found = [] if units_confirmed else [*_other_pace(log)]
     if np.all(proven & (logged < EXACT_SHARE)):
-        return []
-    found = [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
+        return found
+    found += [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
+    if not found and not units_confirmed:
+        found += _other_units(log, proven)
     return found or [*_against_plant(log, proven)]
 
 
@@ -120,16 +126,16 @@ def _rows(log: _Log, shift: int = 0) -> tuple[Array, Array]:
     return np.concatenate(thetas), np.concatenate(inputs)
 
 
-def _on_law(log: _Log, shift: int, change: Array | None = None) -> _OnLaw:
+def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) -> _OnLaw:
     """Return the regressions on the law at the rows ``shift`` away.
 
-    With a ``change`` M the law sees M x in place of the logged states x.
+    With ``change`` = (M, v) the law sees M x + v in place of the logged states x.
     """
     m = log.problem.model.n_inputs
     theta, u = _rows(log, shift)
     if change is not None:
         state = log.problem.layout.state
-        theta[:, state] = theta[:, state] @ change.T
+        theta[:, state] = theta[:, state] @ change[0].T + change[1]
     answer = law_of(log.problem)(theta)
     known = np.isfinite(answer).all(axis=1)
     theta = theta[known]
@@ -246,16 +252,110 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
         ratio = error(change) / (np.abs(change) @ before)
         fits = ratio.min() < CLEARLY_BETTER and ratio.max() < 1.5
         if not fits and not np.all(proven):
-            on = _on_law(log, 0, change)
+            on = _on_law(log, 0, (change, np.zeros(n)))
             better = np.diagonal(on.left) < CLEARLY_BETTER * logged - 1e-9
             fits = np.any(np.diagonal(_is_one(on) & on.alone) & better & ~proven)
         if fits:
-            both = f"{names[i]} and {names[j]} are exchanged"
-            what = both if i != j else f"{names[i]} is negated"
+            what = (
+                f"{names[i]} and {names[j]} are exchanged" if i != j else f"{names[i]} is negated"
+            )
             yield (
                 f"The log fits the MPC, or its model, clearly better where {what}: look at the "
                 "columns and signs of the states."
             )
+
+
+def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
+    """Yield where the law gives the inputs once one state is taken times a factor, plus a zero."""
+    proven = proven | _held(log)
+    if np.all(proven):
+        return
+    names = labels_of(log.problem.model)[0]
+    n = log.problem.model.n_states
+    unit = log.coordinates.units
+    law = law_of(log.problem)
+    theta, u = _rows(log)
+    some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
+    theta = theta[some]
+    u = u[some]
+    scale = np.maximum(np.std(u, axis=0), 1e-6 * log.problem.u_half)
+
+    for i in range(n):
+
+        def left(p: Array, i: int = i) -> Array:
+            rows = theta.copy()
+            rows[:, i] = p[0] * rows[:, i] + p[1] * unit[i]
+            return np.asarray(np.nan_to_num((u - law(rows)) / scale).ravel())
+
+        before = np.mean(left(np.array([1.0, 0.0])) ** 2)
+        fit = least_squares(left, [1.0, 0.0], diff_step=1e-4, max_nfev=20)
+        factor, zero = fit.x
+        moved = abs(np.log(max(abs(factor), 1e-9))) > 2 * SLOPE_TOLERANCE or abs(zero) > 0.2
+        if not moved or not np.mean(fit.fun**2) < 0.5 * before:
+            continue
+        change = np.eye(n)
+        shift = np.zeros(n)
+        change[i, i] = factor
+        shift[i] = zero * unit[i]
+        on = _on_law(log, 0, (change, shift))
+        if np.any(np.diagonal(_is_one(on) & on.alone) & ~proven):
+            yield (
+                f"The MPC gives the logged inputs where {names[i]} is {factor:.4g} times what is "
+                f"logged, {shift[i]:+.4g}: is it in other units, or has it another zero? {CONFIRM}"
+            )
+
+
+def _other_pace(log: _Log) -> Iterator[str]:
+    """Yield where the states move as the model's do in several samples: rows are missing.
+
+    The gains are left open, and the zeros: a plant may have others.
+    """
+    row = log.coordinates.row
+    model = log.problem.model
+    unit = log.coordinates.units
+    z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes])
+    after = np.concatenate([e.thetas[1:, row.state] for e in log.episodes])
+    x = z[:, : model.n_states]
+    n = model.n_states
+    m = model.n_inputs
+    power: Array = np.eye(n)
+    driven: Array = np.zeros((n, m))
+    left = []
+    for _ in PACES:
+        driven = driven + power @ model.B
+        power = model.A @ power
+        rest = (after - x @ power.T) / unit
+        rest -= rest.mean(axis=0)
+        u = (z[:, -m:] - z[:, -m:].mean(axis=0))[:, None] * (driven / unit[:, None])
+        gains = np.linalg.lstsq(u.reshape(-1, m), rest.ravel(), rcond=1e-9)[0]
+        left.append(np.var(rest - u @ gains, axis=0) + ROUNDING)
+    ratio = np.array(left) / left[0]
+    best = int(np.argmin(ratio.mean(axis=1)))
+    if ratio[best].min() < CLEARLY_BETTER and ratio[best].max() < 1.5:
+        yield (
+            f"From row to row the states move as the model's do in {PACES[best]} samples: are "
+            f"rows missing, or is dt = {model.dt:g} another plant's? {CONFIRM}"
+        )
+
+
+def _held(log: _Log) -> NDArray[np.bool_]:
+    """Return which inputs (m,) mostly stand still inside of their bounds while the states move.
+
+    No law of the states makes them.
+    """
+    problem = log.problem.deviations
+    units = log.coordinates.units
+    state = log.coordinates.row.state
+    held = []
+    moves = []
+    for each in log.episodes:
+        u = each.actions
+        x = each.thetas[:-1, state]
+        still = np.abs(np.diff(u, axis=0)) <= ROUNDING * problem.u_half
+        held.append(still & (u[1:] > problem.u_min) & (u[1:] < problem.u_max))
+        moves.append(np.any(np.abs(np.diff(x, axis=0)) > MOVING * units, axis=1))
+    moving = np.concatenate(moves)
+    return np.asarray(np.concatenate(held)[moving].mean(axis=0) > 0.5) & bool(moving.any())
 
 
 def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
@@ -282,6 +382,9 @@ def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
             )
             return
     yield from _against_gains(log, fit, weights, proven)
+    driven = fit.follows.min() > 0.7 and not np.any(proven)  # in closed loop noise moves the zero
+    if driven and not (log.problem.layout.has_constants or log.units_confirmed):
+        yield from _resting(log, fit)
 
 
 def _against_gains(
@@ -342,19 +445,42 @@ def _error_of_runs(log: _Log, j: int, gain: float) -> float:
     return float(np.var(np.concatenate(errors), axis=0).sum())
 
 
+def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
+    """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
+    if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
+        return
+    A = log.problem.model.A
+    names = labels_of(log.problem.model)[0]
+    rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
+    x_ss = log.problem.model.x_ss
+    shown = log.problem.units.to_plant(rest)
+    away = np.abs(rest / log.coordinates.units)
+    if np.max(away) > 5:  # beyond the log: a state that hardly returns, or noise
+        return
+    for i in np.flatnonzero(away > 0.5):
+        yield (
+            f"Without inputs the logged plant rests at {names[i]} = {shown[i]:.4g}, the "
+            f"problem's at {x_ss[i]:.4g}: compare units and operating point of states and inputs. "
+            f"{CONFIRM}"
+        )
+
+
 @dataclass(frozen=True)
 class _Effects:
     """A regression of the next states on states and inputs.
 
     It finds B (n, m), leaves the ``covariance`` (n, n) and the mean squares ``left`` (n,).
     ``factors`` (m,) are standard errors of a column of B over the deviation of what is left.
-    ``follows`` (m,) is the deviation of the inputs that the states leave, relative to their own.
+    ``drift`` (n,) is the next state of x = 0 and u = 0. ``follows`` (m,) is the deviation of the
+    inputs that the states leave, relative to their own.
     """
 
     B: Array
     covariance: Array
     factors: Array
     left: Array
+    drift: Array
+    drift_error: Array
     follows: Array
 
     @classmethod
@@ -389,6 +515,9 @@ class _Effects:
         factors = np.linalg.norm(right.T * inverse, axis=1) / scale
         own = u - F[:, m:] @ np.linalg.lstsq(F[:, m:], u, rcond=None)[0]
         follows = np.std(own, axis=0) / np.maximum(np.std(u, axis=0), 1e-12)
+        squares = np.diag(covariance).copy()
         size = log.coordinates.scale[-m:]
-        B = slopes[:m].T / size
-        return cls(B, covariance, factors[:m] / size, np.diag(covariance).copy(), follows)
+        return cls(
+            slopes[:m].T / size, covariance, factors[:m] / size, squares, slopes[m],
+            np.sqrt(squares) * factors[m], follows,
+        )  # fmt: skip

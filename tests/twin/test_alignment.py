@@ -9,6 +9,7 @@ import pytest
 
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
 from sb3_yann.evaluation import evaluate
+from sb3_yann.twin import alignment
 from sb3_yann_envs import cstr, problems
 from twin_samples import log, problem
 
@@ -105,6 +106,16 @@ def test_the_report_says_what_is_wrong_with_a_log_of_the_mpc(fault, said) -> Non
     assert said in fitted([FAULTS[fault](x, u) for x, u in logged("the MPC")]).report()
 
 
+@pytest.mark.parametrize("samples", [2, 3])
+def test_a_log_whose_rows_are_samples_apart_says_so(samples) -> None:
+    log = [
+        (x[::samples], u[::samples][: len(x[::samples]) - 1])
+        for x, u in logged("the MPC", noise=0.003)
+    ]
+    assert f"as the model's do in {samples} samples" in fitted(log).report()
+    assert fitted(logged("the MPC", noise=0.003)).trusted
+
+
 def test_consecutive_pieces_of_a_record_are_tested_as_episodes() -> None:
     rng = np.random.default_rng(1)
     u = np.repeat(rng.uniform(-0.8, 0.8, (60, 2)), 10, axis=0)
@@ -159,6 +170,29 @@ def test_inputs_times_a_factor_are_not_those_of_the_mpc(factor, dither) -> None:
     twin = heated_twin([(x, factor * u) for x, u in heated(1.0, dither)])
     assert "times what the MPC gives" in twin.report()
     assert not twin.trusted
+
+
+def test_a_state_with_another_zero_and_scale_is_not_the_one_that_the_mpc_saw() -> None:
+    twin = heated_twin([(x * [1.8, 1] + [0.5, 0], u) for x, u in heated(1.0, 0.2)])
+    assert "The MPC gives the logged inputs where x[0] is" in twin.report()
+    assert not twin.trusted
+
+
+def test_an_mpc_that_has_settled_still_shows_a_state_in_other_units() -> None:
+    twin = heated_twin([(x * [1, 0.4], u) for x, u in heated(1.0, 0.0, steps=200)])
+    assert "The MPC gives the logged inputs where x[1] is 2.5 times" in twin.report()
+    assert not twin.trusted
+
+
+def test_inputs_that_are_held_while_the_states_move_are_no_law_s() -> None:
+    def held(episodes: list) -> bool:
+        twin = heated_twin(episodes)
+        log = alignment._Log(room(), twin.dynamics.coordinates, twin.episodes, False)
+        return bool(alignment._held(log)[0])
+
+    assert held(heated(1.0, 0.0, open_loop=True, steps=200, hold=40))
+    assert not held(heated(1.0, 0.0, steps=200))  # at rest nothing moves
+    assert not held([(x, 0 * u + 2) for x, u in heated(1.0, 0.0)])  # on its bound
 
 
 def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed() -> None:
@@ -231,6 +265,19 @@ def refuse_or_doubt(mpc, episodes) -> None:
 )
 def test_a_reactor_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
     refuse_or_doubt(problems.cstr(), [change(x, u) for x, u in reactor()])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x, u: (x + np.array([20.0, 0.0]), u),
+        lambda x, u: (100 * x, u),
+        lambda x, u: (x, 100 * u),
+    ],
+    ids=["absolute place", "per cent", "input in per cent"],
+)
+def test_the_cart_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
+    refuse_or_doubt(problem(), [change(x, u) for x, u in log(3)])
 
 
 def test_what_is_missing_in_a_poor_log_is_advised() -> None:
