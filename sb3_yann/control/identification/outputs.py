@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.dead_time import MAX_DELAY
 from sb3_yann.control.identification.innovations import (
@@ -81,15 +83,16 @@ def fit_structure(
     trials = [tuple(delays)] if delays is not None else [(0,) * m]
     if delays is None:
         trials += [each for each in dict.fromkeys(dead_times(fitted, MAX_DELAY)) if any(each)]
-    searches = [Search(fitted, known, tested, lags) for lags in trials]
-    rough = [each.rough(order) for each in searches]
-    best = int(np.argmin([each.criterion for each in rough]))
-    sure = rough[best].criterion < rough[0].criterion - SURE / sum(map(len, fitted))
-    if not sure or rough[best].error > rough[0].error * WORSE:
-        best = 0
-    found = searches[best].best(order)
-    whole = Search(episodes, read, [], found.delays)
-    final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
+    with bar("models of the outputs") as tries:
+        searches = [Search(fitted, known, tested, lags, tries) for lags in trials]
+        rough = [each.rough(order) for each in searches]
+        best = int(np.argmin([each.criterion for each in rough]))
+        sure = rough[best].criterion < rough[0].criterion - SURE / sum(map(len, fitted))
+        if not sure or rough[best].error > rough[0].error * WORSE:
+            best = 0
+        found = searches[best].best(order)
+        whole = Search(episodes, read, [], found.delays, tries)
+        final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
     past = whole.past
     return replace(
         found,
@@ -131,7 +134,7 @@ def _feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, flo
 
 
 class Search:
-    """Models of each order for given dead times."""
+    """Models of each order for given dead times; a bar counts them."""
 
     def __init__(
         self,
@@ -139,7 +142,9 @@ class Search:
         read: Sequence[Episode],
         tested: Sequence[Episode],
         delays: tuple[int, ...],
+        tries: Any,
     ) -> None:
+        self.tries = tries
         self.fitted = shifted(read, delays)
         self.tested = shifted(tested, delays)
         self.chunks = Chunks(self.fitted)
@@ -182,6 +187,7 @@ class Search:
 
     def assessed(self, model: Innovations) -> Structure:
         """Return a model with its criterion and its free runs over held-out data."""
+        self.tries.update()
         q = len(model.C)
         if not self.chunks.forgets(model):
             none = np.full(q, np.inf)
