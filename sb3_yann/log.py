@@ -421,7 +421,10 @@ def _number(path: object, row: int, content: dict[str, str], name: str) -> float
     try:
         return float(text) if text else np.nan
     except ValueError:
-        raise ValueError(f"{path}, row {row + 2}: {name} is {text!r}, expected a number.") from None
+        raise ValueError(
+            f"{path}, row {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
+            "where there is no reading."
+        ) from None
 
 
 def _time(
