@@ -15,6 +15,8 @@ from sb3_yann.compare import (
     Starts,
     Tolerance,
     less_safe,
+    level_of_look,
+    looks,
     no_worse,
     tail_average,
     unsafe_columns,
@@ -287,3 +289,8 @@ def test_what_a_rule_may_be_ends_where_it_says(name: str, good: Any, bad: Any) -
     for value in bad:
         with pytest.raises((ValueError, TypeError), match=name):
             AcceptanceRule(**{name: value})
+
+
+def test_looks_double_and_share_the_level() -> None:
+    assert looks(5, 100) == [5, 10, 20, 40, 80, 100] and looks(5, 3) == [3]
+    assert sum(level_of_look(0.05, j) for j in range(1, 1000)) == pytest.approx(0.05, rel=0.01)

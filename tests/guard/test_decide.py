@@ -429,3 +429,26 @@ def test_beyond_the_bound_it_is_refused_with_the_reason() -> None:
     assert is_mpc(model)
     mpc = guard.state.evidence.starts.mpc
     assert not mpc.unsafe[:, 3].any()  # the MPC itself never counts
+
+
+def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
+    # Only the very last of them shows the left.
+    simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 5 + 199)
+    model, guard = tried(spoil_left, env=simulator, n_new_starts=20)
+    whole, end = guard.decisions
+    assert whole.verdict == "accepted"
+    assert end.verdict == "accepted in part" and end.reason.startswith("at the end, on 200 new")
+    assert not last_layer(model)[REGION[LEFT], :, -1].any()
+    assert actor_bits(model.policy) == accepted_bits(guard)
+    assert guard.state.evidence.starts.seeds[0] == FIRST + 10 + 5 + 199
+
+
+@pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
+def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, seeds) -> None:
+    model = build(gradient_steps=0)
+    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule=WHOLE)
+    train(model, STEPS, At([STEPS], spoil_left), guard)
+    assert guard.state.evidence.next_seed == FIRST + 10 + seeds
+    assert is_mpc(model) == (final is not None)
+    if final is not None:
+        assert guard.decisions[-1].reason.startswith("at the end, on 30 new starts, start 1000")

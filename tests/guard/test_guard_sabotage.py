@@ -212,3 +212,13 @@ def test_a_candidate_with_what_is_not_finite_in_its_episodes_violates_and_return
         train(model, STEPS, At([1], better), guard)
     assert "a cost or an observation that is no finite number" in guard.decisions[0].reason
     assert guard.decisions[0].restored
+
+
+def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=5, keep_if_worse=True)
+    train(model, 2 * STEPS, At([1], worse), guard)
+    assert guard.decisions[-1].restored
+    assert is_mpc(model)
+    worse(model.policy)
+    train(model, STEPS + 1, guard)  # five more, not what was left
+    assert [each.restored for each in guard.decisions[-2:]] == [False, True]

@@ -15,6 +15,7 @@ from guard_samples import (
     Slide,
     actor_bits,
     better,
+    bits,
     buffer_bits,
     build,
     critic_bits,
@@ -149,3 +150,20 @@ def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -
     again, other = DDPG.load(tmp_path / "model", env=envs(1), device="cpu"), guard_in_simulator()
     train(again, 1, other, reset_num_timesteps=False)
     assert all_bits(other.player.mpc) == all_bits(guard.player.mpc)
+
+
+@ALGORITHMS
+def test_a_guard_that_rejects_everything_leaves_the_mpc_while_the_critic_learns(
+    algorithm, monkeypatch
+) -> None:
+    monkeypatch.setattr(compare, "no_worse", lambda *_, **__: Verdict("no"))
+    fresh = build(algorithm)
+    seen: list[bool] = []
+    look = At(range(STEPS, 9 * STEPS, STEPS), lambda p: seen.append(is_mpc(p)))
+    model, guard = build(algorithm), make_guard()
+    train(model, 8 * STEPS, guard, look)
+    assert seen == [True] * 8
+    assert len(guard.decisions) >= 7
+    assert bits(model.policy.actor.state_dict()) == bits(fresh.policy.actor.state_dict())
+    assert critic_bits(model.policy)["critic"] != critic_bits(fresh.policy)["critic"]
+    assert model.policy.critic_updates == model._n_updates == 8 * STEPS

@@ -348,3 +348,11 @@ def test_headroom_is_drawn_part_after_part() -> None:
     bars = plot_headroom(found).patches
     np.testing.assert_allclose([bar.get_x() for bar in bars], [0, 3, 5, 0], atol=1e-12)
     np.testing.assert_allclose([bar.get_width() for bar in bars], [3, 2, 1, 6])
+
+
+def test_the_final_starts_that_the_rule_lets_it_lose_are_listed() -> None:
+    said = said_of([decision("accepted", 30.0)], lost=(7, 12))
+    assert said[3].endswith(
+        "of the final starts 2 cost more by more than the margin, which the rule allows: seeds 7, "
+        "12"
+    )

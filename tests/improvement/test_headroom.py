@@ -16,6 +16,7 @@ from sb3_yann import (
     LinearModel,
     LinearMPC,
     PlantTwin,
+    Terminal,
     Tracking,
     UntrustedTwinError,
     headroom,
@@ -24,6 +25,7 @@ from sb3_yann import (
 from sb3_yann.audit.meaning import in_deviations
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import simulator
+from sb3_yann.improvement.measuring import verdict_of
 from sb3_yann.twin.selection import fit_ensemble
 from sb3_yann.wrappers import ObserveDisturbance, SetPoint, StageCost
 from sb3_yann_envs import problems
@@ -352,3 +354,41 @@ def test_set_points_that_are_not_the_problem_s_are_named(low) -> None:
         match=r"set-point of temperature (= -.* is a deviation|is 35.*, and the MPC was solved)",
     ):
         headroom(tracking(), plant, n_starts=2)
+
+
+@pytest.mark.parametrize(
+    ("parts", "doubt", "verdict"),
+    [
+        ((0.0, 0.0, 0.019), 0.0, "keep the MPC"),  # learning would find a part of it
+        ((0.0, 0.0, 0.021), 0.0, "learn"),
+        ((0.004, 0.003, 0.014), 0.0, "learn"),
+        ((0.006, 0.0, 0.001), 0.0, "add ObserveDisturbance first"),
+        ((0.004, 0.0, 0.0), 0.0, "keep the MPC"),
+        ((0.0, 0.3, 0.1), 0.5, "not known"),  # it may be chance
+        ((0.0, 0.0, 0.021), 0.03, "not known"),
+        ((0.0, 0.015, 0.004), 0.02, "keep the MPC"),  # little, and that may be chance
+        ((0.006, 0.0, 0.012), 0.0, "add ObserveDisturbance first"),  # too little to learn
+        ((0.0, 0.3, 0.1), 0.3, "re-identify"),
+    ],
+)
+def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None:
+    assert verdict_of(*parts, doubt=doubt) == verdict
+
+
+def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
+    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=Terminal())
+    found = headroom(mpc, "ClippedPendulum-v0", n_starts=2, seed=2021)
+    assert found.mpc_costs[0] > 2000  # it hangs
+    assert found.best_costs[0] < 0.3 * found.mpc_costs[0]
+    assert found.verdict == "learn"
+
+
+def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:
+    mpc, observer = offset_free(heater())
+    with pytest.raises(ValueError, match="1 estimated disturbances already"):
+        offset_free(mpc)
+    with pytest.raises(ValueError, match="d_max"):
+        offset_free(heater(), -1.0)
+    env = ObserveDisturbance(Heater(load=0.1), observer, -0.25, 0.25)
+    found = headroom(mpc, env, n_starts=3)
+    assert found.offset == 0 and np.array_equal(found.observer_costs, found.mpc_costs)

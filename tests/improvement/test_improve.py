@@ -509,3 +509,24 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
         Improvement((small,), 0.0, accepted=False)
     )
     assert Improvement((), 0.0, False).reason == "Nothing better was found: no gain in the twin."
+
+
+class Limited(Spring):
+    """Says that whoever leaves the MPC breaks a limit, from some starts."""
+
+    def reset(self, *, seed=None, options=None):
+        self.bad = seed is not None and seed % 7 == 0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        left = np.abs(problem().explicit()(self.x.astype(np.float32)) - action).max() > 1e-3
+        *rest, info = super().step(action)
+        return *rest, {**info, "violation": bool(self.bad and left)}
+
+
+def test_a_policy_that_breaks_a_limit_is_refused_whatever_it_gains() -> None:
+    model = model_of(Limited)
+    before = bits(model)
+    found = improve(model, Limited, **FEW)
+    assert not found.accepted and bits(model) == before
+    assert "starts with violations" in found.reason

@@ -11,7 +11,7 @@ import torch as th
 
 from general_problems import servo, solved
 from sample_layers import by_loops_and_by_torch, scrambled, train
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearModel, LinearMPC
 from sb3_yann.networks import SharedYannLayer
 from sb3_yann_envs import problems
 
@@ -100,3 +100,11 @@ def test_it_learns_and_copies() -> None:
 def test_it_says_that_it_cannot_be_traced() -> None:
     with pytest.raises(RuntimeError, match="cannot be traced"):
         th.jit.trace(layer_of(reactor(), "online"), drawn(reactor()).float())
+
+
+def test_inputs_without_bounds_are_refused() -> None:
+    mpc = LinearMPC(
+        LinearModel([[0.5]], [[1.0]], 1), Q=[[1]], R=[[1]], horizon=2, x_min=-1, x_max=1
+    )
+    with pytest.raises(ValueError, match="finite bounds on every input"):
+        SharedYannLayer(mpc.online())

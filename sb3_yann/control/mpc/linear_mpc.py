@@ -23,7 +23,6 @@ from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.model.identify import Identified
 from sb3_yann.control.model.identify_outputs import IdentifiedOutputs
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.mpc import problem as at_rest
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.coordinates import constant_box, theta_box
 from sb3_yann.control.mpc.groups import (
@@ -42,7 +41,15 @@ from sb3_yann.control.mpc.groups import (
     parametric_names,
 )
 from sb3_yann.control.mpc.invariant_sets import KeptSet, completed, hard_rows, kept_set
-from sb3_yann.control.mpc.problem import MPCProblem, Value, layout_of
+from sb3_yann.control.mpc.problem import (
+    MPCProblem,
+    Value,
+    is_reachable,
+    layout_of,
+    state_action_value,
+    steady_state,
+    value,
+)
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.online import LAWS, Law, OnlineLaw, OnlineLawWarning, steepness
 from sb3_yann.control.simulator import borrow
@@ -317,7 +324,7 @@ class LinearMPC(MPCProblem):
 
         Both may be batches; None is the operating point. Soft bounds count too.
         """
-        return at_rest.is_reachable(self, r, d)
+        return is_reachable(self, r, d)
 
     def steady_state(self, r: Given = None, d: Given = None) -> tuple[Array, Array]:
         """Return x_s (n,) and u_s (m,) for the reference r (p,) and disturbance d (d,).
@@ -330,7 +337,7 @@ class LinearMPC(MPCProblem):
         ValueError
             If it lies beyond a bound of x, u or y.
         """
-        return at_rest.steady_state(self, r, d)
+        return steady_state(self, r, d)
 
     def stage_cost(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the stage cost, without penalties, at theta (..., n_theta) and u (..., m)."""
@@ -378,7 +385,7 @@ class LinearMPC(MPCProblem):
         region in which the model rests under the law, and needs a gamma below 1.
         """
         gamma = check.check_discount(gamma)  # before the law, which may take long
-        return at_rest.value(self.deviations, self.law(), gamma)
+        return value(self.deviations, self.law(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
         """Return M (n_theta + m, n_theta + m): ``[theta; u]' M [theta; u]`` is the cost of u now.
@@ -391,7 +398,7 @@ class LinearMPC(MPCProblem):
     def state_action_terms(self, gamma: float) -> Value:
         """Return the terms of the same cost of ``[theta; u]``, as :meth:`value_terms` does."""
         gamma = check.check_discount(gamma)
-        return at_rest.state_action_value(self.deviations, self.law(), gamma)
+        return state_action_value(self.deviations, self.law(), gamma)
 
     def explicit(
         self,
