@@ -31,8 +31,6 @@ from sb3_yann.compare import (
     Difference,
     allowed_excess,
     level_of_look,
-    paired_rows,
-    summary_lines,
 )
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import (
@@ -41,6 +39,7 @@ from sb3_yann.control.mpc.bound_excess import (
     bound_excess,
     excess_of_episodes,
 )
+from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
 from sb3_yann.improvement.confirmation import RULE
 from sb3_yann.policy.checkpoint import ActorCheckpoint

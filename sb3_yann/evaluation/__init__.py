@@ -1,8 +1,11 @@
-"""Seeded episodes, what they cost before and after training, and pictures."""
+"""Seeded episodes, what they cost before and after training as it is printed, and pictures."""
 
 from __future__ import annotations
 
-from sb3_yann.compare import paired_rows, summary_lines
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.compare import Difference
 from sb3_yann.rollout import Trajectories, as_played, evaluate
 
 __all__ = ["Trajectories", "comparison_table", "evaluate"]
@@ -37,3 +40,38 @@ def comparison_table(title: str, before: Trajectories, after: Trajectories) -> s
     return summary_lines(
         "\n".join(lines), **paired_rows(after.costs, before.costs), violations=violations
     )
+
+
+def summary_lines(verdict: str, **rows: str) -> str:
+    """Return a verdict and what it rests on, one row each; rows without text are left out.
+
+    `improve`, `headroom`, the guard and commissioning all print the same rows, in the same order:
+    change, worst start, violations, steps, next.
+    """
+    shown = (f"  {name.replace('_', ' '):<13}{text}" for name, text in rows.items() if text)
+    return "\n".join([verdict, *shown])
+
+
+def change_in_percent(change: float, interval: tuple[float, float] | None = None) -> str:
+    """Return a change relative to the MPC's cost in %, with its interval of 90 %."""
+    change, *ends = (round(100 * each, 2) + 0.0 for each in (change, *(interval or ())))  # no -0.00
+    known = len(ends) == 2 and np.all(np.isfinite(ends))
+    return f"{change:+.2f} %" + (f" ({ends[0]:+.2f} to {ends[1]:+.2f} %, 90 %)" if known else "")
+
+
+def paired_rows(
+    costs: Array, mpc: Array, *, level: float = 0.05, in_turns: bool = False
+) -> dict[str, str]:
+    """Return the rows `change` and `worst_start` of costs from the same starts as the MPC's."""
+    change = f"{costs.mean():.5g} instead of {mpc.mean():.5g} over {len(costs)} episodes"
+    size = float(np.abs(mpc).mean())
+    if not (size and np.isfinite(size)):
+        return {"change": change}
+    more = (costs - mpc) / size
+    found = Difference.of(more, in_turns=in_turns)
+    room = found.room(level)
+    shown = change_in_percent(found.mean, (found.mean - room, found.mean + room))
+    return {
+        "change": f"{shown}; {change}",
+        "worst_start": f"{change_in_percent(more.max())} of the MPC's mean cost",
+    }

@@ -19,7 +19,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann._validation import Array, check_type
-from sb3_yann.compare import Scores, Starts, less_safe, paired_rows, summary_lines
+from sb3_yann.compare import Scores, Starts, less_safe
+from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import StartsAsMPC
 

@@ -19,9 +19,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
-from sb3_yann.compare import change_in_percent, summary_lines
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
+from sb3_yann.evaluation import change_in_percent, summary_lines
 from sb3_yann.improvement.confirmation import (
     ENOUGH,
     FIRST_LOOK,

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import Array, check_int
-from sb3_yann.compare import change_in_percent, less_safe, paired_rows, summary_lines
+from sb3_yann.compare import less_safe
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.augmented import SHARE
+from sb3_yann.evaluation import change_in_percent, paired_rows, summary_lines
 from sb3_yann.improvement.simulator import (
     OutOfStepsError,
     Simulator,
