@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
@@ -19,6 +21,23 @@ LARGEST_BOUND = 1e100
 
 class NonFiniteWarning(RuntimeWarning):
     """An observation, a reward, an action or a gradient is not a finite number."""
+
+
+LIBRARIES = frozenset(
+    "sb3_yann sb3_yann_envs stable_baselines3 sb3_contrib gymnasium torch numpy joblib dataclasses "
+    "contextlib functools".split()
+)
+"""A warning is about none of their lines, but about the one that called them."""
+
+
+def warn(words: str, kind: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the user's that led here, however deep this is called."""
+    frame = sys._getframe(1)
+    level = 2
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in LIBRARIES:
+        frame = frame.f_back
+        level += 1
+    warnings.warn(words, kind, stacklevel=level)
 
 
 def check_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import Array, check_int, check_range, check_type
+from sb3_yann._validation import Array, check_int, check_range, check_type, warn
 from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.policy.exploring import Explores
 from sb3_yann.policy.observations import normalized, require_frozen, require_same_statistics
@@ -53,11 +52,10 @@ class NoActionNoise(BaseCallback):
 
     def _init_callback(self) -> None:
         if isinstance(self.model.policy, Explores):
-            warnings.warn(
+            warn(
                 f"NoActionNoise turns nothing off here: {type(self.model).__name__} adds no noise, "
                 "its policy draws its actions. policy_kwargs={'initial_std': ...} says how far "
                 "from the MPC's, and predict(..., deterministic=True) draws none.",
-                stacklevel=2,
             )
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
         if not hasattr(self.model, "replay_buffer"):

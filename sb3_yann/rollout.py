@@ -7,7 +7,6 @@ import importlib
 import itertools
 import random
 import sys
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -21,7 +20,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array, check_int, check_type, half_widths
+from sb3_yann._validation import Array, check_int, check_type, half_widths, warn
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
@@ -478,7 +477,7 @@ def _watch_length(env: Any, steps: int) -> None:
     )
     if steps == MAX_EPISODE_STEPS:
         raise RuntimeError(message)
-    warnings.warn(message, stacklevel=3)
+    warn(message)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
@@ -14,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.wrapper_stack import require_state_shown
@@ -59,12 +58,10 @@ class CostMismatchError(RuntimeError):
     """
 
 
-def warn_of_order(
-    problem: LinearMPC, theta: Array, u: Array, following: Array, stacklevel: int
-) -> None:
+def warn_of_order(problem: LinearMPC, theta: Array, u: Array, following: Array) -> None:
     """Warn where the model predicts the steps of an env in another reading of its states alone."""
     if words := misread_states(problem, theta, u, following):
-        warnings.warn(words, stacklevel=stacklevel)
+        warn(words)
 
 
 def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array) -> str:
@@ -160,7 +157,6 @@ def warn_of_signs(
     *,
     theta: Callable[[Array], Array] = np.asarray,
     inputs: Callable[[Array], Array] = np.asarray,
-    stacklevel: int,
 ) -> None:
     """Warn where an input moves the states against the model, in the first step of some starts.
 
@@ -192,11 +188,10 @@ def warn_of_signs(
             if size > 0 and np.linalg.norm(effect) > LEAST_EFFECT:
                 gains.append(float(effect @ expected) / size)
         if len(gains) == len(starts) > 0 and max(gains) < 0:
-            warnings.warn(
+            warn(
                 f"{name} moves the env against the sign of the model's B: {np.median(gains):.2g} "
                 f"times as far in a step, from {len(gains)} starts. The MPC steers the wrong way. "
                 "Look at the sign and the order of the actions, and at B.",
-                stacklevel=stacklevel,
             )
 
 
@@ -219,7 +214,7 @@ def below_set_points(env: gym.Env[Any, Any]) -> bool:
     return False
 
 
-def warn_of_own_reward(problem: LinearMPC, played: Trajectories, stacklevel: int) -> None:
+def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:
     """Warn where rewards are not minus the stage cost, times a constant and up to one.
 
     The constant may be each episode's own: it ranks no controllers. The cost may be that of the
@@ -232,14 +227,13 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories, stacklevel: int
         return
     share = max(_explained(-cost, rewards, known) for cost in costs)
     if share < EXPLAINED_REWARD:
-        warnings.warn(
+        warn(
             f"The env has a reward of its own, and it is ignored: the MPC's stage cost explains "
             f"{100 * share:.0f} % of it over {np.count_nonzero(known)} steps of the MPC. What "
             "counts here is the MPC's stage cost. If the reward is what you want, state it in Q "
             "and R of the MPC, or learn under an ImprovementGuard or a Commissioning, which go by "
             "the reward; else wrap the env in sb3_yann.wrappers.StageCost(env, mpc).",
             CostMismatchWarning,
-            stacklevel=stacklevel,
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import Array, check_bool, check_int, check_positive
+from sb3_yann._validation import Array, check_bool, check_int, check_positive, warn
 from sb3_yann.audit.meaning import CostMismatchError, CostMismatchWarning, warn_of_order
 from sb3_yann.policy.observations import require_frozen
 from sb3_yann.policy.policies import require_yann_policy
@@ -255,7 +254,7 @@ class CostAudit(BaseCallback):
         if count < MIN_STEPS and finite.all():
             return
         if not self.order_checked:
-            warn_of_order(self.policy.problem, theta, u, following, stacklevel=2)
+            warn_of_order(self.policy.problem, theta, u, following)
         line = Line.through(-compared.cost, compared.rewards)
         cause, explanation = self._vec_normalize_switched_on()
         if not cause and count >= MIN_STEPS and not compared.match(self.tolerance):
@@ -275,7 +274,7 @@ class CostAudit(BaseCallback):
         elif self.strict:
             raise CostMismatchError(message)
         else:
-            warnings.warn(message, CostMismatchWarning, stacklevel=2)
+            warn(message, CostMismatchWarning)
 
     def _theta(self, observations: Array) -> Array:
         if not len(observations):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, warn
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
@@ -322,10 +321,9 @@ class AcceptedPolicy:
         if held.is_actor_of(self.policy) and bound == self.policy.max_correction:
             return
         self._become(held, bound)
-        warnings.warn(
+        warn(
             "The model's actor is not the one that was accepted: that one is restored. Train "
             "another copy of the model, not the one that is being commissioned.",
-            stacklevel=2,
         )
 
     @contextmanager

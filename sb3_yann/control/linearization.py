@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -12,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, check_array, check_positive, check_positive_vector, to_float
+from sb3_yann._validation import (
+    Array,
+    check_array,
+    check_positive,
+    check_positive_vector,
+    to_float,
+    warn,
+)
 from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.lqr import unreached
 from sb3_yann.control.simulator import (
@@ -160,7 +166,7 @@ def _partly_known(name: str, value: ArrayLike) -> Array:
     return array
 
 
-def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
+def _idle_inputs(B: Array) -> list[str]:
     """Return a note on inputs without effect, and warn of them."""
     idle = np.flatnonzero(~np.any(B, axis=0))
     if not idle.size:
@@ -169,7 +175,7 @@ def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
         f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. With a delay or an "
         "actuator, make the inputs on their way part of the state; leave out an idle input."
     )
-    warnings.warn(note, stacklevel=stacklevel)
+    warn(note)
     return [note]
 
 
@@ -387,15 +393,14 @@ def linearize_env(
         found = _linearize(simulator, x, u, step_time, scale)
         moves = np.linalg.svd(found.A - np.eye(len(found.A)), compute_uv=False)
         if x is None and moves[-1] <= 1e-6 * moves[0]:
-            warnings.warn(
+            warn(
                 f"The plant rests at other states too: x_ss = {found.x_ss.tolist()} is where a "
                 "reset led. Pass the state to hold, x_ss=[...].",
-                stacklevel=3,
             )
         fault = _time_limit_fault(borrowed.env, found.u_ss) if borrowed.private else ""
         if not fault:
             return found
-        warnings.warn(fault, stacklevel=3)
+        warn(fault)
         return replace(found, notes=(*found.notes, fault))
 
 
@@ -425,7 +430,7 @@ def _linearize(
     A = found.value[:, :n]
     B = found.value[:, n:]
     notes = [
-        *_idle_inputs(B, 5),
+        *_idle_inputs(B),
         "Linearized by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
@@ -532,7 +537,7 @@ def linearize_dynamics(
     A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
     A, B, E = zero_order_hold(A, B, E, dt)
     x, u, d = np.split(point, np.cumsum(sizes[:2]))
-    notes += [*_idle_inputs(B, 4), *curvature(found, names(sizes))]
+    notes += [*_idle_inputs(B), *curvature(found, names(sizes))]
     return LinearSystem(A, B, dt, x, u, E, d, tuple(notes))
 
 
@@ -618,10 +623,9 @@ def _require_steady(rate: Rate, parts: list[Array], size: Array, dt: float, scal
             "solved for."
         )
     if not scaled and np.any((moved > MOVES * np.abs(x)) & (x != 0) & (moved > 1e-8)):
-        warnings.warn(
+        warn(
             f"In one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
             f"{moved.tolist()}, much beside itself. Pass scale=..., how far each state moves.",
-            stacklevel=4,
         )
 
 

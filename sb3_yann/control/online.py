@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
-from sb3_yann._validation import Array, check_array, check_choice, check_int, half_widths
+from sb3_yann._validation import Array, check_array, check_choice, check_int, half_widths, warn
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import (
     MILD,
@@ -216,13 +215,12 @@ class OnlineLaw(PlantLaw):
             return
         vars(self)["_has_warned"] = True
         steps = (len(self.c) - self.n_slacks) // self.n_inputs
-        warnings.warn(
+        warn(
             f"{lqr.long_horizon(self.model.A, steps)}, no solution was found at theta = "
             f"{rows[inside][0].tolist()}: no input brings the model back from there, or a hard "
             "bound cannot be kept. Predictions run away, and rounding hides the law. The input is "
             "bounded, but not the MPC's; law.in_domain is False. Give theta_min and theta_max the "
             "states from which inputs bring it back, or pass a shorter horizon.",
-            stacklevel=4,
         )
 
     def _answers(self, rows: Array) -> tuple[Array, NDArray[np.bool_], Answers, Answers | None]:

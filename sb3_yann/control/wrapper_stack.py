@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+
+from sb3_yann._validation import warn
 
 LIBRARIES = {"gymnasium", "stable_baselines3"}
 LEAVE_OUT = (
@@ -53,10 +54,9 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
             late := _library_names(layer) & {"DelayObservation", "StickyAction"}
         ):
             what = "shows past states" if "DelayObservation" in late else "repeats past inputs"
-            warnings.warn(
+            warn(
                 f"{name} {what}, and the law is one of the present state and input. Leave it out, "
                 "or put the inputs that are under way into the model's state.",
-                stacklevel=3,
             )
         is_wrapped = getattr(layer, "env_is_wrapped", None)
         if is_wrapped is not None and "envs" not in vars(layer) and "venv" not in vars(layer):

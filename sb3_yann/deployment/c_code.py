@@ -10,7 +10,6 @@ import signal
 import subprocess
 import tempfile
 import uuid
-import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -23,7 +22,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, warn
 from sb3_yann.deployment import code
 from sb3_yann.deployment.code import (
     Arrays,
@@ -377,10 +376,9 @@ def _library(sources: dict[str, str]) -> bytes:
             raise
         if process.returncode == 0:
             return (Path(folder) / "library").read_bytes()
-    warnings.warn(
+    warn(
         f"{compiler} failed, so the FMU holds sources and no library: {errors.strip()[:300]}",
         RuntimeWarning,
-        stacklevel=2,
     )
     return b""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -17,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
-from sb3_yann._validation import check_bool, check_int, check_options, check_range
+from sb3_yann._validation import check_bool, check_int, check_options, check_range, warn
 from sb3_yann.audit.reward import CostAudit
 from sb3_yann.compare import AcceptanceRule
 from sb3_yann.evaluation.plots import plot_decisions
@@ -293,10 +292,9 @@ class ImprovementGuard(BaseCallback):
             player.max_input_step = known.max_input_step
             goes_on = still_holds(known.evidence, player)
             if not goes_on:
-                warnings.warn(
+                warn(
                     f"The guard's env {settings.env} does not play the episodes of before: it is "
                     "another simulator of that name. The policies are tried anew.",
-                    stacklevel=2,
                 )
         if not goes_on:
             player.max_input_step = None
@@ -352,11 +350,10 @@ class ImprovementGuard(BaseCallback):
         """Warn where the training env pays the MPC's cost, and the guard's env something else."""
         found = None if self._audit is None else self._audit.finding
         if found is not None and found.matches and not self.player.pays_cost:
-            warnings.warn(
+            warn(
                 f"The training env pays minus the cost of the MPC, and the guard's env "
                 f"{self.settings.env} pays something else, by which policies are compared. Give "
                 "the guard the env of the training, with the same StageCost.",
-                stacklevel=2,
             )
 
     def _try_candidate(self) -> None:
@@ -415,11 +412,10 @@ class ImprovementGuard(BaseCallback):
         for each in all_callbacks(self.locals.get("callback")):
             if folder := getattr(each, "best_model_save_path", None):
                 instead = (self.save_path or Path(folder)) / ACCEPTED_FILE
-                warnings.warn(
+                warn(
                     f"The best_model.zip that {type(each).__name__} keeps in {folder} is a "
                     f"candidate, which no guard has accepted. Load {instead} instead, or the model "
                     "that learn leaves behind.",
-                    stacklevel=2,
                 )
                 return instead.parent
         return self.save_path
@@ -440,7 +436,7 @@ class ImprovementGuard(BaseCallback):
             self._saved = accepted
         except OSError as error:
             self._saved = None
-            warnings.warn(f"{path} could not be written ({error}). Training goes on.", stacklevel=2)
+            warn(f"{path} could not be written ({error}). Training goes on.")
         finally:
             if not self.player.interrupted:
                 own.restore(policy)
@@ -448,11 +444,10 @@ class ImprovementGuard(BaseCallback):
     def _warn_of_an_endless_episode(self, dones: Any) -> None:
         self._steps = np.where(dones, 0, self._steps + 1)
         if np.any(self._steps == LONG_EPISODE):
-            warnings.warn(
+            warn(
                 f"An episode of the training env has not ended after {LONG_EPISODE} steps, and the "
                 "guard decides at the ends of episodes. Give it a limit, by "
                 "gymnasium.wrappers.TimeLimit.",
-                stacklevel=2,
             )
 
     def _on_training_end(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from types import FrameType
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 
+from sb3_yann._validation import warn
 from sb3_yann.audit.meaning import warn_of_order, warn_of_signs
 from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, Scores, Starts
 from sb3_yann.control import LinearMPC
@@ -88,10 +88,9 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
                 "is random in the env must come from self.np_random."
             )
     if len(seeds) > 1 and _all_alike(mpc):
-        warnings.warn(
+        warn(
             f"All {len(seeds)} starts of the guard's env {name} are one and the same: its reset "
             "ignores its seed. What the guard accepts is compared from this start only.",
-            stacklevel=2,
         )
     _warn_of_misreading(player, seeds, mpc)
     if settings.rule.max_input_step is not None:
@@ -127,7 +126,7 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
     inputs = [policy.inputs(each) for each in mpc.actions]
     before = np.concatenate([each[:-1] for each in thetas])
     after = np.concatenate([each[1:] for each in thetas])
-    warn_of_order(policy.problem, before, np.concatenate(inputs), after, stacklevel=2)
+    warn_of_order(policy.problem, before, np.concatenate(inputs), after)
     options = policy.critic_options
     rewards = np.concatenate(mpc.own_rewards)
     cost = policy.problem.deviations.stage_cost(before, np.concatenate(inputs))
@@ -137,7 +136,7 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
     player.pays_cost = not np.mean(error) > SAME * options.reward_scale * np.mean(cost)
     with preserve_rng(), player.envs.acquire(1) as (env,):
         maps = {"theta": player.theta, "inputs": policy.inputs}
-        warn_of_signs(policy.problem, env, seeds, mpc, **maps, stacklevel=2)
+        warn_of_signs(policy.problem, env, seeds, mpc, **maps)
     if player.interrupted:  # and a simulator has made of it what it can
         raise KeyboardInterrupt
 

@@ -6,7 +6,6 @@ import csv
 import io
 import math
 import os
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -18,7 +17,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
-from sb3_yann._validation import Array, check_type
+from sb3_yann._validation import Array, check_type, warn
 from sb3_yann.compare import Scores, Starts, less_safe
 from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.policy.checkpoint import ActorCheckpoint
@@ -256,9 +255,7 @@ class Record:
                 numbered = (path.with_name(f"{path.stem}.{i}{path.suffix}") for i in count(1))
                 beside = next(each for each in numbered if not each.exists())
                 os.rename(path, beside)
-                warnings.warn(
-                    f"{path} held the record of another run: it is {beside} now.", stacklevel=2
-                )
+                warn(f"{path} held the record of another run: it is {beside} now.")
         self.write(decisions)
 
     def write(self, decisions: list[Decision]) -> None:
@@ -268,11 +265,10 @@ class Record:
             with atomic_write(self.path) as part:
                 part.write_text(as_csv(decisions), encoding="utf-8", newline="")
         except OSError as error:
-            warnings.warn(
+            warn(
                 f"The guard's record {self.path} could not be written ({error}). Training goes on, "
                 "and guard.decisions has all decisions; the record is completed once there is "
                 "room.",
-                stacklevel=2,
             )
 
 

@@ -54,7 +54,6 @@ MOST = 60  # of such episodes, at most
 PUSH = 0.5  # half-widths by which inputs are moved at random, at most
 OFTEN = 0.7  # share of the time in which they are
 HELD = 5  # steps for which they stay
-CALLER = 6  # stack level of whoever calls `improve` or `headroom`, for warnings
 
 
 class OutOfStepsError(Exception):
@@ -188,11 +187,11 @@ class Simulator:
         require_repeated(problem, self.envs, seeds[0], played.costs[0])
         if not checked:
             return played
-        warn_of_order(problem, *played.steps(), stacklevel=CALLER)
+        warn_of_order(problem, *played.steps())
         with self.envs.acquire(1) as (one,):
-            warn_of_signs(problem, one, seeds, played, stacklevel=CALLER)
+            warn_of_signs(problem, one, seeds, played)
         if not self.unaware:
-            warn_of_own_reward(problem, played, stacklevel=CALLER)
+            warn_of_own_reward(problem, played)
         return played
 
     def excite(self, count: int) -> Trajectories:

@@ -6,7 +6,6 @@ Actions are in [-1, 1]. Stable-Baselines3 gives them units, in its `unscale_acti
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -25,6 +24,7 @@ from sb3_yann._validation import (
     check_number,
     check_options,
     check_positive,
+    warn,
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.mpc.problem import Value
@@ -200,7 +200,7 @@ class YannActor(KeepsPrecision, SeesTheta, Actor):
         names = problem.labels() if named else ()
         said = what_is_not_finite(lost.cpu().numpy(), names)
         if said != self.named:  # once, for a sensor that stays so
-            warnings.warn(said, NonFiniteWarning, stacklevel=3)
+            warn(said, NonFiniteWarning)
         self.named = said
         return th.where(whole, actions, self.mu.law(theta).to(actions))
 

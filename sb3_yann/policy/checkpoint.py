@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_yann._validation import check_type
+from sb3_yann._validation import check_type, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
@@ -265,7 +264,7 @@ def retarget(model: Model, mpc: LinearMPC, env: Any = None) -> Model:
     target: Any = found.policy.actor_target
     target.load_state_dict(actor.state_dict())
     if lost:
-        warnings.warn(f"What was learnt and is not kept: {'; '.join(lost)}.", stacklevel=2)
+        warn(f"What was learnt and is not kept: {'; '.join(lost)}.")
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
@@ -15,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from sb3_yann._validation import Array, check_int
+from sb3_yann._validation import Array, check_int, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
@@ -176,7 +175,7 @@ def require_inverse_normalization(
     normalize = algorithm.get_vec_normalize_env()
     if normalize is None:
         if getattr(algorithm, "sees_normalized", False) and algorithm.get_env() is not None:
-            warnings.warn(LOST_STATISTICS, stacklevel=4)
+            warn(LOST_STATISTICS)
         return
     require_frozen(normalize)
     if not normalize.norm_obs:
@@ -260,7 +259,7 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
 def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
     """Warn where an env shows deviations, and the problem is in plant units."""
     if words := problem.shown_as_deviation(problem.units.to_plant(theta)):
-        warnings.warn(words, stacklevel=4)
+        warn(words)
 
 
 def require_theta(

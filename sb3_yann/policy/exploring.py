@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,7 +14,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
-from sb3_yann._validation import check_bool, check_range
+from sb3_yann._validation import check_bool, check_range, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.policy.actor_critic import YannActor, YannCritic
 from sb3_yann.policy.policies import NOT_OURS, StartsAsMPC
@@ -146,12 +145,11 @@ class Explores(StartsAsMPC):
         if not self.simulator and not self.guarded:
             self.explored = True
             name = type(algorithm).__name__
-            warnings.warn(
+            warn(
                 f"{name} explores: it draws its actions, {100 * self.initial_std:.3g} % of the "
                 "input range around the policy's at first, limits or not, and nothing confirms "
                 "what it learns. That belongs into a simulator, with an ImprovementGuard among "
                 "the callbacks. If this env is one: policy_kwargs={'simulator': True}.",
-                stacklevel=4,
             )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

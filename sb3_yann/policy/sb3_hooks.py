@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import sys
-import warnings
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_yann._validation import NonFiniteWarning
+from sb3_yann._validation import NonFiniteWarning, warn
 
 
 def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
@@ -144,12 +143,11 @@ class FiniteRows:
         self.named.update(dict.fromkeys(new, self.rows))
         if new:
             what = ", ".join(f"{name}[{j}] of env {i} is {found[name, i, j]}" for name, i, j in new)
-            warnings.warn(
+            warn(
                 f"Step {self.rows}: {what}. The transition is not learnt from"
                 f"{' (nor are those of the other envs)' if buffer.n_envs > 1 else ''}; "
                 f"{self.left_out} left out so far. Mend the env or the sensor.",
                 NonFiniteWarning,
-                stacklevel=3,
             )
 
 
@@ -200,11 +198,10 @@ def warn_of_refused_step(
         advice = "The env has paid rewards that are not finite: mend it."
     if not all(bool(each.isfinite().all()) for each in _weights(optimizer)):
         advice = f"The weights of the {name} are not finite any more: load an earlier save."
-    warnings.warn(
+    warn(
         f"The gradient of the {name} is not finite, or too large for float32: this step is not "
         f"taken ({refused} so far). {advice}",
         NonFiniteWarning,
-        stacklevel=5,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, to_float
+from sb3_yann._validation import Array, to_float, warn
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.log import Log
 from sb3_yann.rollout import is_vec_env
@@ -285,10 +284,9 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
         return
     left = moved - e @ np.linalg.lstsq(e, moved, rcond=None)[0]
     if np.sum((left / half) ** 2) <= EXPLAINED * np.sum((moved / half) ** 2):
-        warnings.warn(
+        warn(
             "The disturbances of the log follow the model's errors, as an observer's estimate "
             "does. A twin takes them for measured ones, which the policy does not move. Pass "
             "observer=, the one of ObserveDisturbance.",
             EstimatedDisturbanceWarning,
-            stacklevel=4,
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -13,7 +12,7 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, check_bounds, check_int, check_number, check_type
+from sb3_yann._validation import Array, check_bounds, check_int, check_number, check_type, warn
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
@@ -214,12 +213,11 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         if ratio := ratio_of_time_units(env._slope, mpc):
             faster = ratio < 1
             times = 1 / ratio if faster else ratio
-            warnings.warn(
+            warn(
                 f"f(x, u) is {times:g} times as {'fast' if faster else 'slow'} as the model of the "
                 f"MPC, whose dt = {mpc.model.dt:g}{f' {mpc.model.time_unit}'.rstrip()}. If f is in "
                 "another unit of time than dt, pass lambda x, u: np.asarray(f(x, u)) "
                 f"{'/' if faster else '*'} {times:g}.",
-                stacklevel=2,
             )
         if layout.n_references:
             r = mpc.tracking

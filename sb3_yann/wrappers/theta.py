@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -13,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, NonFiniteWarning, check_int, check_type, check_vector
+from sb3_yann._validation import Array, NonFiniteWarning, check_int, check_type, check_vector, warn
 from sb3_yann.control import DisturbanceObserver, StateEstimator
 from sb3_yann.units import Units
 
@@ -372,11 +371,10 @@ class MeasuredDisturbance(Appending):
         failing = ~np.isfinite(d)
         self.held = np.where(failing, self.held, d)
         if np.any(failing & ~self.failing):  # once, for a sensor that stays so
-            warnings.warn(
+            warn(
                 f"info[{self.key!r}] = {d.tolist()} is not finite: {self.held.tolist()} holds "
                 "until it is again. Mend the sensor.",
                 NonFiniteWarning,
-                stacklevel=3,
             )
         self.failing = failing
         return joined(observation, self.held)
@@ -497,7 +495,7 @@ class EstimateState(Appending):
         if np.any((failing & ~self.failing)[observer.every == 1]):  # once, for one that stays so
             shown = observation[: len(measured)].tolist()
             at = f"The measurement {shown} is not finite: the observer predicts it."
-            warnings.warn(at, NonFiniteWarning, stacklevel=4)
+            warn(at, NonFiniteWarning)
         self.failing = failing
         measured[failing] = np.nan
         if u is None:

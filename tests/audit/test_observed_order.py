@@ -59,7 +59,7 @@ def told(env: gym.Env, mpc: LinearMPC = MPC, episodes: int = 3) -> list[str]:
     steps = [np.concatenate([part] * episodes) for part in played.steps()]
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        warn_of_order(mpc, *steps, stacklevel=2)
+        warn_of_order(mpc, *steps)
     return [str(each.message) for each in found]
 
 
@@ -159,7 +159,7 @@ def test_of_two_states_that_are_alike_neither_order_is_reported() -> None:
     twins = LinearModel(np.eye(2) / 2, [[1], [1]], dt=1.0)
     mpc = LinearMPC(twins, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
     theta, u = np.random.default_rng(0).normal(size=(40, 2)), np.zeros((40, 1))
-    warn_of_order(mpc, theta, u, theta[:, ::-1] / 2, stacklevel=2)  # a warning would be an error
+    warn_of_order(mpc, theta, u, theta[:, ::-1] / 2)  # a warning would be an error
 
 
 BOX = {"theta_min": -9, "theta_max": 9}
@@ -172,9 +172,9 @@ def test_of_six_states_two_that_are_exchanged_are_reported() -> None:
     theta, u, order = rng.normal(size=(80, 6)), rng.uniform(-1, 1, (80, 1)), [0, 4, 2, 3, 1, 5]
     after = mpc.predict(theta, u)
     with pytest.warns(UserWarning, match=r"Show x\[\[0, 4, 2, 3, 1, 5\]\]"):
-        warn_of_order(mpc, theta[:, order], u, after[:, order], stacklevel=2)
+        warn_of_order(mpc, theta[:, order], u, after[:, order])
     few = slice(59)
-    warn_of_order(mpc, theta[few, order], u[few], after[few, order], stacklevel=2)
+    warn_of_order(mpc, theta[few, order], u[few], after[few, order])
 
 
 @pytest.mark.parametrize("name", ["CSTR-v0", "ClippedPendulum-v0"])

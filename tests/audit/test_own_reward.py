@@ -71,7 +71,7 @@ def told(env, problem: LinearMPC, seeds: int = 4) -> list[str]:
     played = rollout(of_law(problem), env, range(seeds), problem=problem)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        warn_of_own_reward(problem, played, stacklevel=2)
+        warn_of_own_reward(problem, played)
     return [str(each.message) for each in found]
 
 
@@ -122,7 +122,7 @@ def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
             none.astype(bool),
             own_rewards=(rewards,),
         )
-        warn_of_own_reward(problem, played, stacklevel=2)
+        warn_of_own_reward(problem, played)
 
 
 def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:

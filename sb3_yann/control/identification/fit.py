@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -10,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, check_choice, check_range, check_vector
+from sb3_yann._validation import Array, check_choice, check_range, check_vector, warn
 from sb3_yann.control.identification.dead_time import (
     as_delays,
     exact_memory,
@@ -82,7 +81,7 @@ def fit_log(
     system = replace(_with_exact_memory(system, delays, sizes[0]), time_unit=log.time_unit)
     late = [] if any(delays) else input_notes(found, episodes, sizes)
     if late:
-        warnings.warn(" ".join(late), stacklevel=3)
+        warn(" ".join(late))
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
     notes = [*system.notes, *_memory_notes(delays, sizes, system.u_ss), *quality, *shrunk, *late]
     if log.lost_steps:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, check_array, check_bounds, check_symmetric, to_float
+from sb3_yann._validation import Array, check_array, check_bounds, check_symmetric, to_float, warn
 from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
@@ -480,11 +479,10 @@ class LinearMPC(MPCProblem):
             found = self._found_soon()
             if isinstance(found, PiecewiseAffine):
                 return found
-            warnings.warn(
+            warn(
                 f"The program will be solved online, at each point. {found} To skip the search, "
                 "and this warning, choose problem.law('online'), or law='online' of a policy.",
                 OnlineLawWarning,
-                stacklevel=2,
             )
         vars(self)[ONLINE_CHOSEN] = True
         return self.online()
@@ -602,11 +600,10 @@ def _warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
     width = (upper - lower) / 2
     size = np.where(np.isfinite(width), width, np.maximum(np.abs(model.x_ss), 1.0))
     if np.any(np.abs(model.drift) > DRIFT * size):
-        warnings.warn(
+        warn(
             f"x_ss = {model.x_ss.tolist()} with u_ss = {model.u_ss.tolist()} is no steady state: "
             f"there the plant moves by {model.drift.tolist()} in one sample, and the law will rest "
             "beside its references. Identify it with an x_ss and u_ss at which it rests.",
-            stacklevel=3,
         )
 
 
@@ -617,11 +614,10 @@ def _warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> No
     unused = (softness > 0) & (low >= lower) & (high <= upper)
     if np.any(unused):
         i = int(np.argmax(unused))
-        warnings.warn(
+        warn(
             f"SoftBounds.x softens the bounds {lower[i]:g} to {upper[i]:g} of x[{i}], but theta_min"
             f" = {low[i]:g} and theta_max = {high[i]:g} do not exceed them: the law ends there. "
             "Give theta_min and theta_max the states from which it is to come back.",
-            stacklevel=3,
         )
 
 
@@ -639,12 +635,11 @@ def _warn_of_misread_bounds(
             low = lower[i]
             high = upper[i]
             point = points[i]
-            warnings.warn(
+            warn(
                 f"{name}_min = {low:g} and {name}_max = {high:g} of entry {i} leave out the "
                 f"operating point, {point:g}, and hold 0. Bounds are what the plant shows. If "
                 f"these are deviations, pass {name}_min = {low + point:g} and {name}_max = "
                 f"{high + point:g}, or leave x_ss and u_ss out of the model.",
-                stacklevel=3,
             )
             return
     if has_constants:
@@ -655,18 +650,16 @@ def _warn_of_misread_bounds(
         cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
     for i in np.flatnonzero(left_out["u"]):
         low, high, point = (each[i] for each in ranges["u"])
-        warnings.warn(
-            f"u_min = {low:g} and u_max = {high:g} leave out u[{i}] = {point:g}, "
+        warn(
+            f"u_min = {low:g} and u_max = {high:g} leave out {labels_of(model)[1][i]} = {point:g}, "
             f"the operating point: the law cannot rest there. {cure}",
-            stacklevel=3,
         )
     for i in np.flatnonzero(has_point & (left_out["x"] | left_out["theta"])):
         low, high, point = (each[i] for each in ranges["x" if left_out["x"][i] else "theta"])
-        warnings.warn(
+        warn(
             f"{labels_of(model)[0][i]} = {point:g}, the operating point, lies outside its "
             f"bounds, {low:g} to {high:g}: the law cannot rest there. Look at the "
             "order of the states.",
-            stacklevel=3,
         )
 
 

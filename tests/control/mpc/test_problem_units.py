@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
+import warnings
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,17 @@ def test_an_input_that_cannot_rest_is_reported() -> None:
     box = {"theta_min": 0, "theta_max": 20, "u_min": 4, "u_max": 10}
     with pytest.warns(UserWarning, match=r"u_min = 4 and u_max = 10 leave out u\[0\] = 3, .*Line"):
         LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **box)
+
+
+def test_a_warning_names_the_line_that_led_to_it_and_comes_once() -> None:
+    tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3], input_names=["inflow"])
+    mpc = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, x_min=0, x_max=20, u_min=0, u_max=10)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        for _ in range(2):
+            dataclasses.replace(mpc, u_min=4)  # in a function that dataclasses writes
+    assert [each.filename for each in told] == [__file__]
+    assert "leave out inflow = 3, the operating point" in str(told[0].message)
 
 
 def test_a_box_that_leaves_out_the_operating_point_is_reported() -> None:
