@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -37,11 +36,9 @@ if TYPE_CHECKING:
 LEVELS = 6
 RATIO = 4.0
 """Number of steps that approach a point, and how much shorter each is than the one before."""
-SHORTER = 64.0  # factor by which steps shrink where a function has no value next to the point
 NOISE_FLOOR = 100.0
 """Effects below so many times the noise are none. Hundreds of operations of an integrator round
 ten times as much as one does, and a plant that forgets a state within a sample shows only that."""
-NO_VALUE = "it has no finite value on one of its sides"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,21 +68,16 @@ def jacobian(
     """Return the derivatives of f, from points (c,) to values (r,), by Richardson extrapolation.
 
     Each entry takes the extrapolation that agrees best with its neighbor over shorter steps:
-    Ridders (1982), *Advances in Engineering Software* 4, 75-76. ``steps`` (c,) are the longest,
-    and shorter where f has no value, NaN; ``noise`` (r,) is the error of each value, and ``actual``
-    the point at which f is evaluated for a given one, e.g. its float32 rounding. ValueError where
-    it has a kink or a jump at the point, or no value next to it.
+    Ridders (1982), *Advances in Engineering Software* 4, 75-76. ``steps`` (c,) are the longest;
+    those at whose ends f has no value, NaN, are left out. ``noise`` (r,) is the error of each
+    value, and ``actual`` the point at which f is evaluated for a given one, e.g. its float32
+    rounding. ValueError where f has a kink or a jump at the point, or no value next to it.
     """
     begin = actual(point)
     center = f(begin)
-    steps = steps.copy()
     columns = []
     for i, label in enumerate(labels):
         found = _column(f, center, begin, i, steps[i], noise, actual)
-        for _ in range(2):
-            if found == NO_VALUE:
-                steps[i] /= SHORTER
-                found = _column(f, center, begin, i, steps[i], noise, actual)
         if isinstance(found, str):
             raise ValueError(
                 f"The plant cannot be linearized at {point.tolist()}: along {label}, {found}, with "
@@ -112,38 +104,37 @@ def _column(
     actual: Callable[[Array], Array],
 ) -> tuple[Array, Array, float] | str:
     """Return derivatives by coordinate i, their errors and the change; or why there are none."""
-    rows = []
-    for level in range(LEVELS):
+    sides: list[Array] = []
+    widths = []
+    for level in range(2 * LEVELS):
         offset = np.zeros(point.size)
         offset[i] = longest / RATIO**level
         above = actual(point + offset)
         below = actual(point - offset)
         up = above[i] - point[i]
         down = point[i] - below[i]
-        if up <= 0 or down <= 0:
+        if up <= 0 or down <= 0 or len(sides) == LEVELS:
             break  # the step is lost in the rounding of the point
-        rows.append(
-            (np.concatenate([(f(above) - center) / up, (center - f(below)) / down]), up + down)
-        )
-    far = bool(rows) and bool(np.all(np.isfinite(rows[0][0])))
-    rows = [each for each in rows if np.all(np.isfinite(each[0]))]
-    if len(rows) < 3:
-        return NO_VALUE
-    one, other = np.split(np.array([sides for sides, _ in rows]), 2, axis=1)
-    span = np.array([[width] for _, width in rows])
+        slopes = np.array([(f(above) - center) / up, (center - f(below)) / down])
+        if np.all(np.isfinite(slopes)):
+            sides.append(slopes)
+            widths.append(up + down)
+    if len(sides) < 3:
+        return "it has no finite value on one of its sides"
+    one, other = np.swapaxes(sides, 0, 1)
+    span = np.array(widths)[:, None]
     slope = (one + other) / 2
     # Unequal sides (a point that is rounded) would leave a first-order error in the mean.
     value, error = _extrapolated(slope, RATIO**2, 2 * noise / span)
     kink, doubt = _extrapolated(one - other, RATIO, 4 * noise / span)
+    scale = np.max(np.abs(value))
     steepest = np.max(np.abs(value) + np.abs(kink) / 2)
-    floor = np.max(2 * noise / span[0])
     if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
         return "its slopes to the two sides differ (a kink)"
-    scale = np.max(np.abs(value))
-    if np.max(error) > max(0.2 * scale, NOISE_FLOOR * floor):
+    if np.max(error) > max(0.2 * scale, NOISE_FLOOR * np.max(2 * noise / span[0])):
         return "its slope has no limit for short steps (a jump or noise)"
     change = np.max(np.abs(slope[0] - value)) / scale if scale > 0 else 0.0
-    return value, error, float(change) if far else np.nan
+    return value, error, float(change) if widths[0] > longest else np.nan
 
 
 def _extrapolated(levels: Array, power: float, rounding: Array) -> tuple[Array, Array]:
@@ -153,6 +144,36 @@ def _extrapolated(levels: Array, power: float, rounding: Array) -> tuple[Array, 
     best = np.argmin(errors, axis=0)
     rows = np.arange(levels.shape[1])
     return limits[best, rows], errors[best, rows]
+
+
+def notes_of(found: Jacobian, labels: list[str]) -> list[str]:
+    """Return notes on what has no effect, dropped entries and strong nonlinearity.
+
+    An input without effect is warned of as well.
+    """
+    notes = []
+    idle = ~np.any(found.value, axis=0)
+    if inputs := ", ".join(labels[i] for i in np.flatnonzero(idle) if labels[i][0] == "u"):
+        notes.append(
+            f"{inputs} has no effect on the next state. With a delay or an actuator, make the "
+            "inputs on their way part of the state; leave out an idle input."
+        )
+        warn(notes[0])
+    if found.dropped > 0:
+        notes.append(
+            f"Derivatives that are not above their rounding error (at most {found.dropped:.1e}) "
+            "were set to zero."
+        )
+    for i, change in enumerate(found.change):
+        if not change <= 0.1:
+            what = "it has no value there" if np.isnan(change) else f"slopes differ by {change:.0%}"
+            notes.append(
+                f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
+                f"along {labels[i]}: {what}."
+            )
+        elif idle[i] and labels[i][0] != "u":
+            notes.append(f"{labels[i]} has no effect on the next state.")
+    return notes
 
 
 def _partly_known(name: str, value: ArrayLike) -> Array:
@@ -166,49 +187,23 @@ def _partly_known(name: str, value: ArrayLike) -> Array:
     return array
 
 
-def _idle_inputs(B: Array) -> list[str]:
-    """Return a note on inputs without effect, and warn of them."""
-    idle = np.flatnonzero(~np.any(B, axis=0))
-    if not idle.size:
-        return []
-    note = (
-        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. With a delay or an "
-        "actuator, make the inputs on their way part of the state; leave out an idle input."
-    )
-    warn(note)
-    return [note]
-
-
-def curvature(found: Jacobian, labels: list[str]) -> list[str]:
-    """Return notes on dropped entries, strong nonlinearity, and what has no effect."""
-    notes = []
-    if found.dropped > 0:
-        notes.append(
-            f"Derivatives that are not above their rounding error (at most {found.dropped:.1e}) "
-            "were set to zero."
-        )
-    for i, change in enumerate(found.change):
-        if not change <= 0.1:
-            what = "it has no value there" if np.isnan(change) else f"slopes differ by {change:.0%}"
-            notes.append(
-                f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
-                f"along {labels[i]}: {what}."
-            )
-        elif not np.any(found.value[:, i]) and not labels[i].startswith("u"):
-            notes.append(f"{labels[i]} has no effect on the next state.")
-    return notes
+def _slopes(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
+    """Return plain central differences (r, c) of f, over steps (c,)."""
+    return np.array([(f(point + h) - f(point - h)) / (2 * h.max()) for h in np.diag(steps)]).T
 
 
 def _least_moved(
-    moved: Callable[[Array], Array],
+    motion: Callable[[Array], Array],
     start: Array,
     free: NDArray[np.bool_],
     scale: Array,
-    xtol: float,
-    step: float = 0.0,
+    step: float,
     bounds: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
 ) -> tuple[Array, float]:
-    """Return the point that moves least, its free entries changed, and its motion in scales."""
+    """Return the point that moves least, its free entries changed, and its motion in scales.
+
+    The search takes slopes over a ``step``, in scales, and turns back where there is no value.
+    """
     from scipy.optimize import least_squares
 
     def at(z: Array) -> Array:
@@ -217,17 +212,17 @@ def _least_moved(
         return point
 
     def finite(z: Array) -> Array:
-        # Where there is no value, the search turns back.
-        return np.asarray(np.nan_to_num(moved(at(z)), nan=1e3, posinf=1e3, neginf=-1e3))
+        return np.asarray(np.nan_to_num(motion(at(z)), nan=1e3, posinf=1e3, neginf=-1e3))
 
-    def slopes(z: Array) -> Array:
-        steps = step * np.eye(z.size)
-        return np.array([(finite(z + h) - finite(z - h)) / (2 * step) for h in steps]).T
-
-    box = [np.broadcast_to(side, start.shape)[free] / scale[free] for side in bounds]
-    options: dict[str, Any] = {"xtol": xtol, "ftol": 1e-15, "gtol": 1e-15, "bounds": box}
-    options["jac"] = slopes if step else "2-point"
-    found = least_squares(finite, start[free] / scale[free], **options)
+    found = least_squares(
+        finite,
+        start[free] / scale[free],
+        jac=lambda z: _slopes(finite, z, np.full(z.size, step)),
+        bounds=[np.broadcast_to(side, start.shape)[free] / scale[free] for side in bounds],
+        xtol=1e-12,
+        ftol=1e-15,
+        gtol=1e-15,
+    )
     return at(found.x), float(np.max(np.abs(found.fun)))
 
 
@@ -236,6 +231,13 @@ AWAY = 1e-2  # largest distance to the linear model's steady state, relative to 
 SOLVED = 1e-6  # largest residual of a steady state that was solved for
 NOTHING = 1e-9  # a solved entry that is smaller, relative to its scale, is zero
 SETTLES = 2_000  # steps in which a plant may come to rest by itself
+SEARCH_STEP = 1e-3  # in scales, as a float32 state needs: SciPy's own would vanish in its rounding
+
+
+def _residual(simulator: Simulator, point: Array, scale: Array) -> Array:
+    """Return the motion of the state (n,) in one step, relative to the scale."""
+    reached = simulator.step(point)
+    return np.asarray((reached - point[: reached.size]) / scale[: reached.size])
 
 
 def _steady_state(
@@ -246,71 +248,58 @@ def _steady_state(
     ``start`` (n+m,) holds the known entries, and a guess for the free ones. ``scale`` (n+m,) is the
     range in which each moves in use.
     """
-    if not np.any(free):
-        return start
-    space: Any = simulator.env.action_space
-    n = scale.size - space.shape[0]
-    low = np.concatenate([np.full(n, -np.inf), space.low.astype(np.float64)])
-    high = np.concatenate([np.full(n, np.inf), space.high.astype(np.float64)])
+    low = np.full(scale.size, -np.inf)
+    high = np.full(scale.size, np.inf)
+    n = scale.size - simulator.space.shape[0]
+    low[n:] = simulator.space.low
+    high[n:] = simulator.space.high
 
-    def moved(point: Array) -> Array:
+    def motion(point: Array) -> Array:
         return _residual(simulator, point, scale)
 
-    # Steps as long as a float32 state needs; SciPy's own would vanish in its rounding.
-    options: dict[str, Any] = {"step": 1e-3, "bounds": (low, high), "xtol": 1e-12}
-    point = _least_moved(moved, start, free, scale, **options)[0]
-    left = moved(point)
-    if not np.max(np.abs(left)) <= SOLVED and np.all(free[:n]) and not np.any(free[n:]):
+    def search(start: Array) -> tuple[Array, float]:
+        return _least_moved(motion, start, free, scale, SEARCH_STEP, (low, high))
+
+    point, most = search(start)
+    if most > SOLVED and np.all(free[:n]) and not np.any(free[n:]):
         # A search may run away from where the plant comes to rest by itself.
-        other = _least_moved(moved, _settled(simulator, start, scale), free, scale, **options)[0]
-        if np.max(np.abs(moved(other))) <= SOLVED:
+        settled = start.copy()
+        for _ in range(SETTLES):
+            left = motion(settled)
+            if not SOLVED < np.max(np.abs(left)) < np.inf:
+                break
+            settled[:n] += left * scale[:n]
+        other, most_of_other = search(settled)
+        if most_of_other <= SOLVED:
             point = other
-            left = moved(point)
-    if not np.max(np.abs(left)) <= SOLVED:
+            most = most_of_other
+    if most > SOLVED:
         # What is left of the motion may be no more than the simulator's own error.
-        noise = noise_of(
-            lambda z: simulator.next_state(z[:n], z[n:]), point, scale * (np.arange(scale.size) < n)
-        )
-        noise = noise / scale[:n]
+        left = motion(point)
+        noise = noise_of(simulator.step, point, np.where(np.arange(scale.size) < n, scale, 0.0))
+        noise /= scale[:n]
         if not (np.all(np.abs(left) <= SOLVED + 5 * noise) and np.all(noise <= MOST)):
-            reason = (
-                simulator.refusal if np.any(np.isnan(left)) else f"{(left * scale[:n]).tolist()}"
-            )
             at_bound = [
-                f"u[{i}] is at its {side} bound, {bound[i]:g}"
-                for side, bound in (("lower", space.low), ("upper", space.high))
-                for i in np.flatnonzero(np.abs(point[n:] - bound) <= 1e-6 * scale[n:])
+                f"u[{i - n}] is at its {side} bound, {bound[i]:g}"
+                for side, bound in (("lower", low), ("upper", high))
+                for i in np.flatnonzero(np.abs(point - bound) <= 1e-6 * scale)
             ]
             stuck = f" {', '.join(at_bound)}: the inputs do not hold it." if at_bound else ""
+            moves = simulator.refusal if np.any(np.isnan(left)) else (left * scale[:n]).tolist()
             raise ValueError(
                 f"No steady state was found. The best is x_ss = {point[:n].tolist()}, u_ss = "
-                f"{point[n:].tolist()}, which moves in one step by {reason}.{stuck} Leave more "
+                f"{point[n:].tolist()}, which moves in one step by {moves}.{stuck} Leave more "
                 "entries free (NaN), or start closer to it."
             )
     return np.where(free & (np.abs(point) <= NOTHING * scale), 0.0, point)
 
 
-def _settled(simulator: Simulator, start: Array, scale: Array) -> Array:
-    """Return the point that the plant comes to with its action held, the last one with values."""
-    n = scale.size - simulator.env.action_space.shape[0]
-    point = start
-    for _ in range(SETTLES):
-        moved = _residual(simulator, point, scale)
-        if not np.all(np.isfinite(moved)):
-            break
-        point = np.concatenate([point[:n] + moved * scale[:n], point[n:]])
-        if np.max(np.abs(moved)) <= SOLVED:
-            break
-    return point
-
-
-def _require_steady_state(simulator: Simulator, point: Array, slopes: Array, scale: Array) -> None:
+def _require_steady_state(moved: Array, point: Array, slopes: Array, scale: Array) -> None:
     """Raise ValueError if a given operating point is far from the linear model's steady states.
 
-    Its motion alone says little: in a short sample a plant hardly moves from anywhere. The
-    ``slopes`` (n, n+m) are those of the next state at the point (n+m,).
+    How far it moves in one step (n,), in scales, says little: in a short sample a plant hardly
+    moves from anywhere. The ``slopes`` (n, n+m) are those of the next state at the point (n+m,).
     """
-    moved = _residual(simulator, point, scale)
     n = moved.size
     slopes = (slopes - np.eye(n, point.size)) * scale / scale[:n, None]
     way = np.linalg.lstsq(slopes, -moved, rcond=1e-9)[0]
@@ -322,12 +311,6 @@ def _require_steady_state(simulator: Simulator, point: Array, slopes: Array, sca
         )
 
 
-def _residual(simulator: Simulator, point: Array, scale: Array) -> Array:
-    """Return the motion of the state (n,) in one step, relative to the scale."""
-    n = scale.size - simulator.env.action_space.shape[0]
-    return (simulator.next_state(point[:n], point[n:]) - point[:n]) / scale[:n]
-
-
 LONGEST_EPISODE = 400  # steps after which an episode counts as one without an end of its own
 SECONDS = 1.0  # after which a slow one does
 
@@ -337,12 +320,11 @@ def _time_limit_fault(env: Any, action: Array) -> str:
 
     The env is reset and stepped with an action (m,) and another one; pass a copy.
     """
-    low = env.action_space.low
-    high = env.action_space.high
-    other = np.clip(action + 0.25 * np.minimum(high - low, 4.0), low, high)
+    space = env.action_space
+    other = action + 0.25 * np.minimum(space.high - space.low, 4.0)
     try:
         steps = _termination(env, 0, action)
-        if steps < 2 or steps != _termination(env, 1, other):
+        if steps < 2 or steps != _termination(env, 1, np.clip(other, space.low, space.high)):
             return ""
     except Exception:  # whatever a simulator raises away from its operating point
         return ""
@@ -360,10 +342,8 @@ def _termination(env: Any, seed: int, action: Array) -> int:
     begun = perf_counter()
     for step in range(1, LONGEST_EPISODE + 1):
         _, _, terminated, truncated, _ = env.step(action.astype(env.action_space.dtype))
-        if terminated:
-            return step
-        if truncated or perf_counter() - begun > SECONDS:
-            break
+        if terminated or truncated or perf_counter() - begun > SECONDS:
+            return step if terminated else 0
     return 0
 
 
@@ -385,7 +365,7 @@ def linearize_env(
     scale: ArrayLike | None,
 ) -> LinearSystem:
     """Return the linearized step of `LinearModel.from_env`, which says what None stands for."""
-    with contextlib.closing(borrow(env)) as borrowed:
+    with borrow(env) as borrowed:
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
         x = None if x_ss is None else _partly_known("x_ss", x_ss)
@@ -408,7 +388,7 @@ def _linearize(
     simulator: Simulator, x: Array | None, u: Array | None, dt: float, scale: ArrayLike | None
 ) -> LinearSystem:
     """Connect to the simulator, find its steady state, and take the differences there."""
-    space = simulator.env.action_space
+    space = simulator.space
     bounded = (space.low > -1e6) & (space.high < 1e6)
     low = np.where(bounded, space.low, -1.0)
     high = np.where(bounded, space.high, 1.0)
@@ -420,17 +400,18 @@ def _linearize(
         raise ValueError(f"u_ss has shape {u.shape}, expected {middle.shape}.")
     u_start = np.where(np.isnan(u), middle, u)
     x_start, size = connect(simulator, x, u_start, scale)
-    scales = np.concatenate([size, (high - low) / 2])
     n = size.size
+    scales = np.concatenate([size, (high - low) / 2])
     free = np.isnan(np.concatenate([np.full(n, np.nan) if x is None else x, u]))
-    point = _steady_state(simulator, np.concatenate([x_start, u_start]), free, scales)
+    point = np.concatenate([x_start, u_start])
+    if np.any(free):
+        point = _steady_state(simulator, point, free, scales)
     found, noise = _differentiate(simulator, point, scales)
     if not np.any(free):
-        _require_steady_state(simulator, point, found.value, scales)
-    A = found.value[:, :n]
-    B = found.value[:, n:]
+        _require_steady_state(_residual(simulator, point, scales), point, found.value, scales)
+    A, B = np.split(found.value, [n], axis=1)
     notes = [
-        *_idle_inputs(B),
+        *notes_of(found, names((n, u.size))),
         "Linearized by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
@@ -443,16 +424,14 @@ def _linearize(
             f"derivatives of two step sizes agree within {found.doubt:.1%}. Tighten its tolerances "
             "for better ones."
         )
-    simulator.next_state(point[:n], point[n:])
+    state = simulator.step(point)
     if simulator.ended:
         notes.append("The environment terminates the episode at the operating point.")
-    seen: Any = to_vector(simulator.observation)
-    state: Any = simulator.read()
-    if np.shape(seen) != np.shape(state) or not np.allclose(seen, state, rtol=1e-5, atol=1e-5):
+    seen = to_vector(simulator.observation)
+    if seen is None or seen.shape != state.shape or not np.allclose(seen, state, 1e-5, 1e-5):
         notes.append(
             "The observation is not this state. A policy needs a wrapper that makes it so."
         )
-    notes += curvature(found, names((n, u.size)))
     notes.append(f"The simulator was {simulator.origin}.")
     none = np.zeros((n, 0))
     return LinearSystem(A, B, dt, point[:n], point[n:], none, np.zeros(0), tuple(notes))
@@ -460,7 +439,7 @@ def _linearize(
 
 def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Jacobian, float]:
     """Return the Jacobian (n, n+m) of the next state, and the simulator's noise in scales."""
-    space = simulator.env.action_space
+    space = simulator.space
     n = scale.size - space.shape[0]
     room = np.minimum(point[n:] - space.low, space.high - point[n:]).astype(np.float64)
     if np.any(room <= 1e-6 * scale[n:]):
@@ -470,28 +449,26 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Ja
             "plant cannot be linearized. Choose an operating point with room to both sides."
         )
 
-    def step(point: Array) -> Array:
-        return simulator.next_state(point[:n], point[n:])
-
     def actual(point: Array) -> Array:
         return np.concatenate([point[:n], simulator.actual(point[n:])])
 
     # What is read may be float32: then every number read is one, and steps have to be longer.
     of_states = np.where(np.arange(scale.size) < n, scale, 0.0)
-    readings = [step(point), step(point + LONGEST / 3 * of_states)]
-    single = all(np.array_equal(r, r.astype(np.float32), equal_nan=True) for r in readings)
+    readings = np.array([simulator.step(point + k * LONGEST / 3 * of_states) for k in (0, 1)])
+    single = np.array_equal(readings, readings.astype(np.float32), equal_nan=True)
     longest = (LONGEST_SINGLE if single else LONGEST) * scale
     spacing = np.finfo(np.float32 if single else np.float64).eps
     rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
-    noise = noise_of(lambda z: step(actual(z)), point, of_states)
-    noise = np.where(noise > np.maximum(NOISY * rounding, LEAST * scale[:n]), noise, 0.0)
+    noise = noise_of(lambda z: simulator.step(actual(z)), point, of_states)
+    noise[noise <= np.maximum(NOISY * rounding, LEAST * scale[:n])] = 0.0
     if np.any(noise > MOST * scale[:n]):
-        noise = np.zeros(n)  # no noise that differences could cope with
+        noise[:] = 0.0  # no noise that differences could cope with
     rough = float(np.max(noise / scale[:n]))
     longest = np.maximum(longest, np.minimum(1e6 * rough, LONGEST_NOISY) * scale)
     longest[n:] = np.minimum(longest[n:], room)
     labels = names((n, room.size))
-    return jacobian(step, point, longest, np.maximum(rounding, noise), labels, actual), rough
+    error = np.maximum(rounding, noise)
+    return jacobian(simulator.step, point, longest, error, labels, actual), rough
 
 
 STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
@@ -499,6 +476,7 @@ MOVES = 0.01  # the same relative to its own size: beyond it, a state smaller th
 AT_REST = 1e-8  # largest motion in one sample of a steady state that was solved for
 STARTS = (0.0, 1.0, -1.0, 0.1, 10.0)
 """Scales of the free entries from which the steady state is sought, in turn."""
+RATE_STEP = 1e-6  # of the slopes that a search takes, in scales
 ANOTHER = 1e-3  # distance, in scales, from which two steady states are different ones
 Rate = Callable[[Array], Array]  # dx/dt (n,) at [x, u, d]
 
@@ -537,19 +515,15 @@ def linearize_dynamics(
     A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
     A, B, E = zero_order_hold(A, B, E, dt)
     x, u, d = np.split(point, np.cumsum(sizes[:2]))
-    notes += [*_idle_inputs(B), *curvature(found, names(sizes))]
+    notes += notes_of(found, names(sizes))
     return LinearSystem(A, B, dt, x, u, E, d, tuple(notes))
 
 
 def _vector(value: Any, size: int) -> Array:
     """Return what f returned as a vector (n,): of shape (n,), (n, 1) or (1, n), or a list."""
-    try:
-        array = to_float("f(x, u)", value)
-    except TypeError:
-        if not isinstance(value, (list, tuple)):
-            raise
-        # A list of numbers and of arrays with one entry.
-        array = np.concatenate([np.ravel(to_float("f(x, u)", each)) for each in value])
+    if isinstance(value, (list, tuple)):  # of numbers, and of arrays with one entry
+        value = np.concatenate([np.ravel(to_float("f(x, u)", each)) for each in value])
+    array = to_float("f(x, u)", value)
     if array.shape not in ((size,), (size, 1), (1, size)):
         raise ValueError(
             f"f returned the shape {array.shape}, expected ({size},) or ({size}, 1): dx/dt of each "
@@ -565,30 +539,43 @@ def _rest_of(
     free = np.isnan(given)
     n = sizes[0]
 
-    def moved(point: Array) -> Array:
-        with np.errstate(all="ignore"):
-            return np.asarray(dt * rate(point) / scale[:n])
+    def motion(point: Array) -> Array:
+        try:
+            with np.errstate(all="ignore"):
+                return np.asarray(dt * rate(point) / scale[:n])
+        except (ArithmeticError, ValueError):  # math functions raise where numpy's return NaN
+            return np.full(n, np.nan)
 
-    tried = []
-    for start in STARTS:
-        at = np.where(free, start * scale, given)
-        # Math functions raise where numpy's return NaN.
-        with contextlib.suppress(ArithmeticError, ValueError):
-            tried.append(_least_moved(moved, at, free, scale, xtol=1e-14))
     found: list[Array] = []
-    for point, left in tried:
-        apart = [np.max(np.abs(point - other) / scale) > ANOTHER for other in found]
+    least = np.inf
+    for start in STARTS:
+        begun = np.where(free, start * scale, given)
+        point, left = _least_moved(motion, begun, free, scale, RATE_STEP)
+        if left < least:
+            least = left
+            best = point
+        apart = (np.max(np.abs(point - other) / scale) > ANOTHER for other in found)
         if left <= AT_REST and all(apart):
             found.append(point)
     if not found:
-        best, least = min(tried, key=lambda each: each[1], default=(given, np.inf))
         raise ValueError(
             f"No steady state was found. The best is x_ss = {best[:n].tolist()}, the rest "
             f"{best[n:].tolist()}, which moves in one sample by {least:.2g} scales. Leave more "
             "entries free (NaN), give one that you know, or pass scale=..., how far each moves."
         )
+
+    def is_lost(point: Array) -> bool:
+        """Tell whether a mode that does not decay is out of reach of the inputs."""
+        try:
+            slopes = _slopes(rate, point, 1e-4 * _size(point, n, scale[:n]))
+            A, B, E = np.split(slopes, np.cumsum(sizes[:2]), axis=1)
+            A, B, _ = zero_order_hold(A, B, E, dt)
+            return unreached(A, B) is not None
+        except (ArithmeticError, ValueError):  # no value next to it
+            return True
+
     # A bioreactor that is washed out is at rest too, and no input brings it back.
-    found.sort(key=lambda each: _is_lost(rate, each, _size(each, n, scale[:n]), dt, sizes))
+    found.sort(key=is_lost)
     solved = np.count_nonzero(free)
     notes = [f"Solved for the steady state: {solved} {'entry' if solved == 1 else 'entries'}."]
     if solved > n:
@@ -597,18 +584,6 @@ def _rest_of(
         others = "; ".join(str([float(f"{v:.4g}") for v in other]) for other in found[1:])
         notes[0] += f" There are others, {others}: give an entry that separates them."
     return found[0], notes
-
-
-def _is_lost(rate: Rate, point: Array, size: Array, dt: float, sizes: tuple[int, int, int]) -> bool:
-    """Tell whether a mode that does not decay is out of reach of the inputs at a steady state."""
-    steps = np.diag(1e-4 * size)
-    try:
-        slopes = np.array([(rate(point + h) - rate(point - h)) / (2 * h.max()) for h in steps]).T
-        A, B, E = np.split(slopes, np.cumsum(sizes[:2]), axis=1)
-        A, B, _ = zero_order_hold(A, B, E, dt)
-        return unreached(A, B) is not None
-    except (ArithmeticError, ValueError):  # no value next to it
-        return True
 
 
 def _require_steady(rate: Rate, parts: list[Array], size: Array, dt: float, scaled: bool) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import copy
 import inspect
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise, product
 from math import factorial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,37 +20,19 @@ if TYPE_CHECKING:
     import gymnasium
 
     Maker = gymnasium.Env[Any, Any] | str | Callable[[], gymnasium.Env[Any, Any]]
-Reader = Callable[[Any, Any, dict[str, Any]], Any]  # of an environment, observation and info
 
 RESET = 'reset(options={"state": x})'
 ATTRIBUTE = "env.unwrapped.state"
-MUJOCO = "env.unwrapped.data.qpos and qvel"
+MUJOCO = "env.unwrapped.set_state(qpos, qvel)"
 SHOWN = "the observation"
-READERS: dict[str, Reader] = {
-    'info["state"]': lambda env, observation, info: info.get("state"),
-    ATTRIBUTE: lambda env, observation, info: getattr(env.unwrapped, "state", None),
-    MUJOCO: lambda env, observation, info: _positions_and_velocities(env.unwrapped),
-    SHOWN: lambda env, observation, info: observation,
-}
-"""Where a state may be read, the most precise first: observations are float32."""
 
 
-@dataclass
-class Borrowed:
-    """An environment for experiments, and where it comes from.
-
-    It is `private` to them, or not; one that is `owned` is closed afterwards.
-    """
+class Borrowed(NamedTuple):
+    """An environment for experiments, where it comes from, and whether nobody else steps it."""
 
     env: Any
     note: str
-    private: bool
-    owned: bool
-
-    def close(self) -> None:
-        """Close the environment if it was made here; a copy may share its window."""
-        if self.owned:
-            self.env.close()
+    private: bool = True
 
 
 def require_makes(env: Any) -> None:
@@ -77,21 +59,25 @@ def require_makes(env: Any) -> None:
             pass
 
 
-def borrow(env: Maker) -> Borrowed:
-    """Return an environment made from an id or a function, or a deep copy of the given one."""
+@contextmanager
+def borrow(env: Maker) -> Iterator[Borrowed]:
+    """Lend an environment made from an id or a function, or a deep copy of the given one.
+
+    What is made here is closed afterwards. A copy is not: it may share its window.
+    """
     import gymnasium
 
     require_makes(env)
     if isinstance(env, str):
-        found = Borrowed(gymnasium.make(env), f"a {env} made for it", private=True, owned=True)
+        found = Borrowed(gymnasium.make(env), f"a {env} made for it")
     elif isinstance(env, gymnasium.Env):
         try:
-            found = Borrowed(copy.deepcopy(env), "a copy of env", private=True, owned=False)
+            found = Borrowed(copy.deepcopy(env), "a copy of env")
         except Exception:  # whatever a simulator raises that cannot be copied
             note = "env itself, which cannot be copied: reset it before its next step"
-            found = Borrowed(env, note, private=False, owned=False)
+            found = Borrowed(env, note, private=False)
     elif callable(env):
-        found = Borrowed(env(), "an environment made for it", private=True, owned=True)
+        found = Borrowed(env(), "an environment made for it")
     else:
         raise TypeError(
             f"env = {env!r} must be a single gymnasium.Env, its id, or a function that makes one "
@@ -99,14 +85,17 @@ def borrow(env: Maker) -> Borrowed:
         )
     if not isinstance(found.env, gymnasium.Env):
         raise TypeError(f"env() returned {found.env!r}, expected a single gymnasium.Env.")
-    space = found.env.action_space
-    if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-        found.close()
-        raise TypeError(
-            f"The action space is {space}: a linear model needs a Box of shape (m,). Wrap the "
-            "environment so that its action is the physical input."
-        )
-    return found
+    try:
+        space = found.env.action_space
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            raise TypeError(
+                f"The action space is {space}: a linear model needs a Box of shape (m,). Wrap the "
+                "environment so that its action is the physical input."
+            )
+        yield found
+    finally:
+        if not isinstance(env, gymnasium.Env):
+            found.env.close()
 
 
 def sample_time(env: Any, dt: float | None) -> float:
@@ -126,10 +115,10 @@ def sample_time(env: Any, dt: float | None) -> float:
 
 
 class Simulator:
-    """``next_state(x, u)`` of an environment whose state can be set.
+    """The next state of an environment whose state can be set.
 
     `LinearModel.from_env` documents ``set_state`` and ``get_state``. A private environment is reset
-    with a fixed seed.
+    with a fixed seed. :func:`connect` chooses ``setter`` and ``reader`` among those there are.
     """
 
     def __init__(
@@ -140,47 +129,62 @@ class Simulator:
     ) -> None:
         self.env = borrowed.env
         self.origin = borrowed.note
+        self.space = borrowed.env.action_space
+        self.set_state = set_state
+        self.get_state = get_state
+        self.setter = RESET
+        self.reader = ""
+        self.n_states = 0
         self.refusal = ""
         self.ended = False
         self.over = False
         self.observation, self.info = self.env.reset(seed=0 if borrowed.private else None)
-        self.readers = dict(READERS)
-        if get_state is not None:
-            self.readers = {"get_state": lambda env, observation, info: get_state(env)}
-        self.setters: dict[str, Callable[[Array], object]] = {}
-        if set_state is not None:
-            self.setters["set_state"] = lambda x: set_state(self.env, x)
-        else:
-            self.setters[RESET] = self._reset_to
-            if to_vector(getattr(self.env.unwrapped, "state", None)) is not None:
-                self.setters[f"{ATTRIBUTE} = x"] = self._assign
-            if _positions_and_velocities(self.env.unwrapped) is not None:
-                self.setters["env.unwrapped.set_state(qpos, qvel)"] = self._set_mujoco
-        self.setter = next(iter(self.setters))
-        self.reader = next(iter(self.readers))
+        plant = self.env.unwrapped
+        self.setters = [RESET] if set_state is None else ["set_state"]
+        if set_state is None and to_vector(getattr(plant, "state", None)) is not None:
+            self.setters.append(f"{ATTRIBUTE} = x")
+        if set_state is None and _positions_and_velocities(plant) is not None:
+            self.setters.append(MUJOCO)
 
-    def read(self, reader: str | None = None) -> Array | None:
-        """Return the state of shape (n,) where `reader` has it, None if it is not there."""
-        read = self.readers[reader or self.reader]
-        return to_vector(read(self.env, self.observation, self.info))
+    def readings(self) -> dict[str, Array | None]:
+        """Return the state wherever it may be, the most precise first: observations are float32."""
+        if self.get_state is not None:
+            return {"get_state": to_vector(self.get_state(self.env))}
+        plant = self.env.unwrapped
+        return {
+            'info["state"]': to_vector(self.info.get("state")),
+            ATTRIBUTE: to_vector(getattr(plant, "state", None)),
+            "env.unwrapped.data.qpos and qvel": _positions_and_velocities(plant),
+            SHOWN: to_vector(self.observation),
+        }
 
-    @property
-    def resets(self) -> bool:
-        """Whether the state is set by a reset, which returns the observation of it."""
-        return self.setter == RESET
-
-    def put(self, x: Array) -> bool:
-        """Put the environment into the state x; tell whether `read` then returns it already."""
-        if self.over and not self.resets:
+    def put(self, x: Array) -> None:
+        """Put the environment into the state x."""
+        x = np.array(x)
+        self.n_states = x.size
+        plant = self.env.unwrapped
+        if self.over and self.setter != RESET:
             self.observation, self.info = self.env.reset()
             self.over = False
-        self.setters[self.setter](x)
-        return self.resets or self.reader in ("get_state", ATTRIBUTE, MUJOCO)
+        if self.set_state is not None:
+            self.set_state(self.env, x)
+        elif self.setter == RESET:
+            self.observation, self.info = self.env.reset(options={"state": x})
+        elif self.setter == MUJOCO:
+            plant.set_state(*np.split(x, [np.size(plant.data.qpos)]))
+        else:
+            plant.state = x
+
+    def put_and_read(self, x: Array) -> Array | None:
+        """Put the environment into the state x; return what is read, None before a step shows."""
+        self.put(x)
+        stale = self.setter != RESET and self.reader in ('info["state"]', SHOWN)
+        return None if stale else self.readings()[self.reader]
 
     def actual(self, u: Array) -> Array:
         """Return the action that the environment gets for u: in the precision of its space."""
-        space = self.env.action_space
-        return np.clip(u, space.low, space.high).astype(space.dtype).astype(np.float64)
+        action = np.clip(u, self.space.low, self.space.high)
+        return np.asarray(action.astype(self.space.dtype).astype(np.float64))
 
     def next_state(self, x: Array, u: Array) -> Array:
         """Return the state one step later, NaN where the environment cannot go from x."""
@@ -190,35 +194,31 @@ class Simulator:
             self.refusal = str(error)
             return np.full(x.size, np.nan)
         try:
-            reached = self.go_on(u)
+            return self.go_on(u)
         except ArithmeticError as error:  # the equations have no value there
             self.refusal = str(error)
             return np.full(x.size, np.nan)
-        if reached.shape != x.shape:
-            raise ValueError(f"{self.reader} holds no state of shape {x.shape} after a step.")
-        return reached
 
     def go_on(self, u: Array) -> Array:
         """Return the state one step later, from wherever the environment is."""
-        action = self.actual(u).astype(self.env.action_space.dtype)
+        action = self.actual(u).astype(self.space.dtype)
         self.observation, _, terminated, truncated, self.info = self.env.step(action)
         self.over = bool(terminated or truncated)
         self.ended = bool(terminated)
-        reached = self.read()
-        if reached is None:
-            raise ValueError(f"{self.reader} holds no state after a step.")
+        reached = self.readings()[self.reader]
+        if reached is None or reached.size != self.n_states:
+            raise ValueError(f"{self.reader} holds no state ({self.n_states},) after a step.")
         return reached
 
-    def _reset_to(self, x: Array) -> None:
-        self.observation, self.info = self.env.reset(options={"state": np.array(x)})
+    def step(self, point: Array) -> Array:
+        """Return the next state (n,) from the state and action in one vector (n+m,)."""
+        return self.next_state(*np.split(point, [-self.space.shape[0]]))
 
-    def _assign(self, x: Array) -> None:
-        self.env.unwrapped.state = np.array(x)
-
-    def _set_mujoco(self, x: Array) -> None:
-        plant = self.env.unwrapped
-        split = np.size(plant.data.qpos)
-        plant.set_state(np.array(x[:split]), np.array(x[split:]))
+    def way(self, u: Array) -> Array:
+        """Return the way from u to the farther bound of the actions, signed, and at most 1000."""
+        up = self.space.high - u
+        down = u - self.space.low
+        return np.asarray(np.where(up >= down, np.minimum(up, 1e3), -np.minimum(down, 1e3)))
 
 
 def _positions_and_velocities(plant: Any) -> Array | None:
@@ -258,13 +258,9 @@ def noise_of(f: Callable[[Array], Array], point: Array, scale: Array) -> Array:
     """
     direction = scale * np.random.default_rng(0).choice([-1.0, 1.0], point.size)
     offsets = np.arange(POINTS) - (POINTS - 1) / 2
+    values = np.array([[f(point + h * k * direction) for k in offsets] for h in SPACINGS])
     shrink = factorial(ORDER) ** 2 / factorial(2 * ORDER)
-    levels = []
-    for spacing in SPACINGS:
-        values = np.array([f(point + spacing * k * direction) for k in offsets])
-        table = np.diff(values, ORDER, axis=0)
-        levels.append(np.sqrt(shrink * np.mean(table**2, axis=0)))
-    found = np.array(levels)
+    found = np.sqrt(shrink * np.mean(np.diff(values, ORDER, axis=1) ** 2, axis=1))
     if not np.all(np.isfinite(found)):
         return np.zeros(found.shape[1])
     largest = np.max(found, axis=0)
@@ -280,8 +276,6 @@ ADVICE = (
     "too, or identify the plant: LinearModel.from_data"
 )
 
-PASS = "Pass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
-
 
 def connect(
     simulator: Simulator, x: Array | None, u: Array, scale: ArrayLike | None
@@ -291,7 +285,7 @@ def connect(
     The simulator's ``setter`` and ``reader`` are the first pair that passes. A state x (n,) may
     hold NaN where it is not known, and is by default that of the reset; u (m,) is tried.
     """
-    begun = {name: simulator.read(name) for name in simulator.readers}
+    begun = simulator.readings()
     tried = []
     for setter, (reader, start) in product(simulator.setters, begun.items()):
         if start is None or (x is not None and start.size != x.size):
@@ -301,7 +295,7 @@ def connect(
         trial = start if x is None else np.where(np.isnan(x), start, x)
         size = _scale(simulator, trial, scale)
         failure = _failure(simulator, trial, u, size)
-        if failure is None:
+        if not failure:
             return trial, size
         tried.append(f"set by {setter}, read from {reader}: {failure}")
     if not tried:
@@ -309,11 +303,9 @@ def connect(
         wanted = "" if x is None else f" of shape {x.shape}, like the one given,"
         tried = [f"a state{wanted} is nowhere to be read: {sizes}"]
     ways = "".join(f"\n  - {each}" for each in tried)
-    given = "set_state" in simulator.setters and "get_state" in simulator.readers
-    advice = "" if given else f"\n{PASS}"
-    raise ValueError(
-        f"The environment could not be put into a state and read. Tried:{ways}{advice}"
-    )
+    if simulator.set_state is None or simulator.get_state is None:
+        ways += "\nPass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
+    raise ValueError(f"The environment could not be put into a state and read. Tried:{ways}")
 
 
 def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
@@ -328,18 +320,17 @@ def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
     return np.asarray(size)
 
 
-def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | None:
-    """Try the present way to set and read the state; return its fault, None without one."""
+def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str:
+    """Try the present way to set and read the state; return its fault, empty without one."""
     for other in (x + 0.01 * scale, x - 0.01 * scale):
         try:
-            seen = [simulator.read() if simulator.put(state) else None for state in (x, other)]
+            seen = [(state, simulator.put_and_read(state)) for state in (x, other)]
+            break
         except (ValueError, AssertionError, TypeError, KeyError, AttributeError) as error:
             failure = f"refused ({error})"
-            continue
-        break
     else:
         return failure
-    for wanted, got in zip((x, other), seen, strict=True):
+    for wanted, got in seen:
         if got is not None and np.any(np.abs(got - wanted) > 1e-5 * (scale + np.abs(wanted))):
             reading = f"set to {wanted.tolist()} it reads {got.tolist()}"
             return f"{reading} (a state that is ignored, or an angle that wraps there)"
@@ -350,35 +341,25 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | No
             f"{again.tolist()}: setting it fails, or the plant is random or has states besides "
             "these (then identify it: LinearModel.from_data)"
         )
-    pushed = simulator.next_state(other, u + 0.1 * _room(simulator, u))
+    pushed = simulator.next_state(other, u + 0.1 * simulator.way(u))
     if np.array_equal(moved, other) and np.array_equal(pushed, other):
         return f"no step changes it from {other.tolist()}, whatever the action"
     # A plant that forgets within a sample has A = 0: then what it did before does not matter.
-    alike = not simulator.resets and np.array_equal(first, moved)
+    alike = simulator.setter != RESET and np.array_equal(first, moved)
     if alike and not np.array_equal(simulator.next_state(x, u), first):
         return f"the next state is {first.tolist()} from {x.tolist()} and {other.tolist()} alike"
-    return _hidden_state(simulator, x, u, u + 0.5 * _room(simulator, u), scale)
+    return _hidden_state(simulator, x, u, first, scale)
 
 
-def _room(simulator: Simulator, u: Array) -> Array:
-    """Return the way from u to the farther bound of the actions, signed, and at most 1000."""
-    space = simulator.env.action_space
-    up = space.high - u
-    down = u - space.low
-    return np.asarray(np.where(up >= down, np.minimum(up, 1e3), -np.minimum(down, 1e3)))
-
-
-def _hidden_state(
-    simulator: Simulator, x: Array, u: Array, other: Array, scale: Array
-) -> str | None:
-    """Describe the hidden states that show in steps from x with u and other, None without any.
+def _hidden_state(simulator: Simulator, x: Array, u: Array, first: Array, scale: Array) -> str:
+    """Describe states besides x, whose next one is the first with u; empty without any.
 
     One that setting x leaves alone shows when a step is repeated after other inputs, one that
     setting x resets when the plant goes on by itself.
     """
-    first = simulator.next_state(x, u)
+    push = u + 0.5 * simulator.way(u)
     for _ in range(LONGEST_DELAY):
-        moved = simulator.next_state(x, other)
+        moved = simulator.next_state(x, push)
     again = simulator.next_state(x, u)
     if np.any(np.abs(again - first) > 1e-6 * (scale + np.abs(first))):
         return (
@@ -386,26 +367,19 @@ def _hidden_state(
             f"and after other actions in {again.tolist()}: {HIDDEN} leaves alone (a delay of the "
             f"input, an actuator). {ADVICE}"
         )
-    for before, after in _trajectory(simulator, x, other, 10 * scale):
-        reached = simulator.next_state(before, other)
+    states = [simulator.next_state(x, push)]
+    while len(states) < LONGEST_DELAY and not simulator.over:
+        if not np.all(np.abs(states[-1] - x) <= 10 * scale):
+            break
+        states.append(simulator.go_on(push))
+    for before, after in pairwise(states):
+        reached = simulator.next_state(before, push)
         # States may be read in float32, which the step may enlarge.
         doubt = np.maximum(1e-5 * (scale + np.abs(after)), 0.01 * np.abs(moved - first))
         if np.any(np.abs(reached - after) > doubt):
             return (
-                f"going on from {before.tolist()}, the action {other.tolist()} leads to "
+                f"going on from {before.tolist()}, the action {push.tolist()} leads to "
                 f"{after.tolist()}, and set there to {reached.tolist()}: {HIDDEN} starts anew "
                 f"(a delay of the input, an actuator, a clock). {ADVICE}"
             )
-    return None
-
-
-def _trajectory(
-    simulator: Simulator, x: Array, u: Array, farthest: Array
-) -> list[tuple[Array, Array]]:
-    """Return the pairs of states before and after each step with u, set once, to x."""
-    states = [x]
-    for k in range(LONGEST_DELAY):
-        states.append(simulator.go_on(u) if k else simulator.next_state(x, u))
-        if simulator.over or not np.all(np.abs(states[-1] - x) <= farthest):
-            break
-    return list(pairwise(states[1:]))
+    return ""

@@ -275,7 +275,7 @@ class LinearMPC(MPCProblem):
         names = ("x_ss", "u_ss", "dt", "set_state", "get_state", "scale")
         of_model = {name: options.pop(name) for name in names if name in options}
         model = LinearModel.from_env(env, **of_model)
-        with contextlib.closing(borrow(env)) as borrowed:
+        with borrow(env) as borrowed:
             shown = borrowed.env.observation_space
             action = borrowed.env.action_space
             own = getattr(borrowed.env, "mpc", None)

@@ -22,7 +22,8 @@ class Plant(gym.Env[Any, Any]):
     dt = 0.5
 
     def __init__(self, fault: str = "") -> None:
-        self.observation_space, self.action_space = box([-4], [4]), box([-1], [1])
+        self.observation_space = box([-4], [4])
+        self.action_space = box([-1], [1])
         self.fault = fault
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
@@ -50,7 +51,8 @@ class Clock(Plant):
 
     def step(self, action: Any) -> Any:
         _, *rest = super().step(action)
-        self.x, self.t = self.x + 0.1 * (self.t == self.at), self.t + 1
+        self.x = self.x + 0.1 * (self.t == self.at)
+        self.t += 1
         return self._seen(), *rest
 
 
@@ -68,7 +70,8 @@ class Strict(Plant):
 
     def __init__(self, ends: bool) -> None:
         super().__init__()
-        self.ends, self.done = ends, False
+        self.ends = ends
+        self.done = False
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         self.done = False

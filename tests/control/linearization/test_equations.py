@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization import Jacobian, curvature, jacobian
+from sb3_yann.control.linearization import Jacobian, jacobian, notes_of
 from sb3_yann_envs import cstr
 
 NAN = np.nan
-A, B = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.0], [1.0]])
+A = np.array([[0.0, 1.0], [-2.0, -0.3]])
+B = np.array([[0.0], [1.0]])
 
 
 def flat(x: Any, u: Any) -> Any:
@@ -112,20 +113,23 @@ def test_a_point_in_float32_is_differenced_between_what_is_evaluated() -> None:
 
 
 def test_the_notes_tell_what_is_dropped_what_bends_and_what_has_no_effect() -> None:
-    def told(change: list[float], value: Any, dropped: float = 0.0) -> list[str]:
+    def notes(change: list[float], value: Any = ((1.0, 1.0),), dropped: float = 0.0) -> list[str]:
         steps = np.array([0.5, 0.25])
-        return curvature(Jacobian(np.array(value), dropped, steps, np.array(change), 0.0), LABELS)
+        found = Jacobian(np.array(value), dropped, steps, np.array(change), 0.0)
+        return notes_of(found, ["x[0]", "u[0]"])
 
-    LABELS, plain = ["x[0]", "u[0]"], [[1.0, 1.0]]
-    assert told([0.1, 0.0], plain) == []
-    (note,) = told([0.0, 0.101], plain)
-    assert note == (
-        "The plant is not smooth within 0.25 of the operating point along u[0]: slopes differ by "
-        "10%."
-    )
-    assert (
-        "within 0.5 of the operating point along x[0]: it has no value"
-        in told([np.nan, 0.0], plain)[0]
-    )
-    assert told([0.0, 0.0], [[0.0, 0.0]]) == ["x[0] has no effect on the next state."]
-    assert "(at most 1.5e-09) were set to zero" in told([0.0, 0.0], plain, 1.5e-9)[0]
+    assert notes([0.1, 0.0]) == []
+    bends = "The plant is not smooth within 0.25 of the operating point along u[0]: slopes differ"
+    assert notes([0.0, 0.101]) == [f"{bends} by 10%."]
+    (none,) = notes([np.nan, 0.0])
+    assert "within 0.5 of the operating point along x[0]: it has no value" in none
+    assert notes([0.0, 0.0], [[0.0, 1.0]]) == ["x[0] has no effect on the next state."]
+    assert "(at most 1.5e-09) were set to zero" in notes([0.0, 0.0], dropped=1.5e-9)[0]
+
+
+def test_steps_at_whose_ends_there_is_no_value_are_left_out() -> None:
+    found = of(lambda z: np.sqrt(z) if z > 0.9 else np.nan, at=1.0, longest=0.3)
+    assert found.value[0, 0] == pytest.approx(0.5, rel=1e-10)
+    assert np.isnan(found.change[0])
+    with pytest.raises(ValueError, match="no finite value on one of its sides"):
+        of(lambda z: z if z >= 1 else np.nan, at=1.0)

@@ -13,7 +13,8 @@ from sb3_yann_envs import cstr
 
 # theta+ = theta + dt speed+, speed+ = speed + dt (15 sin(theta) + 3 u), at dt = 0.05 (Gymnasium's
 # Pendulum-v1, g = 10, m = l = 1), by hand:
-UPRIGHT_A, UPRIGHT_B = [[1.0375, 0.05], [0.75, 1.0]], [[0.0075], [0.15]]
+UPRIGHT_A = [[1.0375, 0.05], [0.75, 1.0]]
+UPRIGHT_B = [[0.0075], [0.15]]
 HANGING_A = [[0.9625, 0.05], [-0.75, 1.0]]
 
 
@@ -227,7 +228,9 @@ class Delayed(Plant):
 
     def __init__(self, delay: int, keeps: bool) -> None:
         super().__init__()
-        self.line, self.delay, self.keeps = [0.0] * delay, delay, keeps
+        self.line = [0.0] * delay
+        self.delay = delay
+        self.keeps = keeps
 
     def reset(self, *, seed=None, options=None):
         if not self.keeps:

@@ -83,9 +83,9 @@ def test_noise_of_a_simulator_is_measured_and_stepped_over(grid: float) -> None:
 
 
 def test_noise_is_told_from_a_kink() -> None:
-    point, scale = np.array([0.3]), np.ones(1)
-    assert noise_of(lambda z: np.abs(z - 0.3001), point, scale)[0] == 0
-    assert noise_of(lambda z: np.sin(z), point, scale)[0] < 1e-14
+    point = np.array([0.3])
+    assert noise_of(lambda z: np.abs(z - 0.3001), point, np.ones(1))[0] == 0
+    assert noise_of(lambda z: np.sin(z), point, np.ones(1))[0] < 1e-14
 
 
 class Body(gym.Env):
@@ -96,13 +96,15 @@ class Body(gym.Env):
     def __init__(self) -> None:
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
         self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-        self.init_qpos, self.init_qvel = np.zeros(1), np.zeros(1)
+        self.init_qpos = np.zeros(1)
+        self.init_qvel = np.zeros(1)
         self.data = SimpleNamespace(qpos=np.zeros(1), qvel=np.zeros(1))
 
     def set_state(self, qpos: Any, qvel: Any) -> None:
         assert qpos.shape == (1,)
         assert qvel.shape == (1,)
-        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        self.data.qpos[:] = qpos
+        self.data.qvel[:] = qvel
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -116,7 +118,8 @@ class Body(gym.Env):
         return self._observe(), 0.0, False, False, {}
 
     def _observe(self) -> np.ndarray:
-        q, v = self.data.qpos[0], self.data.qvel[0]
+        q = self.data.qpos[0]
+        v = self.data.qvel[0]
         return np.array([np.sin(q), np.cos(q), v])
 
 
