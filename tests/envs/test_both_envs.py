@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import copy
+import os
 import random
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
 from numpy.typing import NDArray
 
+import sb3_yann_envs
 from sb3_yann_envs import ProblemBox
 from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
 from sb3_yann_envs.cstr import CSTREnv
@@ -58,3 +67,152 @@ def test_the_global_random_states_are_untouched(name: str) -> None:
 def test_a_step_before_the_first_reset_is_refused(name: str) -> None:
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"env.reset\(\) before env.step\(\)"):
         ENVS[name]().step(act(0.0))
+
+
+# ---- Both environment checkers accept both environments, but for one recommendation each ----
+
+
+ENV_IDS = ["CSTR-v0", "ClippedPendulum-v0"]
+
+# Actions are in physical units on purpose: the controllers that these environments are for have
+# theirs in kJ/(h m2 K) and N m. Stable-Baselines3's actors rescale to the bounds by themselves.
+NORMALIZE = "symmetric and normalized"
+
+
+def messages(check: Callable[[], None]) -> list[str]:
+    """Return the warnings that a check gives (Gymnasium's logger warns through `warnings`)."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check()
+    return [str(warning.message) for warning in caught]
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_gymnasium_only_recommends_normalized_actions(env_id: str) -> None:
+    env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, render_mode="rgb_array").unwrapped
+    (message,) = messages(lambda: gymnasium_check(env))
+    assert "For Box action spaces, we recommend" in message
+    assert NORMALIZE in message
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_stable_baselines3_only_recommends_normalized_actions(env_id: str, wrapped: bool) -> None:
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")  # needs torch
+    env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, render_mode="rgb_array")
+    checked = env if wrapped else env.unwrapped
+    (message,) = messages(lambda: sb3.check_env(checked, warn=True, skip_render_check=False))
+    assert "We recommend you to use a" in message
+    assert NORMALIZE in message
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_gymnasiums_wrappers_find_nothing_in_an_episode(env_id: str) -> None:
+    def play() -> None:
+        env = gymnasium.make(env_id)
+        env.action_space.seed(0)
+        env.reset(seed=0)
+        over = False
+        while not over:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            over = terminated or truncated
+
+    assert messages(play) == []
+
+
+# ---- Importing sb3_yann_envs registers two environments, and does nothing else ----
+
+
+HEAVY = {"torch", "stable_baselines3", "sb3_yann", "matplotlib"}
+
+
+def fresh_python(code: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a new interpreter that finds this package, with warnings as errors."""
+    folder = str(Path(sb3_yann_envs.__file__).parents[1])
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        env={**os.environ, "PYTHONPATH": folder},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+
+
+def test_the_import_is_light_and_silent() -> None:
+    done = fresh_python(f"import sys, sb3_yann_envs; sys.exit(bool({HEAVY} & set(sys.modules)))")
+    assert (done.stdout, done.stderr) == ("", "")
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_making_and_stepping_an_environment_stays_light(env_id: str) -> None:
+    code = (
+        "import sys, gymnasium\n"
+        f"env = gymnasium.make('sb3_yann_envs:{env_id}')\n"
+        "env.reset(seed=0); env.step(env.action_space.sample())\n"
+        f"print({HEAVY} & set(sys.modules))"
+    )
+    done = fresh_python(code)
+    assert (done.stdout, done.stderr) == ("set()\n", "")
+
+
+@pytest.mark.parametrize(("env_id", "steps"), [("CSTR-v0", 400), ("ClippedPendulum-v0", 200)])
+def test_an_episode_is_truncated_at_its_length(env_id: str, steps: int) -> None:
+    assert gymnasium.spec(env_id).max_episode_steps == steps
+
+
+def test_registering_again_is_harmless(recwarn: pytest.WarningsRecorder) -> None:
+    before = {env_id: gymnasium.spec(env_id) for env_id in ENV_IDS}
+    sb3_yann_envs.register_envs()
+    assert not recwarn.list
+    for env_id, spec in before.items():
+        assert gymnasium.spec(env_id) is spec
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_a_vector_of_environments_can_be_made(env_id: str) -> None:
+    envs = gymnasium.make_vec(env_id, num_envs=2, vectorization_mode="sync")
+    observations, _ = envs.reset(seed=0)
+    assert observations in envs.observation_space
+    envs.close()
+
+
+# ---- Frames of both environments are pictures, and rendering says where it cannot be ----
+
+
+EVERY_ENV = pytest.mark.parametrize("make", [CSTREnv, ClippedPendulumEnv])
+
+
+@pytest.mark.parametrize(
+    ("make", "action", "width"), [(CSTREnv, -55.0, 600), (ClippedPendulumEnv, 2.0, 400)]
+)
+def test_a_frame_is_a_picture_that_changes_with_the_episode(make, action, width) -> None:
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    env.step(np.array([action], dtype=np.float32))
+    second = env.render()
+    assert first is not None and second is not None
+    assert first.shape == (400, width, 3)
+    assert first.dtype == np.uint8
+    assert (first != second).any()
+
+
+@EVERY_ENV
+def test_an_unknown_render_mode_is_refused(make) -> None:
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        make(render_mode="ansi")
+
+
+@EVERY_ENV
+def test_rendering_before_the_first_reset_is_refused(make) -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before env.render\(\)"):
+        make(render_mode="rgb_array").render()
+
+
+@EVERY_ENV
+def test_rendering_without_a_mode_warns_and_returns_nothing(make) -> None:
+    env = make()
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without specifying any render mode"):
+        assert env.render() is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import sys
 import types
 
@@ -16,6 +17,7 @@ from experiments.measures import rows_of
 from experiments.published import paper_table
 from experiments.results import in_short, write_report
 from experiments.runner import Outcome, Run
+from fresh_process import run_module
 
 pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
 
@@ -204,3 +206,19 @@ def test_the_short_table_has_a_row_for_each_plant_that_was_learnt() -> None:
     assert empty == "" and "after 50 training episodes, over 2 starts" in legend
     left = {run: out for run, out in reactor().items() if run.learner != "YANN-RL"}
     assert in_short(left) == ""
+
+
+# ---- The quick form of the experiments: the command itself, from its runs to its report ----
+
+
+@pytest.mark.nightly
+def test_the_quick_form_runs_to_its_report_and_does_nothing_twice(tmp_path) -> None:
+    assert "9 of 9 runs" in run_module(tmp_path, "experiments", "--quick")
+    folder = tmp_path / "out" / "paper-quick"
+    report = (folder / "results.md").read_text(encoding="utf-8")
+    assert "## After 4 training episodes" in report
+    for picture in re.findall(r"!\[.*?\]\((.*?)\)", report):
+        assert (folder / picture).stat().st_size > 10_000
+    before = (folder / "results.sqlite").read_bytes()
+    run_module(tmp_path, "experiments", "--quick")
+    assert (folder / "results.sqlite").read_bytes() == before
