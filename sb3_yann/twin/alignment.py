@@ -10,7 +10,7 @@ acts. A plant whose gain is not the model's looks like an input in other units; 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import NamedTuple
@@ -43,6 +43,8 @@ ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
 MOVING = 1e-3  # of a standard deviation: a state that moves by more in a step moves
 PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
 LEAST_ROWS = 20  # rows of a regression on the law, at least
+LAW = 1e-3  # how far an input may be from the MPC's own, in half-widths
+PROVING = 0.2  # share of the rows, where the law is inside of its bounds, that it has made
 CONFIRM = (
     "If its units were checked, and the plant or its controller is so: "
     "PlantTwin.fit(..., units_confirmed=True)."
@@ -78,12 +80,35 @@ def objections(
         clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
         proven &= ~(clearly & np.diagonal(_is_one(readings[s]) & readings[s].alone))
     found = [] if units_confirmed else [*_other_pace(log)]
-    if np.all(proven & (logged < EXACT_SHARE)):
+    exact = made_by_law(problem, episodes)
+    if np.all(exact | (proven & (logged < EXACT_SHARE))):
         return found
+    proven |= exact
     found += [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
     if not found and not units_confirmed:
         found += _other_units(log, proven)
     return found or [*_against_plant(log, proven)]
+
+
+def made_by_law(problem: LinearMPC, episodes: Sequence[Episode]) -> NDArray[np.bool_]:
+    """Return which inputs (m,) are the MPC's own in enough rows: then all units are beyond doubt.
+
+    In these rows the law moves nearly as much as in all of them: in other units what is logged
+    would meet it only where it stands still, or on a bound.
+    """
+    theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
+    u = np.concatenate([each.actions for each in episodes])
+    law = law_of(problem)(theta)
+    found = np.zeros(u.shape[1], dtype=bool)
+    for j, half in enumerate(problem.u_half):
+        low = problem.deviations.u_min[j] + LAW * half
+        high = problem.deviations.u_max[j] - LAW * half
+        inside = (law[:, j] > low) & (law[:, j] < high)
+        same = inside & (np.abs(u[:, j] - law[:, j]) <= LAW * half)
+        if same.sum() >= max(LEAST_ROWS, PROVING * inside.sum()):
+            moves = np.std(law[same, j])
+            found[j] = moves > max(10 * LAW * half, 0.5 * np.std(law[inside, j]))
+    return found
 
 
 @dataclass(frozen=True)

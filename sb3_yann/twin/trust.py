@@ -14,7 +14,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.identification.fit import frozen_rows, words_for
 from sb3_yann.control.linear_system import labels_of
-from sb3_yann.twin.alignment import objections
+from sb3_yann.twin.alignment import made_by_law, objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual, law_of
 from sb3_yann.twin.log import Episode, records
 from sb3_yann.twin.selection import FreeRuns
@@ -25,7 +25,6 @@ STILL = 1e-4  # an input that moves by less, in half-widths, does not move
 FOREIGN = 10.0  # A model that errs by so many times what moves describes another plant
 POOR = 2.0  # from so many times on, a report asks whether it is the same plant
 OUTSIDE = 0.05  # share of logged rows beyond the box of theta from which on units are doubted
-LAW = 1e-3  # how far an input may be from the MPC's own, in half-widths
 PREVIOUS = 0.01  # how far theta's previous input may be from the one before it, in half-widths
 ROUNDING = 1e-6  # of a half-width: float32 rounds so much
 ALONE = 0.02
@@ -124,11 +123,10 @@ def persistence_error(
     return np.array(found)
 
 
-def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array, bool]:
-    """Return how much of each input is its own (m,), how much it moves (m,), and if it is the law.
+def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array]:
+    """Return how much of each input is its own (m,), and how much it moves (m,).
 
-    What is linear in theta or the MPC's own input is not its own. Where nearly every input is the
-    MPC's own, the log's units are beyond doubt.
+    What is linear in theta or the MPC's own input is not its own.
     """
     theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
     u = np.concatenate([each.actions for each in episodes])
@@ -138,8 +136,7 @@ def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array
     variance = np.var(u, axis=0)
     share = np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
     moves = np.sqrt(variance) / problem.u_half
-    of_law = (np.abs(u - law) / problem.u_half <= LAW).all(axis=1)
-    return share, moves, bool((moves > STILL).all() and np.mean(of_law) >= 1 - OUTSIDE)
+    return share, moves
 
 
 def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
@@ -251,9 +248,8 @@ def evidence(
     coordinates = dynamics.coordinates
     row = dynamics.row
     standing = persistence_error(coordinates, log, runs.horizons)
-    share, moves, follows_law = excitation(problem, log)
-    inputs = share, moves
-    shares = beyond_the_box(problem, log) * (not follows_law)
+    inputs = excitation(problem, log)
+    shares = beyond_the_box(problem, log) * (not made_by_law(problem, log).all())
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(log))

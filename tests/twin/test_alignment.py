@@ -184,6 +184,24 @@ def test_an_mpc_that_has_settled_still_shows_a_state_in_other_units() -> None:
     assert not twin.trusted
 
 
+def test_episodes_of_the_mpc_prove_the_units_of_those_that_it_did_not_make() -> None:
+    """The heater has less than half of the model's gain, which steps alone make doubtful."""
+    steps = heated(0.4, 0.0, open_loop=True)
+    both = heated(0.4, 0.0)[:3] + steps[3:]
+    assert not heated_twin(steps).trusted
+    assert heated_twin(both).trusted
+    rests = heated(1.0, 0.0, steps=200)  # at rest other units give the same
+    for given in (both, rests):
+        for of_x, of_u, made in (
+            ([1.0, 1.0], 1.0, True),
+            ([1.8, 1.0], 1.0, False),
+            ([1.0, 0.4], 1.0, False),
+            ([1.0, 1.0], 0.55, False),
+        ):
+            episodes = heated_twin([(x * of_x, of_u * u) for x, u in given]).episodes
+            assert alignment.made_by_law(room(), episodes).all() == made
+
+
 def test_inputs_that_are_held_while_the_states_move_are_no_law_s() -> None:
     def held(episodes: list) -> bool:
         twin = heated_twin(episodes)

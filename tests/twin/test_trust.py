@@ -43,11 +43,11 @@ def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains
     x, own = rng.uniform(-1, 1, (401, 2)), 0.1 * rng.standard_normal((400, 1))
     feedback = 0.2 * x[:-1, :1] - 0.1 * x[:-1, 1:]
     (episode,) = as_episodes(problem(), [(x, feedback + own)])
-    share, moves, _ = trusts.excitation(problem(), (episode,))
+    share, moves = trusts.excitation(problem(), (episode,))
     assert share == pytest.approx(np.var(own) / np.var(feedback + own), rel=0.05)
     assert moves == pytest.approx([np.std(feedback + own)])  # half the range is 1
     (still,) = as_episodes(problem(), [(x, 0 * own + 0.25)])
-    assert [each.tolist() for each in trusts.excitation(problem(), (still,))[:2]] == [[0.0], [0.0]]
+    assert [each.tolist() for each in trusts.excitation(problem(), (still,))] == [[0.0], [0.0]]
     (closed,) = as_episodes(problem(), [(x, feedback)])
     assert trusts.excitation(problem(), (closed,))[0] < 1e-20
 
