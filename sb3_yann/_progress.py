@@ -19,6 +19,7 @@ DELAY = 3.0  # seconds that pass without a word
 APART = 30.0  # seconds between two states of bars in a file
 
 _silent = ContextVar("silent", default="TQDM_DISABLE" in os.environ)
+_parts = ContextVar("parts", default=False)
 
 
 def is_watched() -> bool:
@@ -30,14 +31,19 @@ def is_watched() -> bool:
 
 
 @contextmanager
-def shown(progress_bar: bool) -> Iterator[None]:
-    """Show what takes long, unless it is False here or further out."""
+def shown(progress_bar: bool, parts: bool = False) -> Iterator[None]:
+    """Show what takes long, unless it is False here or further out.
+
+    Bars of ``parts`` count and foretell nothing: `Progress` says how long all of them take.
+    """
     check_bool("progress_bar", progress_bar)
     token = _silent.set(_silent.get() or not progress_bar)
+    of_parts = _parts.set(_parts.get() or parts)
     try:
         yield
     finally:
         _silent.reset(token)
+        _parts.reset(of_parts)
 
 
 class _Bar(tqdm):  # type: ignore[misc]
@@ -82,6 +88,7 @@ def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None)
         position=0,
         file=sys.stderr if is_watched() else _LINES,
         disable=_silent.get(),
+        bar_format="  {desc}: {n_fmt} of {total_fmt}" if _parts.get() else None,
     )
 
 
@@ -92,11 +99,11 @@ class Progress:
         self.begun = time.monotonic()
         self.steps = steps
 
-    def __call__(self, text: str, left: float | None = None) -> None:
-        """Write a line; ``left`` are the seconds that the rest takes at most."""
+    def __call__(self, text: str, left: float = 0.0) -> None:
+        """Write a line; ``left`` are the seconds that the rest may take, 0 where nobody knows."""
         passed = time.monotonic() - self.begun
         if _silent.get() or passed < DELAY:
             return
         steps = "" if self.steps is None else f" {self.steps():>9,} steps"
-        most = "" if left is None else f", at most {left:.0f} s left"
+        most = f", up to about {left:.0f} s left" if left > 0 else ""
         _Bar.write(f"[{passed:5.0f} s{steps}{most}] {text}", file=sys.stderr)

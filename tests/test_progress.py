@@ -86,8 +86,14 @@ def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     clock.now += 5.0
     progress("a round is over", left=20.0)
     assert capsys.readouterr().err == (
-        "[    5 s     1,234 steps, at most 20 s left] a round is over\n"
+        "[    5 s     1,234 steps, up to about 20 s left] a round is over\n"
     )
+
+
+def test_bars_of_parts_count_and_foretell_nothing(clock, capsys) -> None:
+    with shown(True, parts=True):
+        counted(clock, each=1.0)
+    assert capsys.readouterr().err.splitlines()[0] == "plans: 3 of 100"
 
 
 def test_false_silences_all_that_is_called(clock, capsys) -> None:

@@ -32,7 +32,7 @@ from sb3_yann.compare import (
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
 from sb3_yann.improvement.imitation import Inputs, controller_of
 from sb3_yann.improvement.simulator import Scenarios, Simulator, of_law
-from sb3_yann.rollout import Trajectories
+from sb3_yann.rollout import Rows, Trajectories
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.env import RARE
 from sb3_yann.twin.log import Episode
@@ -47,6 +47,7 @@ RAREST = 10.0
 many times as much at most where it is rare."""
 FURTHER = 0.01  # how much farther than the MPC a run may leave what the log shows, in its widths
 HARDEST = 40  # scenarios that are planned anew after a check, at most
+WINDOW = 200  # steps that are planned of a run of more than twice as many
 NEARLY = 0.5  # A start that loses so much of what it may lose is a hard one
 
 Outcome = tuple[Array, Array]  # costs, and what is unsafe (`unsafe_columns`), of all starts
@@ -107,6 +108,7 @@ class Trial:
     steps: int = field(init=False)
     given: Array = field(init=False)
     far: Array = field(init=False)
+    rows: Array = field(init=False)
     mpc: Outcome = field(init=False)
 
     @classmethod
@@ -137,7 +139,8 @@ class Trial:
             self.given[:, self.follow == number] = rows[:, None]
         self._law = law_of(self.twin.problem)
         runs = self._run(self._law)
-        self.far = np.nan_to_num(self._beyond(runs[0]), nan=np.inf)
+        self.rows = runs[0]
+        self.far = np.nan_to_num(self._beyond(self.rows), nan=np.inf)
         self.mpc = self._outcome(*runs)
 
     @property
@@ -223,11 +226,26 @@ class Trial:
         more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
         return np.asarray(MARGIN * self.mean + more)
 
-    def scenarios(self) -> Scenarios:
-        """Return the starts, in each of which another member acts."""
+    @property
+    def window(self) -> int:
+        """How many steps of a run are planned."""
+        return WINDOW if self.steps > 2 * WINDOW else self.steps
+
+    def scenarios(self, rng: np.random.Generator) -> Scenarios:
+        """Return the starts, in each of which another member acts; of a long log, from amid it."""
         numbers = np.arange(self.starts.shape[1])
-        members = numbers % len(self.starts)
-        return Scenarios(self.twin, members, self.starts[members, numbers], self.given)
+        begins: Rows = np.zeros(len(numbers), np.intp)
+        if self.steps > self.window:
+            amid = rng.integers(self.steps - self.window + 1, size=len(numbers))
+            begins = np.where(self.follow >= 0, amid, 0)
+        return self._windows(numbers % len(self.starts), numbers, begins)
+
+    def _windows(self, members: Rows, starts: Rows, begins: Rows) -> Scenarios:
+        """Return parts of the MPC's runs, in which members act."""
+        times = begins + np.arange(self.window)[:, None]
+        return Scenarios(
+            self.twin, members, self.rows[begins, members, starts], self.given[times, starts]
+        )
 
     def hard(self, played: Outcome) -> Scenarios | None:
         """Return the scenarios that a policy loses, or nearly, the worst first; None where none."""
@@ -238,7 +256,13 @@ class Trial:
         if not len(worst):
             return None
         members, starts = np.divmod(worst, self.starts.shape[1])
-        return Scenarios(self.twin, members, self.starts[members, starts], self.given[:, starts])
+        last = np.where(self.follow[starts] >= 0, self.steps - self.window, 0)
+        parts = [
+            (*which, begin)
+            for *which, end in zip(members, starts, last, strict=True)
+            for begin in np.unique([*range(0, end, self.window), end])
+        ]
+        return self._windows(*np.array(parts[:HARDEST]).T)
 
 
 FIRST_LOOK = 10  # pairs of a trial between rounds

@@ -144,8 +144,8 @@ class Improvement:
         steps = f"{self.steps:,} of the simulator, {tried}" if self.steps else tried
         source = "twin" if self.where == "the twin" else "env"
         if not self.accepted:
-            more = f"print(headroom(mpc, {source})) shows what can be gained, and how"
-            return summary_lines(f"{self.reason} The model is as it was.", steps=steps, next=more)
+            said = f"{self.reason} The model is as it was."
+            return summary_lines(said, steps=steps, next=self._next())
         last = next((each for each in reversed(self.checks) if each.accepted), None)
         interval = last.interval if last is not None else None
         change = change_in_percent(self.change, interval if source == "env" else None)
@@ -160,6 +160,20 @@ class Improvement:
             'report(model, "report.html", env=env), then Commissioning(model, plant, shadow=True)'
         )
         return summary_lines("Accepted: a better policy.", **rows, steps=steps, next=more)
+
+    def _next(self) -> str:
+        """Return what leads on after a refusal."""
+        _, settled, cure = self.reason.rstrip(".").partition("to settle it, ")
+        if settled:
+            return f"keep the MPC and {cure}; then fit the twin anew"
+        if "too little to teach" in self.note:
+            return "keep the MPC: there is little to gain"
+        if "max_steps" in self.note:
+            return "give more max_steps, or keep the MPC"
+        if self.where == "the twin":
+            return "keep the MPC; log more, with held steps of the inputs that twin.report() names"
+        more = [f"{k}={2 * v}" for k, v in self.settings.items() if k in ("n_starts", "updates")]
+        return f"keep the MPC, or learn from more: improve(..., {', '.join(more)})"
 
     __str__ = report
 
@@ -205,7 +219,7 @@ def improve(
         play at once. Within ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, episodes
         are spread over its workers; nothing else changes.
     max_steps : int, optional
-        Of the simulator, for everything. Where they do not suffice nothing is accepted.
+        Of a simulator, for everything. Where they do not suffice nothing is accepted.
     n_starts : int, default 40
         Episodes that are planned in the model; in a twin, also starts of a check for each member,
         so many as the log begins, and as many around.
@@ -255,9 +269,14 @@ def improve(
         check_int(name, given[name])
     if max_steps is not None:
         check_int("max_steps", max_steps)
+        if isinstance(twin, PlantTwin):
+            raise ValueError(
+                f"max_steps = {max_steps} bounds the steps of a simulator, and a twin takes none. "
+                "Leave it out; n_starts, rounds and updates bound what a twin takes."
+            )
     check_int("seed", seed, 0)
     check_bool("confine", confine)
-    with shown(progress_bar):
+    with shown(progress_bar, parts=True):
         if isinstance(model, LinearMPC):
             with preserve_rng():  # a seed of Stable-Baselines3 is a global one
                 model = DDPG(
@@ -310,11 +329,11 @@ class _Progress:
 
     def __call__(self, text: str, pairs: int = 0) -> None:
         """Write a line; ``pairs`` of a confirmation have been played."""
-        left = None
+        left = 0.0
         if len(self.ends) > 1:
             each = (self.ends[-1] - self.ends[0]) / (len(self.ends) - 1)
             over = self.rounds if pairs else len(self.ends) - 1
-            left = each * (self.rounds - over)
+            left = max(each * (self.rounds - over) - (time.monotonic() - self.ends[-1]), 0.0)
             if self.simulator:
                 left += self.simulator.seconds_of(2 * max(LOOKS[-1] - pairs, 0))
         self.write(text, left)
@@ -404,7 +423,8 @@ class _Work:
             return Improvement(tuple(self.checks), change, accepted, before, note=note)
 
         # As many as are asked for, half of them as the log begins, half around.
-        scenarios: Scenarios | None = Trial.draw(twin, -(-self.n_starts // 2), self.rng).scenarios()
+        drawn = Trial.draw(twin, -(-self.n_starts // 2), self.rng)
+        scenarios: Scenarios | None = drawn.scenarios(self.rng)
         shown: Teacher | None = None
         self.say.end_of_round()
         for number in range(self.rounds):

@@ -288,7 +288,7 @@ def headroom(
     if max_steps is not None:
         check_int("max_steps", max_steps)
     search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), max_steps)
-    with shown(progress_bar), warnings.catch_warnings():
+    with shown(progress_bar, parts=True), warnings.catch_warnings():
         warnings.simplefilter("ignore", OnlineLawWarning)
         return search.found()
 
@@ -346,7 +346,7 @@ class _Search:
             self.simulator.close()
         return self.figures(note)
 
-    def say(self, text: str, left: float | None = None) -> None:
+    def say(self, text: str, left: float = 0.0) -> None:
         """Write a line with the gain that was found."""
         gained = f"{0.0 - 100 * gain(self.base.costs, self.best):+.2f} %"
         self.progress(f"{text}; the best so far: {gained}", left)

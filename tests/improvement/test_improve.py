@@ -445,6 +445,29 @@ def test_what_no_check_lets_through_changes_nothing(monkeypatch) -> None:
     assert not any(each.accepted for each in found.checks)
 
 
+def test_of_long_episodes_parts_are_planned_and_the_whole_is_checked(monkeypatch) -> None:
+    from sb3_yann.improvement import confirmation, improving
+
+    planned = []
+    monkeypatch.setattr(confirmation, "WINDOW", 9)
+    teacher = improving.Teacher
+    monkeypatch.setattr(
+        improving, "Teacher", lambda some, seed: planned.append(some) or teacher(some, seed)
+    )
+    found = improve(model_of(), twin_of(), **ENOUGH)
+    assert found.accepted and found.change < -0.01
+    assert {len(each.given) for each in planned} == {9}
+    trial = confirmation.Trial.draw(twin_of(), 10, np.random.default_rng(0))
+    assert trial.steps == max(map(len, twin_of().episodes)) == 20
+    lost = trial.hard((trial.mpc[0] + 1e3, trial.mpc[1]))  # every start of every member
+    assert len(lost) == confirmation.HARDEST
+
+
+def test_a_twin_takes_no_steps_of_a_simulator() -> None:
+    with pytest.raises(ValueError, match="max_steps = 9 bounds the steps of a simulator, and a tw"):
+        improve(model_of(), twin_of(), max_steps=9)
+
+
 def test_a_twin_that_is_not_trusted_is_refused() -> None:
     model = model_of()
     before = bits(model)
@@ -509,6 +532,30 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
         Improvement((small,), 0.0, accepted=False)
     )
     assert Improvement((), 0.0, False).reason == "Nothing better was found: no gain in the twin."
+
+
+@pytest.mark.parametrize(
+    ("where", "note", "leads_on"),
+    [
+        (
+            "the twin",
+            "it may lose: to settle it, log held steps of u",
+            "the MPC and log held steps",
+        ),
+        (
+            "the twin",
+            "plans gain 0 %, too little to teach",
+            "keep the MPC: there is little to gain",
+        ),
+        ("the twin", "2 starts with violations", "held steps of the inputs that twin.report()"),
+        ("the simulator", "max_steps = 9 are too few to go on", "give more max_steps, or keep"),
+        ("the simulator", "2 starts with violations", "improve(..., n_starts=80, updates=8000)"),
+    ],
+)
+def test_a_refusal_leads_on(where: str, note: str, leads_on: str) -> None:
+    settings = {"n_starts": 40, "updates": 4000, "rounds": 4}
+    refused = Improvement((), 0.0, False, where=where, note=note, settings=settings)
+    assert leads_on in refused.report().splitlines()[-1]
 
 
 class Limited(Spring):

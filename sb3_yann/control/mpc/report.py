@@ -7,6 +7,7 @@ from itertools import chain
 
 import numpy as np
 
+from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.linear_system import labels_of
@@ -112,7 +113,7 @@ def _stay_feasible(problem: MPCProblem, law: Law, theta: Array) -> Array:
     """Tell which rows of theta (batch, n_theta) the closed loop keeps in the domain."""
     (A, B) = problem.prediction
     kept = np.ones(len(theta), dtype=bool)
-    for _ in range(LOOP_STEPS):
+    for _ in bar("closed loops on the model: steps", range(LOOP_STEPS)):
         theta = theta @ A.T + law(theta) @ B.T
         kept &= law.in_domain(theta)
         theta = np.where(kept[:, None], theta, 0.0)  # those that left may grow without bound
@@ -125,7 +126,7 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
     units = ProgramUnits(program, problem.u_min, problem.u_max)
     scaled = units.scaled
     counts = dict.fromkeys(names, 0)
-    for theta in (feasible - units.center) / units.half:
+    for theta in bar("plans at random parameters", (feasible - units.center) / units.half):
         U = scaled.solve(theta)
         if U is None:  # on the border of the domain
             continue
