@@ -25,12 +25,13 @@ class Episode:
     """One episode without gaps: states (T + 1, n), inputs (T, m) and disturbances (T, d).
 
     States are before every input and after the last one, inputs as they were executed, and
-    disturbances measured with them; without entries where nothing was.
+    disturbances and references (T, p) of then; without entries where there were none.
     """
 
     states: Array
     inputs: Array
     disturbances: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    references: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __len__(self) -> int:
         """Return the number of steps T."""
@@ -50,9 +51,8 @@ class Episode:
 
     def part(self, start: int, stop: int) -> Episode:
         """Return the steps from start to before stop."""
-        return Episode(
-            self.states[start : stop + 1], self.inputs[start:stop], self.disturbances[start:stop]
-        )
+        given = (each[start:stop] for each in (self.inputs, self.disturbances, self.references))
+        return Episode(self.states[start : stop + 1], *given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -234,6 +234,7 @@ class Log:
         dt: float,
         *,
         disturbances: Sequence[str] = (),
+        references: Sequence[str] = (),
         episode: str | None = None,
         time: str | None = None,
         delimiter: str = ",",
@@ -248,8 +249,9 @@ class Log:
         ----------
         path : path-like
             The file.
-        states, inputs, disturbances : sequence of str
+        states, inputs, disturbances, references : sequence of str
             Names of columns. Of a header ``T [K]`` the name is ``T``, and the unit ``K``.
+            References are the MPC's set-points, for its twin.
         dt : float
             Sampling time.
         episode : str, optional
@@ -278,11 +280,11 @@ class Log:
             header = list(rows.fieldnames or [])
             columns = {
                 name: _column(path, name, header)
-                for name in (*states, *inputs, *disturbances, episode, time)
+                for name in (*states, *inputs, *disturbances, *references, episode, time)
                 if name is not None
             }
             content = list(rows)
-        wanted = [columns[name] for name in (*states, *inputs, *disturbances)]
+        wanted = [columns[name] for name in (*states, *inputs, *disturbances, *references)]
         if twice := [name for name in wanted if wanted.count(name) > 1]:
             raise ValueError(
                 f"Column {twice[0]!r} is named twice. Each state, input and disturbance has a "
@@ -299,7 +301,8 @@ class Log:
         if not len(table):
             raise ValueError(f"{path} has no rows below its header.")
         n = len(states)
-        m = len(inputs)
+        sizes = (n, len(inputs), len(disturbances), len(references))
+        x, *others = np.split(table, np.cumsum(sizes)[:-1], axis=1)
         ends = np.zeros(len(table) + 1, dtype=bool)
         ends[[0, -1]] = True
         if episode is not None:
@@ -307,10 +310,7 @@ class Log:
             ends[1:-1] |= labels[1:] != labels[:-1]
         edges = pairwise(np.flatnonzero(ends).tolist())
         parts = [slice(first, stop) for first, stop in edges if stop - first > 1]
-        records = [
-            Episode(table[part, :n], table[part, n : n + m][:-1], table[part, n + m :][:-1])
-            for part in parts
-        ]
+        records = [Episode(x[part], *(each[part][:-1] for each in others)) for part in parts]
         if not records:
             raise ValueError(f"{path} holds no two rows of an episode.")
         times = None
@@ -321,8 +321,10 @@ class Log:
                 time_unit = unit or "s"
             instants = np.array([each for each, _ in pairs])
             times = [instants[part] for part in parts]
-        names = [_name_and_unit(each)[0] for each in wanted]
-        units = tuple(_name_and_unit(each)[1] for each in wanted)
+        named = [_name_and_unit(each) for each in wanted[: sum(sizes[:3])]]
+        names = [name for name, _ in named]
+        units = tuple(unit for _, unit in named)
+        m = len(inputs)
         return cls._of(
             records,
             dt,
@@ -362,6 +364,8 @@ def _cut(
     for i, each in enumerate(records):
         there: NDArray[np.bool_] = np.all(np.isfinite(each.states[:, ~rare]), axis=1)
         complete = np.isfinite(each.driven).all(axis=1)
+        if each.references.size:
+            complete &= np.isfinite(each.references).all(axis=1)
         late = [] if on_time is None else [on_time[i]]
         whole = np.all([there[:-1], there[1:], complete, *late], axis=0)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import (
+    DisturbanceBounds,
     LinearModel,
     LinearMPC,
     PlantTwin,
@@ -122,6 +123,44 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(tmp_path) -> None:
     assert log.lost_steps == 3 and log.state_names == ("level", "T")
     assert log.every == (1, 1) and log.with_all_states() is log
     assert log.episodes[0].disturbances.tolist() == [[7], [7]]
+
+
+def test_set_points_and_loads_of_a_csv_file_reach_the_twin(tmp_path) -> None:
+    model = LinearModel([[0.9]], [[0.5]], 1, [12], [3], E=[[0.1]], d_ss=[1])
+    mpc = LinearMPC(
+        model, Q=[[1]], R=[[1]], horizon=2, x_min=0, x_max=20, u_min=0, u_max=10,
+        tracking=Tracking([0], 5, 15), disturbances=DisturbanceBounds(0, 2),
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    lines = ["run,h [cm],q,load,h_sp [cm]"]
+    states, inputs, held = [], [], []
+    for run in range(6):
+        x = [rng.uniform(5, 15)]
+        u = rng.uniform(2, 4, 8)
+        d = rng.uniform(0.5, 1.5, 9)
+        r = np.repeat(rng.uniform(5, 15, 3), 3)
+        for t in range(8):
+            x.append(12 + 0.9 * (x[-1] - 12) + 0.5 * (u[t] - 3) + 0.1 * (d[t] - 1))
+        rows = zip(x, [*u, u[-1]], d, r, strict=True)
+        lines += [f"{run},{','.join(map(repr, map(float, row)))}" for row in rows]
+        states.append(np.array(x)[:, None])
+        inputs.append(u[:, None])
+        held.append(([*r[:-1], r[-2]], [*d[:-1], d[-2]]))  # the last row's count for nothing
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines))
+    columns = {"disturbances": ["load"], "references": ["h_sp"], "episode": "run"}
+    log = Log.from_csv(path, ["h"], ["q"], 1, **columns)
+    assert log.units == ("cm", "", "") and log.disturbance_names == ("load",)
+    of_log = PlantTwin.fit(mpc, log, residuals=["none"])
+    references, disturbances = (
+        [np.array(part)[:, None] for part in each] for each in zip(*held, strict=True)
+    )
+    pairs = [*zip(states, inputs, strict=True)]
+    given = {"references": references, "disturbances": disturbances}
+    plain = PlantTwin.fit(mpc, pairs, **given, residuals=["none"])
+    for one, other in zip(of_log.episodes, plain.episodes, strict=True):
+        np.testing.assert_array_equal(one.thetas, other.thetas)
+    assert np.ptp([each.thetas[:, 1] for each in of_log.episodes]) > 1
 
 
 def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(tmp_path) -> None:

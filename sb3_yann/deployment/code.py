@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,17 +189,19 @@ class Cost:
 
 
 def signal_lines(data: Arrays, output: str) -> list[str]:
-    """Return a line for each entry of an observation and of the output: name and values.
+    """Return a line for each entry of an observation and of the output: name, unit and values.
 
     The values tell deviations from the plant's own units.
     """
-    lines = [
-        f"obs[{i}]  {name}, {rest:.6g} at rest"
-        for i, (name, rest) in enumerate(zip(data["obs_names"], data["obs_rest"], strict=True))
-    ]
+    labels = dict(data.get("labels", ()))
+    lines = [f"A step is {data['dt']:g} {data.get('time_unit', '')}".rstrip() + "."]
+    limits = zip(data["obs_names"], data["obs_rest"], data["obs_min"], data["obs_max"], strict=True)
+    for i, (name, rest, low, high) in enumerate(limits):
+        within = f", good within {low:.6g} to {high:.6g}" if high - low < np.inf else ""
+        lines.append(f"obs[{i}]  {labels.get(name, name)}, {rest:.6g} at rest{within}")
     ends = data["bounds"] * data["action_scale"] + data["action_shift"]
     for i, (name, low, high) in enumerate(zip(data["action_names"], *ends, strict=True)):
-        lines.append(f"{output}[{i}]  {name}, {low:.6g} to {high:.6g}")
+        lines.append(f"{output}[{i}]  {labels.get(name, name)}, {low:.6g} to {high:.6g}")
     return lines
 
 
@@ -249,7 +252,8 @@ def _nested(values: NDArray[np.generic], precision: str, depth: int) -> str:
 
 def ascii_text(lines: Iterable[str]) -> str:
     """Return lines as one text in ASCII."""
-    return "\n".join(lines).encode("ascii", "backslashreplace").decode()
+    plain = normalize("NFKC", "\n".join(lines).replace("°", "deg"))  # a square is m2
+    return plain.encode("ascii", "backslashreplace").decode()
 
 
 # ---- Points at which answers are known ----

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_yann._validation import Array, check_bounds, check_int, check_positive
 from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine, StateEstimator
-from sb3_yann.control.linear_system import labels_of, missing_observer
+from sb3_yann.control.linear_system import labels_of, missing_observer, with_units
 from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMAT
 from sb3_yann.networks import YannLayer
@@ -250,6 +250,8 @@ def describe(
         "action_scale": scale,
         "action_shift": shift,
         "action_names": np.array([*input_names]),
+        "labels": _labels(policy, problem, law.model),
+        "time_unit": "" if law.model is None else law.model.time_unit,
         "note": note,
     }
 
@@ -274,6 +276,19 @@ def _lacks(policy: Any, problem: LinearMPC | None, estimator: Estimator) -> str:
             'code runs it: estimator="caller".'
         )
     return note
+
+
+def _labels(policy: Any, problem: LinearMPC | None, model: Any) -> NDArray[np.str_]:
+    """Return names of what is read and put out in plant units, and the same with units, (k, 2)."""
+    found: list[tuple[str, str]] = []
+    if model is not None and _shows_theta(policy):
+        states = labels_of(model)[0], with_units(model)[0]
+        theta = problem and (problem.labels(), problem.labels(units=True))
+        found += zip(*(theta or states), strict=True)
+    scaled = isinstance(policy, StartsAsMPC) and policy.action_units.kind != "plant"
+    if model is not None and not scaled:
+        found += zip(labels_of(model)[1], with_units(model)[1], strict=True)
+    return np.array([each for each in found if each[0] != each[1]], str).reshape(-1, 2)
 
 
 def _shows_theta(policy: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -100,14 +100,13 @@ def without_copies(episodes: tuple[Episode, ...]) -> tuple[tuple[Episode, ...], 
     return (*kept.values(),), (f"Left out {len(episodes) - len(kept)} copies of other episodes.",)
 
 
-def without_short_pieces(log: Log) -> tuple[list[tuple[Array, Array]], tuple[str, ...]]:
-    """Return the pairs of a log without those of few steps, which gaps leave, and a note."""
-    pairs = [*log]
-    kept = [(states, inputs) for states, inputs in pairs if len(inputs) >= SHORTEST]
-    if not kept or len(kept) == len(pairs):
-        return pairs, ()
-    note = f"Left out {len(pairs) - len(kept)} pieces of less than {SHORTEST} steps"
-    return kept, (f"{note}; {log.lost_steps} steps were gaps.",)
+def without_short_pieces(log: Log) -> tuple[Log, tuple[str, ...]]:
+    """Return a log without episodes of few steps, which gaps leave, and a note."""
+    kept = tuple(each for each in log.episodes if len(each) >= SHORTEST)
+    if not kept or len(kept) == len(log):
+        return log, ()
+    note = f"Left out {len(log) - len(kept)} pieces of less than {SHORTEST} steps"
+    return replace(log, episodes=kept), (f"{note}; {log.lost_steps} steps were gaps.",)
 
 
 def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
@@ -213,7 +212,8 @@ def _theta(
             elif size:
                 raise ValueError(
                     f"The problem's theta holds {size} {name}: pass {name}=, shape (T + 1, "
-                    f"{size}) for each episode, or states of all of theta."
+                    f"{size}) for each episode, or states of all of theta. Of a CSV file, name the "
+                    f"columns: Log.from_csv(..., {name}=[...])."
                 )
             continue
         values = _finite(f"episode {i}: {name}", given[name])

@@ -137,7 +137,8 @@ class PlantTwin(LearntModel):
             The MPC of the plant: its model is where the twin starts from.
         episodes : sequence of pairs, or Log
             States (T + 1, n), or all of theta (T + 1, n_theta), and actions (T, m), in plant units
-            where the problem's model has an operating point.
+            where the problem's model has an operating point. A log may hold references and
+            disturbances.
         references, disturbances : sequence of array_like, optional
             What theta holds besides the state, shapes (T + 1, p) and (T + 1, d) for each episode.
         previous : sequence of array_like, shape (m,), optional
@@ -178,9 +179,16 @@ class PlantTwin(LearntModel):
         notes: tuple[str, ...] = ()
         if isinstance(episodes, Log):
             _require_same_sampling(episodes, problem)
-            episodes = episodes if observer is not None else episodes.with_all_states()
+            whole = episodes if observer is not None else episodes.with_all_states()
             if references is disturbances is previous is None:  # else they are one for each
-                episodes, notes = without_short_pieces(episodes)
+                whole, notes = without_short_pieces(whole)
+                held = [(each.references, each.disturbances) for each in whole.episodes]
+                counts = problem.layout.n_references, problem.layout.n_disturbances
+                references, disturbances = (
+                    [np.vstack([each, each[-1:]]) for each in of] if of[0].size and n else None
+                    for of, n in zip(zip(*held, strict=True), counts, strict=True)
+                )
+            episodes = whole
         row = RowLayout(problem, observer)
         if observer is not None and row.observer is None:
             episodes, disturbances = row.estimated(episodes, disturbances)

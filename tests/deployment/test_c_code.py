@@ -171,14 +171,28 @@ def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
 
 def test_a_header_tells_plant_units(tmp_path):
     for problem, shown in (
-        (solved("reactor"), ["T, 0 at rest", "U, -55 to 55"]),
-        (reactor_in_plant_units(), ["T, 475 at rest", "U, 0 to 110"]),
+        (solved("reactor"), ["T (K), 0 at rest", "U (kJ/(h m2 K)), -55 to 55"]),
+        (reactor_in_plant_units(), ["T (K), 475 at rest", "U (kJ/(h m2 K)), 0 to 110"]),
     ):
         export(problem.explicit(), tmp_path / "plant.c")
         export(problem.explicit(), tmp_path / "plant.st")
         for suffix in ("h", "st"):
             text = (tmp_path / f"plant.{suffix}").read_text()
             assert all(each in text for each in shown)
+
+
+def test_code_names_units_limits_and_the_time_of_a_step(tmp_path):
+    units = {"units": {"level": "cm", "flow": "L/s"}, "time_unit": "min"}
+    names = {"state_names": ["level"], "input_names": ["flow"], "x_ss": [12], "u_ss": [3]}
+    tank = LinearModel([[0.9]], [[0.5]], dt=2, **names, **units)
+    mpc = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=3, x_min=0, x_max=20, u_min=0, u_max=10)
+    for given in (mpc, mpc.explicit()):
+        for file in ("tank.h", "tank.st"):
+            code = tmp_path / file.replace(".h", ".c")
+            export(given, code, checks=Checks(obs_min=0, obs_max=20))
+            text = (tmp_path / file).read_text()
+            assert "A step is 2 min." in text and "[0]  flow (L/s), 0 to 10" in text
+            assert "obs[0]  level (cm), 12 at rest, good within 0 to 20" in text
 
 
 def test_steps_are_counted_by_what_they_found(tmp_path):

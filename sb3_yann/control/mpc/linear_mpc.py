@@ -481,7 +481,8 @@ class LinearMPC(MPCProblem):
                 return found
             warn(
                 f"The program will be solved online, at each point. {found} To skip the search, "
-                "and this warning, choose problem.law('online'), or law='online' of a policy.",
+                "and this warning, choose problem.law('online'), or law='online' of a policy. An "
+                "online law is exported as C, FMU or npz, not as Structured Text or ONNX.",
                 OnlineLawWarning,
             )
         vars(self)[ONLINE_CHOSEN] = True
