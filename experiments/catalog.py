@@ -36,7 +36,8 @@ from sb3_yann import (
     YannPolicy,
     offset_free,
 )
-from sb3_yann.rollout import Source, Trajectories, evaluate
+from sb3_yann.env_pool import Source
+from sb3_yann.rollout import Trajectories, evaluate
 from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs import problems
 

@@ -16,22 +16,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, check_int, check_range, check_type, warn
 from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.env_pool import EnvPool, Source, as_source, make_env, one_env, require_like_training
 from sb3_yann.policy.exploring import Explores
 from sb3_yann.policy.observations import normalized, require_frozen, require_same_statistics
 from sb3_yann.policy.policies import StartsAsMPC, require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
-from sb3_yann.rollout import (
-    EnvPool,
-    Rows,
-    Source,
-    Trajectories,
-    as_source,
-    make_env,
-    one_env,
-    preserve_rng,
-    require_like_training,
-    rollout,
-)
+from sb3_yann.rollout import Rows, Trajectories, preserve_rng, rollout
 
 
 class NoActionNoise(BaseCallback):

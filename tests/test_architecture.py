@@ -24,6 +24,7 @@ FLOORS = [
     {"sb3_yann.log", "sb3_yann.units"},
     {"sb3_yann.control"},
     {"sb3_yann.compare"},
+    {"sb3_yann.env_pool"},
     {"sb3_yann.rollout"},
     {"sb3_yann_envs"},
     {"sb3_yann.evaluation"},

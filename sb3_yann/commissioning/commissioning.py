@@ -39,11 +39,11 @@ from sb3_yann.control.mpc.bound_excess import (
     bound_excess,
     excess_of_episodes,
 )
+from sb3_yann.env_pool import Source, one_env
 from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
 from sb3_yann.improvement.confirmation import RULE
 from sb3_yann.policy.checkpoint import ActorCheckpoint
-from sb3_yann.rollout import Source, one_env
 from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 

@@ -19,6 +19,7 @@ from sb3_yann._archive import atomic_write
 from sb3_yann._validation import check_bool, check_int, check_options, check_range, warn
 from sb3_yann.audit.reward import CostAudit
 from sb3_yann.compare import AcceptanceRule
+from sb3_yann.env_pool import Source, as_source, name_of, require_like_training
 from sb3_yann.evaluation.plots import plot_decisions
 from sb3_yann.guard.decide import GuardSettings, Player, decide, decide_at_end
 from sb3_yann.guard.start import (
@@ -42,14 +43,7 @@ from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import require_same_statistics
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
-from sb3_yann.rollout import (
-    LONG_EPISODE,
-    Source,
-    as_source,
-    name_of,
-    preserve_rng,
-    require_like_training,
-)
+from sb3_yann.rollout import LONG_EPISODE, preserve_rng
 from sb3_yann.twin.plant_twin import PlantTwin
 
 if TYPE_CHECKING:

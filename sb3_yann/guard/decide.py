@@ -33,18 +33,12 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.env_pool import EnvPool, Source
 from sb3_yann.guard.state import Decision, Evidence, Outcome, Play
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
-from sb3_yann.rollout import (
-    EnvPool,
-    Rows,
-    Source,
-    Trajectories,
-    preserve_rng,
-    rollout,
-)
+from sb3_yann.rollout import Rows, Trajectories, preserve_rng, rollout
 
 FIRST_LOOK = 5  # starts of a trial of its first look
 FIRST_FINAL_LOOK = 40  # the same at the end: the worst 5 % of so many are two

@@ -21,6 +21,7 @@ from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
+from sb3_yann.env_pool import Source, maker, name_of
 from sb3_yann.evaluation import change_in_percent, summary_lines
 from sb3_yann.improvement.confirmation import (
     ENOUGH,
@@ -50,7 +51,7 @@ from sb3_yann.policy.policies import (
     require_problem_of_twin,
     require_yann_policy,
 )
-from sb3_yann.rollout import Source, maker, name_of, preserve_rng
+from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin

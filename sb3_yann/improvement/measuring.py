@@ -17,6 +17,7 @@ from sb3_yann._validation import Array, check_int
 from sb3_yann.compare import less_safe
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.augmented import SHARE
+from sb3_yann.env_pool import Source, maker
 from sb3_yann.evaluation import change_in_percent, paired_rows, summary_lines
 from sb3_yann.improvement.simulator import (
     OutOfStepsError,
@@ -27,7 +28,7 @@ from sb3_yann.improvement.simulator import (
     task_of,
 )
 from sb3_yann.plan import PAUSE, Planning, TwinPlant, value_at_end
-from sb3_yann.rollout import Controller, Rows, Source, Trajectories, maker
+from sb3_yann.rollout import Controller, Rows, Trajectories
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import as_episodes
 from sb3_yann.twin.plant_twin import PlantTwin

@@ -27,19 +27,9 @@ from sb3_yann.audit.meaning import (
 from sb3_yann.compare import NewSeeds, unsafe_columns
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.env_pool import EnvPool, Source, maker, pool_of
 from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
-from sb3_yann.rollout import (
-    Controller,
-    EnvPool,
-    Rows,
-    Source,
-    Trajectories,
-    joined,
-    maker,
-    of_episode,
-    pool_of,
-    rollout,
-)
+from sb3_yann.rollout import Controller, Rows, Trajectories, joined, of_episode, rollout
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import SHORTEST, Episode, observer_of

@@ -12,6 +12,7 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
+from sb3_yann.env_pool import Source
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.improvement import Headroom
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
@@ -28,7 +29,7 @@ from sb3_yann.reporting.evidence_parts import (
 )
 from sb3_yann.reporting.problem_parts import constraints_part, law_part, plant_part
 from sb3_yann.reporting.subject import Html, Part, Subject, clean, page, paragraph, table, tag
-from sb3_yann.rollout import Source, as_seeds
+from sb3_yann.rollout import as_seeds
 from sb3_yann.twin import PlantTwin
 
 __all__ = ["report"]

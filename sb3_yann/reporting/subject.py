@@ -20,13 +20,14 @@ from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.control.online import Law
 from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.env_pool import Source, name_of, one_env
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.state import GuardState
 from sb3_yann.improvement import Headroom
 from sb3_yann.improvement.improving import Improvement, fingerprint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
-from sb3_yann.rollout import Controller, Source, Trajectories, name_of, one_env, rollout
+from sb3_yann.rollout import Controller, Trajectories, rollout
 from sb3_yann.twin import PlantTwin
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, to_float, warn
 from sb3_yann.control import LinearMPC, StateEstimator
+from sb3_yann.env_pool import is_vec_env
 from sb3_yann.log import Log
-from sb3_yann.rollout import is_vec_env
 from sb3_yann.twin.row_layout import ROUNDED
 
 SHORTEST = 5  # steps that an episode has at least

@@ -25,8 +25,8 @@ from sb3_yann.commissioning.commissioning import (
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.commissioning.watchdog import Alarm
 from sb3_yann.compare import Difference
+from sb3_yann.env_pool import one_env
 from sb3_yann.improvement import Check
-from sb3_yann.rollout import one_env
 from twin_samples import Cart, problem
 from weights import is_mpc
 

@@ -11,8 +11,8 @@ from stable_baselines3 import DDPG
 
 import unit_samples as units
 from sb3_yann import YannPolicy
+from sb3_yann.env_pool import EnvPool, maker
 from sb3_yann.evaluation import Trajectories, evaluate
-from sb3_yann.rollout import EnvPool, maker
 from sb3_yann_envs import problems
 
 SEEDS = range(3)
