@@ -82,7 +82,8 @@ MODULES = _modules()
 
 def _imports(name: str) -> set[str]:
     """Return what a module imports anywhere: in functions and for type checkers too."""
-    found, package = set(), name if MODULES[name].stem == "__init__" else name.rpartition(".")[0]
+    found = set()
+    package = name if MODULES[name].stem == "__init__" else name.rpartition(".")[0]
     for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}

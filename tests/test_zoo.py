@@ -174,7 +174,8 @@ def test_evaluation_keeps_the_best_model_and_the_rewards(run) -> None:
     assert (run.log() / "best_model.zip").is_file()
     # Which is a candidate; the guard keeps what it accepted beside it.
     accepted = ALGORITHMS[run.algo].load(run.log() / "accepted_model.zip")
-    own, left = accepted.policy.actor.state_dict(), run.model().policy.actor.state_dict()
+    own = accepted.policy.actor.state_dict()
+    left = run.model().policy.actor.state_dict()
     assert all(th.equal(each, left[name]) for name, each in own.items())
     assert np.load(run.log() / "evaluations.npz")["results"].shape == (1, 1)
 
@@ -222,7 +223,8 @@ def test_every_draw_builds_a_policy_that_is_the_mpc(monkeypatch):
     for _ in range(12):
         drawn = tuning.sample(study.ask())
         model = DDPG("YannPolicy", "CSTR-v0", device="cpu", **drawn)
-        law, theta = model.policy.problem.explicit(), np.float32([0.2, 0.1, -0.1, 1.0])
+        law = model.policy.problem.explicit()
+        theta = np.float32([0.2, 0.1, -0.1, 1.0])
         assert np.allclose(model.predict(theta)[0], law(theta), atol=1e-4)
         assert model.policy.lr_mult["actor"] == drawn["policy_kwargs"]["actor_lr_mult"]
         seen.add(drawn["policy_kwargs"]["networks"])

@@ -278,13 +278,15 @@ class Rewarded(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.state, self.t = self.np_random.uniform(-3, 3, 2), 0
+        self.state = self.np_random.uniform(-3, 3, 2)
+        self.t = 0
         if options is not None:
             self.state = np.array(options["state"])
         return self.state.copy(), {}
 
     def step(self, action):
-        before, self.t = self.state, self.t + 1
+        before = self.state
+        self.t = self.t + 1
         self.state = PLANT.step(before, action)
         reward = self.reward(before, action, self.state)
         return self.state.copy(), reward, False, self.t == 25, {}
@@ -345,7 +347,8 @@ def test_what_a_violation_or_a_termination_costs_does_not_count() -> None:
 
 
 def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
-    plain, held = Rewarded(stage), SetPoint(Rewarded(stage), -1, 1)
+    plain = Rewarded(stage)
+    held = SetPoint(Rewarded(stage), -1, 1)
     assert below_set_points(gym.wrappers.TimeLimit(held, 9)) and not below_set_points(plain)
     tracking = dataclasses.replace(mpc(), tracking=Tracking([0], -1, 1))
     headroom(tracking, held, n_starts=2)  # a warning would be an error
@@ -354,8 +357,10 @@ def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
 def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
     problem = mpc()
     for steps, theta in ((9, 1.0), (30, 0.0)):
-        thetas, inputs = np.full((steps + 1, 2), theta), np.zeros((steps, 1))
-        none, rewards = np.zeros(1, dtype=int), np.arange(float(steps))
+        thetas = np.full((steps + 1, 2), theta)
+        inputs = np.zeros((steps, 1))
+        none = np.zeros(1, dtype=int)
+        rewards = np.arange(float(steps))
         played = Trajectories(
             none.astype(float),
             none,
@@ -368,7 +373,8 @@ def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
 
 
 def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:
-    env, problem = Rewarded(OTHER["a profit"]), mpc()
+    env = Rewarded(OTHER["a profit"])
+    problem = mpc()
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
         assert "By its own stage cost" in str(headroom(problem, env, n_starts=2))
     assert [each.filename for each in found] == [__file__]

@@ -38,16 +38,20 @@ class Shuffled(gym.Env):
     action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
 
     def __init__(self, order: list[int], noise: float = 0.0, gain: float = 1.0) -> None:
-        self.order, self.noise, self.gain = order, noise, gain
+        self.order = order
+        self.noise = noise
+        self.gain = gain
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.t = self.np_random.uniform(-3, 3, 3), 0
+        self.x = self.np_random.uniform(-3, 3, 3)
+        self.t = 0
         return self.shown(), {}
 
     def step(self, action):
         cost = float(MPC.stage_cost(self.x, action))
-        self.x, self.t = MODEL.step(self.x, self.gain * action), self.t + 1
+        self.x = MODEL.step(self.x, self.gain * action)
+        self.t += 1
         return self.shown(), -cost, False, self.t == 20, {}
 
     def shown(self) -> np.ndarray:
@@ -96,7 +100,8 @@ class Tanks(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.t = self.np_random.uniform([8, 325], [16, 335]), 0
+        self.x = self.np_random.uniform([8, 325], [16, 335])
+        self.t = 0
         return self.shown(self.x), {}
 
     def step(self, action):
@@ -158,7 +163,8 @@ def test_noise_and_a_wrong_model_are_no_other_order(noise: float, gain: float) -
 def test_of_two_states_that_are_alike_neither_order_is_reported() -> None:
     twins = LinearModel(np.eye(2) / 2, [[1], [1]], dt=1.0)
     mpc = LinearMPC(twins, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
-    theta, u = np.random.default_rng(0).normal(size=(40, 2)), np.zeros((40, 1))
+    theta = np.random.default_rng(0).normal(size=(40, 2))
+    u = np.zeros((40, 1))
     warn_of_order(mpc, theta, u, theta[:, ::-1] / 2)  # a warning would be an error
 
 
@@ -169,7 +175,9 @@ def test_of_six_states_two_that_are_exchanged_are_reported() -> None:
     rng = np.random.default_rng(0)
     model = LinearModel(0.3 * rng.normal(size=(6, 6)), np.ones((6, 1)), dt=1.0)
     mpc = LinearMPC(model, Q=np.eye(6), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
-    theta, u, order = rng.normal(size=(80, 6)), rng.uniform(-1, 1, (80, 1)), [0, 4, 2, 3, 1, 5]
+    theta = rng.normal(size=(80, 6))
+    u = rng.uniform(-1, 1, (80, 1))
+    order = [0, 4, 2, 3, 1, 5]
     after = mpc.predict(theta, u)
     with pytest.warns(UserWarning, match=r"Show x\[\[0, 4, 2, 3, 1, 5\]\]"):
         warn_of_order(mpc, theta[:, order], u, after[:, order])

@@ -26,8 +26,10 @@ from sb3_yann.wrappers import EstimateState, ObserveDisturbance, SetPoint
 
 
 def test_the_estimate_of_a_constant_disturbance_is_exact_in_the_end() -> None:
-    observer, rng = DisturbanceObserver(LOADED, [0]), np.random.default_rng(0)
-    x, d = np.array([1.0, -1.0]), np.array([0.2])
+    observer = DisturbanceObserver(LOADED, [0])
+    rng = np.random.default_rng(0)
+    x = np.array([1.0, -1.0])
+    d = np.array([0.2])
     observer.reset(x[:1])
     for _ in range(200):
         u = rng.uniform(-1, 1, 1)
@@ -115,10 +117,12 @@ def test_bad_measurements_are_named() -> None:
 def test_the_observer_of_an_offset_free_mpc_knows_no_units() -> None:
     """A temperature in thousandths of a degree is estimated as fast as one in degrees."""
     units = np.diag([1.0, 1000.0])
-    A, B = units @ THERMAL.A @ np.linalg.inv(units), units @ THERMAL.B
+    A = units @ THERMAL.A @ np.linalg.inv(units)
+    B = units @ THERMAL.B
     gains = []
     for model, unit in ((THERMAL, np.eye(2)), (LinearModel(A, B, 1.0), units)):
-        Q, half = np.linalg.inv(unit @ unit), np.diag(unit) * 5
+        Q = np.linalg.inv(unit @ unit)
+        half = np.diag(unit) * 5
         box = {"theta_min": -half, "theta_max": half, "u_min": -1, "u_max": 1}
         _, observer = offset_free(LinearMPC(model, Q=Q, R=[[1]], horizon=2, **box))
         gains.append(observer.gain)
@@ -154,13 +158,12 @@ def test_units_of_measurement_and_state_do_not_decide_what_is_determined(unit: f
 def test_a_measured_disturbance_is_told_and_no_part_of_the_estimate() -> None:
     E = np.array([[0.3, 0.1], [-0.2, 1.0]])
     model = LinearModel([[0.7, 0.2], [0.0, 0.9]], [[0.1], [0.4]], 1, E=E, estimated=[1])
-    observer, rng, x = (
-        DisturbanceObserver(model, measured=[1]),
-        np.random.default_rng(3),
-        np.zeros(2),
-    )
+    observer = DisturbanceObserver(model, measured=[1])
+    rng = np.random.default_rng(3)
+    x = np.zeros(2)
     for _ in range(200):  # the load moves at random, the unknown stays
-        u, load = rng.normal(size=1), rng.normal(size=1)
+        u = rng.normal(size=1)
+        load = rng.normal(size=1)
         x = model.step(x, u, [load[0], 0.6])
         x_hat, d_hat = observer.update(x[1:], u, load)
     np.testing.assert_allclose([*x_hat, *d_hat], [*x, 0.6], atol=1e-9)
@@ -174,7 +177,8 @@ def test_a_measured_disturbance_is_told_and_no_part_of_the_estimate() -> None:
 # ---- Estimates from outputs alone ----
 
 
-A, B = np.array([[0.9, 0.3], [0.0, 0.7]]), np.array([[0.0], [0.5]])
+A = np.array([[0.9, 0.3], [0.0, 0.7]])
+B = np.array([[0.0], [0.5]])
 
 
 class Hidden(gym.Env[Array, Array]):
@@ -183,11 +187,15 @@ class Hidden(gym.Env[Array, Array]):
     def __init__(self, load: float = 0.0, lost: int = -1) -> None:
         self.observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
         self.action_space = spaces.Box(1.0, 5.0, (1,), np.float64)
-        self.load, self.lost, self.x, self.k = load, lost, np.zeros(2), 0
+        self.load = load
+        self.lost = lost
+        self.x = np.zeros(2)
+        self.k = 0
 
     def reset(self, *, seed: int | None = None, options: object = None) -> Any:
         super().reset(seed=seed)
-        self.x, self.k = np.array([0.5, 0.0]), 0
+        self.x = np.array([0.5, 0.0])
+        self.k = 0
         return self.x[:1] + 50, {}
 
     def step(self, action: Array) -> Any:
@@ -200,7 +208,8 @@ class Hidden(gym.Env[Array, Array]):
 def identified(dt: float = 1.0) -> IdentifiedOutputs:
     rng = np.random.default_rng(0)
     u = np.repeat(rng.uniform(2, 4, (200, 1)), 4, axis=0)
-    env, y = Hidden(), []
+    env = Hidden()
+    y = []
     y.append(env.reset()[0])
     for each in u:
         y.append(env.step(each)[0])
@@ -213,7 +222,8 @@ def test_the_estimator_of_a_model_predicts_as_the_model_does() -> None:
     u = rng.uniform(2, 4, (300, 1))
     env = Hidden()
     y = np.array([env.reset()[0], *[env.step(each)[0] for each in u]])
-    estimator, model = found.estimator(), found.model
+    estimator = found.estimator()
+    model = found.model
     y_ss = model.C @ model.x_ss
     estimator.reset(y[0] - y_ss)
     one_ahead = [estimator.expected(u[0] - model.u_ss) + y_ss]
@@ -249,7 +259,8 @@ def test_tracking_from_outputs_alone_settles_without_offset(lost: int) -> None:
     )
     free, observer = offset_free(mpc)
     assert observer.n_estimated == 1
-    low, high = free.disturbances.d_min, free.disturbances.d_max
+    low = free.disturbances.d_min
+    high = free.disturbances.d_max
     reference = 52.0
     env = ObserveDisturbance(
         SetPoint(Hidden(0.4, lost), 45, 55, schedule=lambda _: [reference]), observer, low, high
@@ -277,7 +288,8 @@ def test_a_filter_of_two_rates_uses_the_rare_readings_fully() -> None:
     noise = {"state_noise": 0.1, "measurement_noise": 0.3}
     rng = np.random.default_rng(0)
     filters = StateEstimator(model, **noise), StateEstimator(model, **noise, every=[1, 20])
-    x, errors = np.zeros(3), ([], [])
+    x = np.zeros(3)
+    errors = ([], [])
     for k in range(4000):
         y = model.C @ x + 0.3 * rng.normal(size=2)
         y[1] = y[1] if k % 20 == 0 else np.nan

@@ -53,7 +53,8 @@ def test_a_seed_reproduces_an_episode(name: str) -> None:
 
 @BOTH
 def test_the_global_random_states_are_untouched(name: str) -> None:
-    python, legacy = random.getstate(), copy.deepcopy(np.random.get_state())  # noqa: NPY002
+    python = random.getstate()
+    legacy = copy.deepcopy(np.random.get_state())  # noqa: NPY002
     env = ENVS[name]()
     env.reset(seed=1)
     env.step(act(1.0))

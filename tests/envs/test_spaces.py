@@ -268,7 +268,8 @@ class Counter(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.t, self.actions = 0, []
+        self.t = 0
+        self.actions = []
         return np.zeros(1, np.float32), {}
 
     def step(self, action):

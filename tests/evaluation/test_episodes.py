@@ -25,9 +25,11 @@ def test_an_untrained_model_costs_what_its_law_costs() -> None:
 
 
 def test_the_cost_is_minus_the_sum_of_the_rewards() -> None:
-    env, u = gym.make("CSTR-v0"), np.zeros(1, np.float32)
+    env = gym.make("CSTR-v0")
+    u = np.zeros(1, np.float32)
     env.reset(seed=0)
-    total, done = 0.0, False
+    total = 0.0
+    done = False
     while not done:
         _, reward, terminated, truncated, _ = env.step(u)
         total += float(reward)
@@ -49,10 +51,12 @@ def test_violations_are_counted_for_each_episode() -> None:
 @pytest.mark.parametrize("start", [None, -0.9])
 def test_episodes_of_a_vectorized_env_are_those_of_single_ones_to_rounding(env_id, start) -> None:
     env = gym.make(env_id)
-    law, n = env.observation_space.problem.explicit(), env.observation_space.shape[0]
+    law = env.observation_space.problem.explicit()
+    n = env.observation_space.shape[0]
     starts = None if start is None else [np.full(n, start * k / 2) * np.eye(n)[-1] for k in SEEDS]
     assert gym.spec(env_id).vector_entry_point is not None
-    together, alone = evaluate(law, env_id, SEEDS, starts), evaluate(law, env, SEEDS, starts)
+    together = evaluate(law, env_id, SEEDS, starts)
+    alone = evaluate(law, env, SEEDS, starts)
     np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(together.violations, alone.violations)
     np.testing.assert_array_equal(together.terminated, alone.terminated)
@@ -62,7 +66,8 @@ def test_episodes_of_a_vectorized_env_are_those_of_single_ones_to_rounding(env_i
 
 
 def test_an_episode_of_a_vectorized_env_stops_where_it_ends() -> None:
-    starts, u = [[0, 0.3, 0, 4.0], [0, 0, 0, -5.0]], np.full(1, -55, np.float32)
+    starts = [[0, 0.3, 0, 4.0], [0, 0, 0, -5.0]]
+    u = np.full(1, -55, np.float32)
     together = evaluate(lambda _: u, "CSTR-v0", [0, 1], starts)
     alone = evaluate(lambda _: u, gym.make("CSTR-v0"), [0, 1], starts)
     lengths = [len(each) for each in together.actions]
@@ -96,7 +101,8 @@ class Countdown(gym.Env):
         return np.full(1, self.left, np.float32), {}
 
     def step(self, action):
-        reward, violation = -float(self.left + action[0]), self.left == 2
+        reward = -float(self.left + action[0])
+        violation = self.left == 2
         self.left -= 1
         observation = np.full(1, self.left, np.float32)
         return observation, reward, self.left == 0, False, {"violation": violation}
@@ -153,7 +159,8 @@ def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> 
         made.append(Countdown())
         return made[-1]
 
-    before, pool = Countdown.open, EnvPool(make)
+    before = Countdown.open
+    pool = EnvPool(make)
     first = evaluate(Tenth(), pool, [3, 1])
     again = evaluate(Tenth(), pool, [3, 1, 4])
     assert len(made) == 3 and Countdown.open == before + 3
@@ -171,7 +178,8 @@ def test_an_env_that_is_given_stays_open() -> None:
 
 
 def test_a_law_is_played_in_plant_units() -> None:
-    mpc, make = units.plant_mpc(), partial(units.plant, "plant", "plant")
+    mpc = units.plant_mpc()
+    make = partial(units.plant, "plant", "plant")
     own = partial(units.plant, "deviation", "deviation")
     expected = evaluate(mpc.deviations.explicit(), own, SEEDS).costs
     for law in (mpc.explicit(), mpc.online(), mpc.explicit().plant_input):

@@ -50,7 +50,8 @@ def law_of(env: gym.Env):
 
 
 def random_states(env: gym.Env, count: int = 200) -> np.ndarray:
-    rng, space = np.random.default_rng(0), env.observation_space
+    rng = np.random.default_rng(0)
+    space = env.observation_space
     return rng.uniform(space.low, space.high, (count, *space.shape)).astype(np.float32)
 
 

@@ -37,7 +37,8 @@ def drawn(mpc: LinearMPC, count: int = 64) -> th.Tensor:
 
 
 def as_inputs(mpc: LinearMPC, actions: th.Tensor) -> np.ndarray:
-    low, high = mpc.u_min, mpc.u_max
+    low = mpc.u_min
+    high = mpc.u_max
     return low + (actions.detach().double().numpy() + 1) / 2 * (high - low)
 
 
@@ -64,7 +65,8 @@ def test_its_gradient_by_theta_is_its_slope(kind) -> None:
     layer.theta_half = layer.theta_half.double()
     theta = drawn(mpc, 40).requires_grad_()
     layer(theta).sum().backward()
-    step, slopes = 1e-6, []
+    step = 1e-6
+    slopes = []
     for j in range(mpc.n_theta):
         shift = th.zeros(mpc.n_theta).double()
         shift[j] = step
@@ -76,18 +78,21 @@ def test_its_gradient_by_theta_is_its_slope(kind) -> None:
 
 @LAWS
 def test_loops_do_not_stand_in_where_a_gradient_by_theta_is_asked_for(kind) -> None:
-    layer, theta = scrambled(layer_of(servo(), kind), 0.3), drawn(servo(), 40).float()
+    layer = scrambled(layer_of(servo(), kind), 0.3)
+    theta = drawn(servo(), 40).float()
     assert layer.network.compiles
     found = []
     for compiles in (True, False):
-        layer.network.has_loops, asked = compiles, theta.clone().requires_grad_()
+        layer.network.has_loops = compiles
+        asked = theta.clone().requires_grad_()
         layer(asked).sum().backward()
         found.append(asked.grad)
     assert found[0].abs().sum() > 0 and th.equal(*found)
 
 
 def test_it_learns_and_copies() -> None:
-    layer, theta = layer_of(reactor(), "online"), drawn(reactor())
+    layer = layer_of(reactor(), "online")
+    theta = drawn(reactor())
     other = copy.deepcopy(layer)
     train(layer, theta, 0.5, steps=30)
     assert other.base_law is layer.base_law
@@ -171,7 +176,8 @@ def test_network_doubles_or_drops_the_law_on_facets() -> None:
     got = PaperYann(law, 8)(th.as_tensor(on_facet)).detach().numpy()[:, 0]
     clear = np.abs(u) > 0.1
     ratio = got[clear] / u[clear]
-    doubled, dropped = np.abs(ratio - 2) < 1e-6, np.abs(ratio) < 1e-6
+    doubled = np.abs(ratio - 2) < 1e-6
+    dropped = np.abs(ratio) < 1e-6
     assert np.all(doubled | dropped | (np.abs(ratio - 1) < 1e-6))
     assert np.mean(doubled | dropped) > 0.1
 

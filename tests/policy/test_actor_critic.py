@@ -44,11 +44,6 @@ def test_actor_and_critic_are_those_of_sb3_with_yann_networks(algorithm, critic,
         assert changed(getattr(model.policy, name), getattr(before, name)), name
 
 
-@POLICIES
-def test_the_critic_is_an_afterstate_one_by_default(algorithm) -> None:
-    assert isinstance(build(algorithm).critic.qf0, AfterstateValue)
-
-
 def first_step(network) -> float:
     """Return the length of Adam's first step, which is the learning rate itself."""
     before = [p.clone() for p in network.parameters()]
@@ -81,7 +76,8 @@ def test_actor_and_critic_step_at_their_own_rates(way, tmp_path) -> None:
 
 def test_the_actors_loss_leaves_the_critic_alone_which_still_learns() -> None:
     model = build(policy_kwargs={"critic_warmup": 0})
-    critic, theta = model.critic, th.rand(32, model.observation_space.shape[0])
+    critic = model.critic
+    theta = th.rand(32, model.observation_space.shape[0])
     actions = th.zeros(32, model.action_space.shape[0], requires_grad=True)
     q = critic.q1_forward(theta, actions)
     th.testing.assert_close(q, critic(theta, actions)[0], rtol=0, atol=0)
@@ -96,6 +92,7 @@ def test_constants_are_no_parameters_and_target_updates_leave_them_alone() -> No
     model = build()
     learnt = {name for name, _ in model.actor.named_parameters()}
     assert all(name.startswith("mu.network.") for name in learnt)
+    assert isinstance(model.critic.qf0, AfterstateValue)  # by default
     learnt = {name.split(".")[1] for name, _ in model.critic.named_parameters()}
     assert learnt == {"quadratic", "network"}
     assert not any("running_" in name for name in model.policy.state_dict())
@@ -106,7 +103,8 @@ def test_constants_are_no_parameters_and_target_updates_leave_them_alone() -> No
 def test_the_actor_stays_the_mpc_bit_for_bit_until_the_critic_is_warm(policy_delay, critic) -> None:
     model = with_full_buffer(TD3, two_inputs(), critic=critic, critic_warmup=6)
     model.policy_delay = policy_delay
-    first, theta = copy.deepcopy(model.policy), th.as_tensor(starts(two_inputs()))
+    first = copy.deepcopy(model.policy)
+    theta = th.as_tensor(starts(two_inputs()))
     law = first.actor(theta)
     for _ in range(5):
         updates(model, 1)

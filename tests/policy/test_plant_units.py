@@ -72,7 +72,8 @@ def test_small_deviations_of_a_large_value_keep_their_digits() -> None:
 def test_cost_critic_and_logs_count_from_the_operating_point(shows: str, takes: str) -> None:
     """CostAudit, ControlDiagnostics and the replay buffer see the same theta."""
     env = StageCost(units.plant(shows, takes), MPC, observation=units.SAYS[shows])
-    model, audit = build(env, units.SAYS[shows]), CostAudit(steps=60)
+    model = build(env, units.SAYS[shows])
+    audit = CostAudit(steps=60)
     model.set_logger(configure(None, []))
     model.learn(100, callback=[NoActionNoise(), ControlDiagnostics(), audit])
     assert audit.finding.matches, audit.finding.message
@@ -159,7 +160,8 @@ def test_deviations_that_are_shown_are_named_once_as_training_begins() -> None:
 def test_a_reading_that_is_lost_is_called_by_its_name(shows: str) -> None:
     """The law then acts at the operating point of that state, in any units."""
     env = units.plant(shows, "plant")
-    model, x = build(env, units.SAYS[shows]), np.array([0.0, 0.7])
+    model = build(env, units.SAYS[shows])
+    x = np.array([0.0, 0.7])
     seen = np.where([True, False], np.nan, env.unwrapped.shows(x))
     with pytest.warns(NonFiniteWarning, match=r"not finite in entries \[0\] \(temperature\)"):
         action = model.predict(seen)[0]
@@ -189,7 +191,8 @@ def test_a_plant_that_lacks_a_part_of_theta_is_told_of_the_wrappers() -> None:
 # ---- No setting carries a unit: the same plant in other units is learnt the same way ----
 
 
-EPISODES, STEPS = 5, 100
+EPISODES = 5
+STEPS = 100
 
 
 class OtherUnits(gym.Wrapper):
@@ -197,8 +200,11 @@ class OtherUnits(gym.Wrapper):
 
     def __init__(self, env: gym.Env, cost: float, x: Any, u: Any) -> None:
         super().__init__(env)
-        self.cost, self.x, self.u = cost, x, u
-        seen, taken = env.observation_space, env.action_space
+        self.cost = cost
+        self.x = x
+        self.u = u
+        seen = env.observation_space
+        taken = env.action_space
         box = [np.float32(each * x) for each in (seen.low, seen.high)]
         self.observation_space = gym.spaces.Box(*box)
         self.action_space = gym.spaces.Box(
@@ -227,8 +233,10 @@ class Inputs(BaseCallback):
 @cache
 def trained(cost: float = 1.0, x: tuple[float, ...] = (1, 1, 1, 1), u: float = 1.0):
     """Return the inputs of all training steps in the reactor's own units, and the model."""
-    mpc, x_unit = problems.cstr(), np.array(x)
-    to_x, from_x = np.diag(x_unit), np.diag(1 / x_unit)
+    mpc = problems.cstr()
+    x_unit = np.array(x)
+    to_x = np.diag(x_unit)
+    from_x = np.diag(1 / x_unit)
     model = LinearModel(to_x @ mpc.model.A @ from_x, to_x @ mpc.model.B / u, mpc.model.dt)
     changed = replace(
         mpc,
@@ -274,7 +282,8 @@ def test_the_scale_moves_by_twos_and_leaves_what_the_critic_puts_out() -> None:
     _, model = trained()
     critic = model.policy.critic
     points = th.rand(50, 5)
-    before, scale = critic.values(points)[0], critic.qf0.scale
+    before = critic.values(points)[0]
+    scale = critic.qf0.scale
     assert critic.rescale(100 * float(model.policy.mean_stage_cost)) >= 32 * scale
     assert th.equal(critic.values(points)[0], before)
     critic.rescale((1 - model.gamma) * scale)

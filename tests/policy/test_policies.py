@@ -39,21 +39,6 @@ def test_predict_equals_an_independent_online_qp_at_ten_thousand_feasible_states
     assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
 
 
-@pytest.mark.parametrize("env_id", ENVS)
-@POLICIES
-def test_our_envs_need_no_policy_kwargs_and_start_as_their_mpc(algorithm, env_id) -> None:
-    model = algorithm(YannPolicy, env_id)
-    mpc = gym.make(env_id).observation_space.problem
-    states, expected = feasible_states(mpc, 500)
-    actions, _ = model.predict(states.astype(np.float32))
-    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
-
-
-@POLICIES
-def test_the_policy_is_known_by_name(algorithm) -> None:
-    assert isinstance(algorithm("YannPolicy", "CSTR-v0").policy, YannPolicy)
-
-
 @pytest.mark.slow
 @CRITICS
 @pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
@@ -63,7 +48,8 @@ def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, cri
     kwargs = {"critic": critic}
     model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger
-    law, rng = mpc.explicit(), np.random.default_rng(0)
+    law = mpc.explicit()
+    rng = np.random.default_rng(0)
     origin = law.locate(np.zeros(mpc.n_theta))
     stored = 0
     model.replay_buffer.reset()
@@ -89,6 +75,12 @@ def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, cri
 
 
 def test_the_critic_takes_the_discount_of_the_algorithm() -> None:
+    class Mine(YannPolicy):
+        def __init__(self, *args, **kwargs) -> None:
+            super().__init__(*args, **kwargs)
+
+    own = DDPG(Mine, LinearPlant(scalar_mpc()), gamma=0.8, policy_kwargs={"problem": scalar_mpc()})
+    assert own.policy.gamma == 0.8
     assert build(gamma=0.9).policy.gamma == 0.9
     assert build().policy.gamma == 0.99
     given = DDPG(
@@ -98,16 +90,6 @@ def test_the_critic_takes_the_discount_of_the_algorithm() -> None:
         policy_kwargs={"problem": scalar_mpc(), "gamma": 0.95},
     )
     assert given.policy.gamma == 0.95
-
-
-def test_a_subclass_of_the_policy_gets_the_discount_as_well() -> None:
-    class Mine(YannPolicy):
-        def __init__(self, *args, **kwargs) -> None:
-            super().__init__(*args, **kwargs)
-
-    mpc = scalar_mpc()
-    model = DDPG(Mine, LinearPlant(mpc), gamma=0.8, policy_kwargs={"problem": mpc})
-    assert model.policy.gamma == 0.8
 
 
 @pytest.mark.slow

@@ -59,7 +59,8 @@ def reaches_beyond(one: Region, other: Region) -> float:
 
 
 def assert_same_regions(mpc: LinearMPC) -> None:
-    ours, theirs = regions_of(mpc, "walk"), regions_of(mpc, "ppopt")
+    ours = regions_of(mpc, "walk")
+    theirs = regions_of(mpc, "ppopt")
     assert [one.active_set for one in ours] == [one.active_set for one in theirs]
     for one, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(one.gain, other.gain, rtol=1e-9, atol=1e-9)
@@ -122,7 +123,8 @@ def holders(law: PiecewiseAffine, points: np.ndarray, depth: float) -> np.ndarra
     ids=["carts, states bounded", "carts", "staircase"],
 )
 def test_law_of_many_regions_is_the_online_qp_and_no_point_is_in_two(mpc: LinearMPC) -> None:
-    law, points = mpc.explicit(), box_points(mpc, 2000)
+    law = mpc.explicit()
+    points = box_points(mpc, 2000)
     inputs, feasible = online_answers(mpc, points)
     np.testing.assert_array_equal(law.in_domain(points), feasible)
     assert relative_error(mpc, law(points[feasible]), inputs) <= 1e-9
@@ -155,7 +157,8 @@ def test_regions_that_no_first_point_leads_to_are_found_from_others(
 ) -> None:
     from sb3_yann.control.explicit import facet_walk
 
-    explore, calls = facet_walk._Walk.explore, []
+    explore = facet_walk._Walk.explore
+    calls = []
 
     def late(self: Any, wave: Any) -> None:
         calls.append(wave)

@@ -76,7 +76,8 @@ def test_it_finds_the_region_of_a_scan_inside_and_outside(make, stretch: float) 
     points = around(law, 5000, stretch)
     assert law.walks and law.n_regions > 50
     for name in ("locate", "in_domain", "__call__"):
-        found, expected = getattr(law, name)(points), getattr(scanned(law), name)(points)
+        found = getattr(law, name)(points)
+        expected = getattr(scanned(law), name)(points)
         assert np.array_equal(found, expected)
     if stretch == 1:
         assert law.in_domain(points).all() == (make is chain)
@@ -97,7 +98,8 @@ def test_no_point_is_left_to_a_scan() -> None:
 
 
 def test_where_neighbors_are_unknown_or_wrong_the_scan_finds_it() -> None:
-    law, points = chain(), around(chain(), 500)
+    law = chain()
+    points = around(chain(), 500)
     random = np.random.default_rng(0)
     some = np.where(random.random(law.n_halfspaces) < 0.5, -1, law.neighbors)
     others = random.integers(-1, law.n_regions, law.n_halfspaces)
@@ -115,7 +117,8 @@ def test_neighbors_that_lead_nowhere_are_refused(wrong) -> None:
 
 
 def test_they_are_saved_and_copied_and_a_law_may_have_none(tmp_path: Path) -> None:
-    law, points = chain(), around(chain(), 100)
+    law = chain()
+    points = around(chain(), 100)
     law.save(tmp_path / "law.npz")
     for other in (PiecewiseAffine.load(tmp_path / "law.npz"), pickle.loads(pickle.dumps(law))):
         assert np.array_equal(other.neighbors, law.neighbors)
@@ -204,7 +207,8 @@ SEEDS = st.integers(0, 2**32 - 1)
 @examples(8)
 @given(problems(), SEEDS)
 def test_regions_cover_what_is_feasible_and_nothing_else(mpc: LinearMPC, seed: int) -> None:
-    law, online = mpc.explicit(), mpc.online()
+    law = mpc.explicit()
+    online = mpc.online()
     points = in_box(mpc, 15, seed=seed)
     at_edge, ways = edges(law, seed, each=1)
     across = (at_edge + 1e-3 * ways)[:5]
@@ -220,7 +224,8 @@ def test_regions_cover_what_is_feasible_and_nothing_else(mpc: LinearMPC, seed: i
 @examples(8)
 @given(problems(), SEEDS)
 def test_no_two_regions_overlap(mpc: LinearMPC, seed: int) -> None:
-    law, rng = mpc.explicit(), np.random.default_rng(seed)
+    law = mpc.explicit()
+    rng = np.random.default_rng(seed)
     assert np.sum(slacks(law, in_box(mpc, 1000, seed=seed)) > 1e-9, axis=1).max() <= 1
     for region, (center, radius) in enumerate(balls(law)):
         assert radius > 0
@@ -237,7 +242,8 @@ def test_no_two_regions_overlap(mpc: LinearMPC, seed: int) -> None:
 def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: float) -> None:
     law = mpc.explicit()
     at, ways = edges(law, seed)
-    one, other = at - step * ways, at + step * ways
+    one = at - step * ways
+    other = at + step * ways
     # The feasible set is convex: from one to the other the input follows the gains on the way.
     for each in kinds(mpc):
         kept = each.in_domain(one) & each.in_domain(other)
@@ -253,7 +259,8 @@ def test_size_and_order_of_a_batch_change_no_bit(mpc: LinearMPC, seed: int) -> N
         (mpc.explicit(), mixture(mpc, seed)),
         (mpc.online(), mixture(mpc, seed)[::5]),
     ):
-        whole, order = law(points), rng.permutation(len(points))
+        whole = law(points)
+        order = rng.permutation(len(points))
         anew = pickle.loads(pickle.dumps(law))  # an online law remembers its answers
         np.testing.assert_array_equal(anew(points[order]), whole[order])
         alone = pickle.loads(pickle.dumps(law))

@@ -32,8 +32,10 @@ def test_so_is_the_explicit_law(pole, horizon) -> None:
 
 @pytest.mark.parametrize("horizon", [15, 45, 90])
 def test_without_active_constraints_the_law_is_the_regulator(horizon) -> None:
-    A, B = np.array([[1.7, 0.2], [0.0, 0.6]]), np.array([[0.4], [1.0]])
-    Q, R = np.diag([2.0, 0.5]), np.array([[0.3]])
+    A = np.array([[1.7, 0.2], [0.0, 0.6]])
+    B = np.array([[0.4], [1.0]])
+    Q = np.diag([2.0, 0.5])
+    R = np.array([[0.3]])
     P = linalg.solve_discrete_are(A, B, Q, R)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     mpc = LinearMPC(LinearModel(A, B, dt=1), Q=Q, R=R, horizon=horizon, **BOX)
@@ -135,14 +137,16 @@ def test_beyond_what_float64_can_solve_one_warning_names_horizon_and_pole() -> N
 
 @pytest.mark.parametrize("pole", [1.05, 1.3, 1.8])
 def test_a_strong_discount_over_a_long_horizon_makes_nothing_infeasible(pole) -> None:
-    A, B = np.array([[pole, 0.3], [0, 0.9]]), np.array([[0.2], [1.0]])
+    A = np.array([[pole, 0.3], [0, 0.9]])
+    B = np.array([[0.2], [1.0]])
     own = {"x_min": -5, "x_max": 5, "u_min": -2, "u_max": 2}
     mpc = LinearMPC(LinearModel(A, B, 1.0), Q=np.eye(2), R=[[1]], horizon=80, gamma=0.5, **own)
     law = mpc.online()
     P = linalg.solve_discrete_are(A, B, np.eye(2), np.eye(1))
     K = np.linalg.solve(1 + B.T @ P @ B, B.T @ P @ A)
     for theta in np.random.default_rng(0).uniform(-5, 5, (60, 2)):
-        x, kept = theta, True
+        x = theta
+        kept = True
         for _ in range(80):
             x = A @ x + B @ np.clip(-K @ x, -2, 2)
             kept = kept and bool(np.all(np.abs(x) <= 5))
@@ -201,7 +205,8 @@ def test_a_box_of_absurd_size_is_named(large: float, kind: str, entry: int) -> N
 @pytest.mark.parametrize("large", [1e4, 1e6])
 def test_a_box_that_is_only_large_has_the_right_law(large: float) -> None:
     mpc = bounded(x_min=[-5, -large], x_max=[5, large])
-    law, online = mpc.explicit(), mpc.online()
+    law = mpc.explicit()
+    online = mpc.online()
     assert np.array_equal(law.in_domain(points()), online.in_domain(points()))
     inside = points()[online.in_domain(points())]
     np.testing.assert_allclose(law(inside), online(inside), atol=1e-9)

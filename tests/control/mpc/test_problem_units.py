@@ -23,7 +23,9 @@ from sb3_yann import (
 )
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess, excess_of_episodes
 
-X_SS, U_SS, D_SS = np.array([350.0, 2.0]), np.array([10.0]), np.array([5.0])
+X_SS = np.array([350.0, 2.0])
+U_SS = np.array([10.0])
+D_SS = np.array([5.0])
 MODEL = LinearModel(
     [[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0, X_SS, U_SS, E=[[0.1], [0.0]], d_ss=D_SS
 )
@@ -63,7 +65,9 @@ def test_a_terminal_set_is_in_plant_units_too() -> None:
 
 
 def test_what_a_problem_tells_is_in_plant_units() -> None:
-    mpc, own, rng = shown(), deviations(), np.random.default_rng(0)
+    mpc = shown()
+    own = deviations()
+    rng = np.random.default_rng(0)
     theta = rng.uniform(own.theta_min, own.theta_max, (20, own.n_theta))
     u = rng.uniform(own.u_min, own.u_max, (20, 1))
     at = theta + mpc.theta_ss
@@ -290,7 +294,8 @@ def test_what_is_not_finite_exceeds_by_inf() -> None:
 def test_steps_that_are_not_taken_do_not_count_and_batches_are_episode_by_episode() -> None:
     mpc = tank(x_min=[-2, -10], x_max=[2, 10])
     rng = np.random.default_rng(0)
-    thetas, inputs = 4 * rng.normal(size=(6, 3, 2)), rng.normal(size=(5, 3, 2))
+    thetas = 4 * rng.normal(size=(6, 3, 2))
+    inputs = rng.normal(size=(5, 3, 2))
     taken = np.arange(5)[:, None] < np.array([5, 2, 4])
     batch = bound_excess(mpc, thetas, inputs, taken)
     for i, length in enumerate((5, 2, 4)):

@@ -140,7 +140,8 @@ def test_it_names_every_parameter_with_its_box_and_meaning() -> None:
 
 def test_it_counts_regions_half_spaces_and_rows_of_the_terminal_set() -> None:
     mpc = solved("invariant")
-    law, text = mpc.explicit(), mpc.report(samples=50)
+    law = mpc.explicit()
+    text = mpc.report(samples=50)
     assert f"{law.n_regions} regions and {law.n_halfspaces} half-spaces" in text
     assert f"The terminal set has {len(mpc.terminal.set[1])} half-spaces." in text
     assert "There is no terminal set." in small_mpc().report(samples=10)
@@ -186,7 +187,8 @@ def test_boxes_and_points_are_as_the_plant_shows_them_where_it_does_not_rest_at_
     assert "Horizon: 3 steps of 2.5." in lines
     at = next(i for i, line in enumerate(lines) if line.startswith("The law at a few parameters"))
     assert lines[at + 1] == "  [300, 300] -> u = [40]"
-    rng, law = np.random.default_rng(0), mpc.explicit()
+    rng = np.random.default_rng(0)
+    law = mpc.explicit()
     own = mpc.deviations
     points = rng.uniform(own.theta_min, own.theta_max, (20, 2))
     for line, theta in zip(lines[at + 2 :], points, strict=False):

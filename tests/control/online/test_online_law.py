@@ -37,11 +37,14 @@ def regulator(**changes) -> LinearMPC:
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_it_is_the_explicit_law_where_there_is_a_solution(name) -> None:
     mpc = solved(name)
-    explicit, online, theta = mpc.explicit(), mpc.online(), drawn(mpc, 150)
+    explicit = mpc.explicit()
+    online = mpc.online()
+    theta = drawn(mpc, 150)
     feasible = explicit.in_domain(theta)
     assert np.array_equal(online.in_domain(theta), feasible)
     assert relative_error(mpc, online(theta)[feasible], explicit(theta)[feasible]) < 1e-9
-    ours, theirs = online.gain(theta)[feasible], explicit.gain(theta)[feasible]
+    ours = online.gain(theta)[feasible]
+    theirs = explicit.gain(theta)[feasible]
     assert np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
 
 
@@ -53,13 +56,15 @@ def test_all_optimality_conditions_hold_where_no_regions_can_be_counted(make) ->
 
 def test_what_is_feasible_by_a_hair_is_solved_too() -> None:
     mpc = three_masses()
-    law, inside = mpc.online(), np.zeros((60, mpc.n_theta))
+    law = mpc.online()
+    inside = np.zeros((60, mpc.n_theta))
     outside = drawn(mpc, 60, 3.0)
     assert not law.in_domain(outside).any()
     for _ in range(60):
         middle = (inside + outside) / 2
         feasible = law.in_domain(middle)[:, None]
-        inside, outside = np.where(feasible, middle, inside), np.where(feasible, outside, middle)
+        inside = np.where(feasible, middle, inside)
+        outside = np.where(feasible, outside, middle)
     assert max(worst_condition(law, (1 - 1e-7) * inside)) < 1e-6
     apart = np.abs(law(inside) - law((1 - 1e-7) * inside))
     assert np.max(apart) < 1e-2  # it is steep there
@@ -67,7 +72,8 @@ def test_what_is_feasible_by_a_hair_is_solved_too() -> None:
 
 def test_infeasible_constraints_give_way_and_the_input_does_not_jump_at_the_border() -> None:
     law = regulator().online()
-    inside, outside = np.array([4.9, 0.0]), np.array([4.9, 2.0])
+    inside = np.array([4.9, 0.0])
+    outside = np.array([4.9, 2.0])
     assert law.in_domain(inside)
     assert not law.in_domain(outside)
     for _ in range(50):
@@ -87,7 +93,8 @@ def test_zero_input_is_none_where_there_is_no_solution() -> None:
 def test_its_gain_is_its_slope_softened_or_not() -> None:
     law = regulator().online()
     for theta in ([0.1, 0.1], [4.9, 0.2], [4.9, 0.8], [0.5, 1.95], [-5.1, 0.3]):
-        step, slopes = 1e-6 * np.eye(2), []
+        step = 1e-6 * np.eye(2)
+        slopes = []
         for each in step:
             slopes.append((law(theta + each) - law(theta - each)) / 2e-6)
         assert law.gain(theta) == pytest.approx(np.transpose(slopes), abs=1e-4)
@@ -109,14 +116,17 @@ def test_constraints_that_depend_on_each_other_are_no_obstacle() -> None:
 
 def test_daqp_is_asked_where_there_is_no_certificate(monkeypatch) -> None:
     mpc = regulator()
-    theta, solve = drawn(mpc, 60), DualProgram.solve
-    expected, feasible = mpc.online()(theta), mpc.online().in_domain(theta)
+    theta = drawn(mpc, 60)
+    solve = DualProgram.solve
+    expected = mpc.online()(theta)
+    feasible = mpc.online().in_domain(theta)
     gains = mpc.online().gain(theta)
 
     def unsure(self: DualProgram, rows: np.ndarray, soft: bool = False) -> object:
         found = solve(self, rows, soft)
         if not soft:
-            found.status[:], found.sizes[:] = _kernels.UNKNOWN, 0
+            found.status[:] = _kernels.UNKNOWN
+            found.sizes[:] = 0
         return found
 
     monkeypatch.setattr(DualProgram, "solve", unsure)
@@ -128,7 +138,8 @@ def test_daqp_is_asked_where_there_is_no_certificate(monkeypatch) -> None:
 
 def test_it_is_saved_pickled_and_copied(tmp_path) -> None:
     mpc = solved("one of two states soft, soft outputs")
-    law, theta = mpc.online(), drawn(mpc, 50)
+    law = mpc.online()
+    theta = drawn(mpc, 50)
     law.save(tmp_path / "law.npz")
     for other in (OnlineLaw.load(tmp_path / "law.npz"), pickle.loads(pickle.dumps(law))):
         assert other == law
@@ -171,7 +182,8 @@ class Counted:
 
 
 def test_a_full_table_forgets_and_stays_right() -> None:
-    counted, rows = Counted(), np.random.default_rng(0).normal(size=(1000, 2))
+    counted = Counted()
+    rows = np.random.default_rng(0).normal(size=(1000, 2))
     known = KnownPoints(counted, 2, size=64)
     for _ in range(3):
         assert np.array_equal(known(rows), Counted()(rows))
@@ -186,7 +198,8 @@ def test_what_a_law_remembers_does_not_travel() -> None:
 
 def test_inputs_do_not_depend_on_what_was_asked_before() -> None:
     mpc = three_masses()
-    theta, fresh = points(mpc, 300), three_masses().online()
+    theta = points(mpc, 300)
+    fresh = three_masses().online()
     together = mpc.online()(theta)
     assert np.array_equal(together, mpc.online()(theta))  # now they are known
     assert np.array_equal(together, [fresh(each) for each in theta[::-1]][::-1])
@@ -213,9 +226,11 @@ def test_far_outside_a_softened_program_is_solved() -> None:
     mpc = LinearMPC(
         model, Q=np.eye(2), R=[[0.03]], horizon=12, u_min=-1, u_max=1, x_min=[-5, -2], x_max=[5, 2]
     )
-    law, rng = mpc.online(), np.random.default_rng(0)
+    law = mpc.online()
+    rng = np.random.default_rng(0)
     dual = law.dual
-    eye, bounds = np.eye(len(dual.d0)), np.full(len(dual.d0), -1e30)
+    eye = np.eye(len(dual.d0))
+    bounds = np.full(len(dual.d0), -1e30)
     values, vectors = np.linalg.eigh(dual.gram + np.diag(dual.softness))
     rows = np.ascontiguousarray(-vectors * np.sqrt(np.maximum(values, 0.0)))
     points = 100 * rng.uniform(mpc.theta_min, mpc.theta_max, (40, 2))
@@ -223,7 +238,8 @@ def test_far_outside_a_softened_program_is_solved() -> None:
     assert found is not None and np.all(found.status == SOLVED)
     for theta in points[~law.in_domain(points)]:
         d = dual.d0 + theta @ dual.D
-        size, sense = 1 + np.abs(d).max(), np.zeros(len(d), dtype=np.intc)
+        size = 1 + np.abs(d).max()
+        sense = np.zeros(len(d), dtype=np.intc)
         _, _, status, info = daqp.solve(eye, 0 * d, rows, d / size, bounds, sense, primal_tol=1e-11)
         assert status == 1
         u = dual.k0 + dual.K @ theta - dual.E.T @ (np.asarray(info["lam"]) * size)
@@ -233,7 +249,8 @@ def test_far_outside_a_softened_program_is_solved() -> None:
 @pytest.mark.parametrize("unit", [1e2, 1e6])
 def test_steep_penalties_of_states_in_small_units_are_solved(unit: float) -> None:
     mpc = cart(unit)
-    law, explicit = mpc.online(), mpc.explicit()
+    law = mpc.online()
+    explicit = mpc.explicit()
     points = unit * np.random.default_rng(0).uniform(-1.4, 1.4, (100, 2)) * [1, 0.5]
     assert explicit.in_domain(points).all() and law.in_domain(points).all()
     solved, reach = law.scaled
@@ -263,7 +280,8 @@ def solved_in_fractions(program, theta: np.ndarray, active: np.ndarray) -> list[
         [[Fraction(x) for x in row] for row in getattr(program, name).tolist()] for name in "HFGS"
     )
     c, w = ([Fraction(x) for x in getattr(program, name).tolist()] for name in "cw")
-    place, v = [Fraction(x) for x in theta.tolist()], len(c)
+    place = [Fraction(x) for x in theta.tolist()]
+    v = len(c)
     linear = [a + sum(map(mul, row, place)) for a, row in zip(c, F, strict=True)]
     limit = [a + sum(map(mul, row, place)) for a, row in zip(w, S, strict=True)]
     rows = [[*H[i], *(G[k][i] for k in active), -linear[i]] for i in range(v)]
@@ -285,7 +303,8 @@ def solved_in_fractions(program, theta: np.ndarray, active: np.ndarray) -> list[
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_a_law_is_the_same_whatever_the_unit_of_the_states(unit: float) -> None:
     points = np.random.default_rng(0).uniform(-1.4, 1.4, (200, 2)) * [1, 0.5]
-    one, other = cart(), cart(unit, soft=SoftBounds(x=unit, penalty=1e3))
+    one = cart()
+    other = cart(unit, soft=SoftBounds(x=unit, penalty=1e3))
     for solve in (LinearMPC.online, LinearMPC.explicit):
         expected = solve(one)(points)
         np.testing.assert_allclose(solve(other)(unit * points), expected, rtol=0, atol=1e-9)
