@@ -157,9 +157,9 @@ class Improvement:
         if last is not None:
             rows["worst_start"] = f"{change_in_percent(last.worst)} of the MPC's mean cost"
             rows["violations"] = "no more than the MPC's" if last.safe else "more than the MPC's"
-        more = (
-            'report(model, "report.html", env=env), then Commissioning(model, plant, shadow=True)'
-        )
+        which = "twin=twin" if source == "twin" else "env=env"
+        more = f'report(result.model, "report.html", {which}), then '
+        more += "Commissioning(result.model, plant, shadow=True)"
         return summary_lines("Accepted: a better policy.", **rows, steps=steps, next=more)
 
     def _next(self) -> str:

@@ -68,7 +68,7 @@ def report(
         Folders are made as needed. The file is there as a whole or not at all.
     env : gymnasium.Env, str or callable, optional
         Where closed loops are played, as of :func:`~sb3_yann.evaluation.evaluate`; by default the
-        guard's simulator, if a guard is given.
+        guard's simulator, if a guard is given, or the twin.
     guard : ImprovementGuard, optional
         The one that watched `learn`; it adds its settings to the decisions.
     twin : PlantTwin, optional
@@ -141,6 +141,8 @@ def _subject(
     if not chosen:
         raise ValueError("seeds is empty: pass one whole number for each episode, e.g. range(20).")
     played = guard.env if env is None and guard is not None else env
+    if played is None and twin is not None and twin.trusted:
+        played = twin.env()
     return Subject(model, policy, played, guard, twin, headroom, chosen)
 
 

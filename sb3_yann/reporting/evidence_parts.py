@@ -51,6 +51,7 @@ from sb3_yann.reporting.subject import (
     table,
     tag,
 )
+from sb3_yann.twin.env import TwinEnv
 
 NO_ENV = "No env was given: closed loops are left out. Pass report(model, env=...) to play them."
 FAR = 50.0  # % of the range of an input: as far from the MPC as its middle from a bound
@@ -85,6 +86,8 @@ def loops_part(subject: Subject) -> Part:
         "and by the policy from the same start, without any noise of actions. A cost is minus the "
         "sum of the rewards."
     )
+    if isinstance(getattr(subject.env, "unwrapped", None), TwinEnv):
+        how += " The env is a twin, fitted to the plant's log: the plant has played none of them."
     state = subject.state
     known = set() if state is None else {*state.evidence.starts.seeds} & {*subject.seeds}
     warning = (
@@ -506,7 +509,7 @@ def cost_part(subject: Subject) -> Part:
     content = [
         paragraph(how),
         table(["what", "median (µs)", "99 % are below (µs)"], rows),
-        table(["what", "size (kB)"], [[what, f"{n / 1000:.4g}"] for what, n in sizes.items()]),
+        table(["what", "size (MB)"], [[what, f"{n / 1e6:.3g}"] for what, n in sizes.items()]),
     ]
     return Part("Timing and memory", join(content))
 

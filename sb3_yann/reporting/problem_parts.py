@@ -53,10 +53,11 @@ def plant_part(subject: Subject) -> Part:
         ["weight of the inputs, R", _matrix(problem.R)],
         ["discount of the MPC, gamma", number(problem.gamma)],
         ["where the MPC has no solution", problem.infeasible.replace("_", " ")],
-        ["samples for which a move is held", ", ".join(map(str, problem.blocks))],
         ["penalty of a unit of a broken soft bound", number(soft) if soft else "no soft bounds"],
     ]
     prices = [*zip([*states, *inputs], [*problem.price.x, *problem.price.u], strict=True)]
+    if max(problem.blocks) > 1:
+        facts.append(["samples for which a move is held", ", ".join(map(str, problem.blocks))])
     if problem.price.counts:
         facts.append(["prices in a sample", ", ".join(f"{k}: {number(p)}" for k, p in prices if p)])
     content = join(

@@ -427,6 +427,16 @@ def test_a_report_that_fails_leaves_the_last_one_as_it_was(tmp_path) -> None:
     assert path.read_text() == "before" and [*tmp_path.iterdir()] == [path]
 
 
+def test_of_a_twin_alone_its_episodes_are_played_and_said_to_be_no_plant_s(tmp_path) -> None:
+    mpc = twin_samples.problem()
+    log = evaluate(mpc.explicit(), twin_samples.Cart, range(5))
+    twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], n_members=1)
+    model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": mpc}, device="cpu")
+    text = report(model, tmp_path / "r.html", twin=twin, seeds=range(2)).read_text()
+    assert "The env is a twin, fitted to the plant&#x27;s log: the plant has played none" in text
+    assert "Closed loops against the MPC" in text and "samples for which a move" not in text
+
+
 def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
     model, path = guard_samples.build(), tmp_path / "r.html"
     with pytest.raises(TypeError, match="needs a YannPolicy"):
