@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, check_positive, to_float
+from sb3_yann._validation import Array, check_int, check_positive, to_float
 
 Arrays = ArrayLike | Sequence[ArrayLike]
 """One array for each episode, or that of a single one."""
@@ -132,6 +132,16 @@ class Log:
         counts = read.sum(axis=0).tolist()
         rows = len(read)
         return tuple(1 if k == rows else max(2, round(rows / max(k, 1))) for k in counts)
+
+    def cut(self, steps: int) -> Log:
+        """Return the log in pieces of at most so many steps: a long record as many episodes."""
+        check_int("steps", steps, 2)
+        parts = [
+            each.part(first, min(first + steps, len(each)))
+            for each in self.episodes
+            for first in range(0, len(each), steps)
+        ]
+        return replace(self, episodes=tuple(parts))
 
     def with_all_states(self) -> Log:
         """Return the log cut where a state is not read.

@@ -161,6 +161,8 @@ def test_set_points_and_loads_of_a_csv_file_reach_the_twin(tmp_path) -> None:
     for one, other in zip(of_log.episodes, plain.episodes, strict=True):
         np.testing.assert_array_equal(one.thetas, other.thetas)
     assert np.ptp([each.thetas[:, 1] for each in of_log.episodes]) > 1
+    assert [len(each) for each in log.cut(5).episodes] == [5, 3] * 6
+    assert log.cut(5).episodes[1].references.tolist() == log.episodes[0].references[5:].tolist()
 
 
 def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(tmp_path) -> None:

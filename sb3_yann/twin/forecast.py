@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.twin.dynamics import Dynamics, law_of
 from sb3_yann.twin.env import Starts
-from sb3_yann.twin.log import Episode, records
+from sb3_yann.twin.log import Episode, more_of, records
 
 SURE = 0.95  # probability that a change is not above an interval's end, or not below
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
@@ -231,7 +232,8 @@ def forecast(
     high = [each[2] for each in found]
     change = (found[0][0] + found[1][0]) / 2
     worst = found[int(np.argmax(high))]
-    return Forecast(change, min(low), max(high), _cure(*worst, independent, loosest))
+    more = partial(more_of, judges[0].dynamics.problem, episodes)
+    return Forecast(change, min(low), max(high), _cure(*worst, independent, loosest, more))
 
 
 def surely_worse(behind: Array) -> NDArray[np.bool_]:
@@ -268,7 +270,15 @@ def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float,
     return mean, mean - float(np.hypot(down, fits)), mean + float(np.hypot(up, fits))
 
 
-def _cure(middle: float, low: float, high: float, says: str, independent: int, loosest: str) -> str:
+def _cure(
+    middle: float,
+    low: float,
+    high: float,
+    says: str,
+    independent: int,
+    loosest: str,
+    more: Callable[[int], str],
+) -> str:
     """Return what would settle a change whose interval contains zero."""
     if middle >= 0 or says == "hidden dynamics":
         kind = " for longer than the actuator takes" if says == "hidden dynamics" else ""
@@ -277,4 +287,4 @@ def _cure(middle: float, low: float, high: float, says: str, independent: int, l
     if not np.isfinite(high - low):
         return "log more episodes"
     needed = independent * min(((high - middle) / middle) ** 2, 100.0)
-    return f"log about {int(np.ceil(needed)) - independent + 1} episodes more"
+    return f"log about {more(int(np.ceil(needed)) - independent + 1)} more"

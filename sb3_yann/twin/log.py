@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, to_float, warn
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.env_pool import is_vec_env
-from sb3_yann.log import Log
+from sb3_yann.log import SECONDS, Log
 from sb3_yann.twin.row_layout import ROUNDED
 
 SHORTEST = 5  # steps that an episode has at least
@@ -134,6 +134,16 @@ def records(episodes: tuple[Episode, ...]) -> list[range]:
     follows = [np.array_equal(a.thetas[-1], b.thetas[0]) for a, b in pairwise(episodes)]
     edges = [0, *(np.flatnonzero(~np.array(follows, dtype=bool)) + 1), len(episodes)]
     return [range(int(first), int(stop)) for first, stop in pairwise(edges)]
+
+
+def more_of(problem: LinearMPC, episodes: tuple[Episode, ...], count: int) -> str:
+    """Return how much so many independent episodes are: of one record, its rows, and hours."""
+    whole = records(episodes)
+    if len(whole) > 1 or len(episodes) == 1:
+        return f"{count} episodes"
+    rows = 10 * round(count * sum(map(len, episodes)) / len(whole[0][::2]) / 10)
+    hours = rows * problem.model.dt * SECONDS.get(problem.model.time_unit, 0) / 3600
+    return f"{rows:,} rows" + f" ({hours:.3g} h)" * (hours > 0)
 
 
 def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:

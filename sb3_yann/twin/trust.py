@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, Context
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from sb3_yann.control.identification.fit import frozen_rows, words_for
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.alignment import made_by_law, objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual, law_of
-from sb3_yann.twin.log import Episode, records
+from sb3_yann.twin.log import Episode, more_of, records
 from sb3_yann.twin.selection import FreeRuns
 
 COST_ERROR = 0.25
@@ -178,13 +179,14 @@ def judge(
     n_episodes: int,
     beyond: tuple[float, str],
     names: Sequence[str] = (),
+    more: Callable[[int], str] = "{} episodes".format,
 ) -> tuple[list[str], list[str]]:
     """Return what speaks against a twin, and what would help.
 
     The first candidate of the ``runs`` is the linear model as it is; ``standing`` (h,) are the
     errors of standing still, ``costs`` predicted and actual ones (episodes,), ``inputs`` how much
     of each is its own, and how much it moves (m,). ``beyond`` is the largest share of logged rows
-    beyond the box of theta, and of which entry.
+    beyond the box of theta, and of which entry; ``more`` names an amount of log.
     """
     found: list[tuple[str, str]] = []  # what speaks against it, and what would help
     share, moves = inputs
@@ -194,7 +196,7 @@ def judge(
             (
                 "There is one episode: nothing is left to test the twin on.",
                 "Log at least one episode more; five are a good number. A long record may be cut "
-                "into three consecutive pieces or more.",
+                "into three consecutive pieces or more: log.cut(200) makes some of 200 steps.",
             )
         )
     named = [*names] or [f"u[{k}]" for k in range(len(moves))]
@@ -225,7 +227,7 @@ def judge(
             (
                 f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
                 f"mean; {100 * COST_ERROR:.0f} % are the most.",
-                f"Log {max(3, n_episodes)} episodes more, or lessen the sensors' noise.",
+                f"Log {more(max(3, n_episodes))} more, or lessen the sensors' noise.",
             )
         )
     problems, advice = ([each[i] for each in found if each[i]] for i in range(2))
@@ -253,7 +255,8 @@ def evidence(
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(log))
-    problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names)
+    more = partial(more_of, problem, log)
+    problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names, more)
     problems += foreign_previous(problem, log)
     problems += objections(problem, coordinates, log, units_confirmed)
     problems += _frozen(dynamics, log)

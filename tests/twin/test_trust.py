@@ -12,7 +12,7 @@ from general_problems import solved
 from sb3_yann import PlantTwin
 from sb3_yann.evaluation.plots import plot_twin
 from sb3_yann.twin import trust as trusts
-from sb3_yann.twin.log import as_episodes
+from sb3_yann.twin.log import Episode, as_episodes, more_of
 from sb3_yann.twin.selection import FreeRuns
 from sb3_yann.twin.trust import report
 from twin_samples import problem, random_episode, twin
@@ -36,6 +36,14 @@ def judged(found: FreeRuns, standing=(1.0, 1.0), **changes):
 
 
 GOOD = [0.1, 0.2]
+
+
+def test_of_one_record_what_is_lacking_are_rows_and_hours() -> None:
+    log = as_episodes(problem(), [(np.arange(0, 0.9, 0.01)[:, None] * [1, 0], np.zeros((89, 1)))])
+    pieces = (*log, Episode(log[0].thetas[-1:].repeat(12, 0), log[0].actions[:11]))
+    unit = dataclasses.replace(problem(), model=problem().model.named(time_unit="min"))
+    assert more_of(unit, pieces, 3) == f"300 rows ({300 * problem().model.dt / 60:.3g} h)"
+    assert more_of(unit, (*pieces, *log), 3) == more_of(unit, log, 3) == "3 episodes"
 
 
 def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains() -> None:
