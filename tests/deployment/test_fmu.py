@@ -26,7 +26,15 @@ from test_whole_controller import (
     problem,
 )
 
-from deployed import COMPILERS, STRICT, needs_compiler, observations, policy_of, with_faults
+from deployed import (
+    COMPILERS,
+    STRICT,
+    error,
+    needs_compiler,
+    observations,
+    policy_of,
+    with_faults,
+)
 from sb3_yann import Controller, export
 from sb3_yann.deployment import c_code
 from sb3_yann.deployment.code import ROOM
@@ -37,7 +45,8 @@ needs_library = pytest.mark.skipif(OWN is None or not COMPILERS, reason="no libr
 ALLOCATE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
 FREE = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 C = ctypes.CDLL(None)
-C.calloc.restype, C.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+C.calloc.restype = ctypes.c_void_p
+C.free.argtypes = [ctypes.c_void_p]
 C.calloc.argtypes = [ctypes.c_size_t] * 2
 
 
@@ -75,7 +84,8 @@ class Instance:
         number = {"Real": ctypes.c_double, "Integer": ctypes.c_int, "Boolean": ctypes.c_int}[kind]
         held = number(0 if value is None else value)
         call = getattr(self.code, f"fmi2{'Get' if value is None else 'Set'}{kind}")
-        reference, one = ctypes.c_uint(at), ctypes.c_size_t(1)
+        reference = ctypes.c_uint(at)
+        one = ctypes.c_size_t(1)
         found = call(self.own, ctypes.byref(reference), one, ctypes.byref(held))
         assert found == status
         return held.value
@@ -89,7 +99,8 @@ class Instance:
             self.call(name, value)
 
     def step(self, parts: float = 1.0) -> int:
-        zero, size = ctypes.c_double(0.0), ctypes.c_double(parts * self.dt)
+        zero = ctypes.c_double(0.0)
+        size = ctypes.c_double(parts * self.dt)
         return int(self.code.fmi2DoStep(self.own, zero, size, 1))
 
     def outputs(self):
@@ -119,11 +130,6 @@ def opened(tmp_path):
         each.code.fmi2FreeInstance(each.own)
 
 
-def error(found, wanted, controller) -> float:
-    """Return the largest difference, in parts of an input's range."""
-    return float(np.max(np.abs(found - wanted) / (2 * controller.data["action_scale"])))
-
-
 @needs_library
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("name", ["reactor", "two tanks, by a walk", "references and rates"])
@@ -131,7 +137,9 @@ def test_its_steps_are_the_controllers(name, precision, opened):
     policy = policy_of(name)
     checks, events = with_faults(policy, 300)
     instance, controller = opened(policy, checks=checks, precision=precision)
-    met, modes, kept = Status(0), set(), 0
+    met = Status(0)
+    modes = set()
+    kept = 0
     for k, (obs, elapsed, request, manual) in enumerate(events):
         controller.request = MODES[request]
         wanted = controller(obs, elapsed, manual)
@@ -158,7 +166,8 @@ def test_its_steps_are_the_controllers(name, precision, opened):
 def test_reading_and_setting_make_no_step(opened):
     policy = policy_of("reactor")
     instance, controller = opened(policy, checks=with_faults(policy, 200)[0])
-    lost, seen = [np.nan, 0.0, 0.0, -1.0], [0.1, 0.0, 0.0, -1.0]
+    lost = [np.nan, 0.0, 0.0, -1.0]
+    seen = [0.1, 0.0, 0.0, -1.0]
     for _ in range(10):  # more than `hold` of them
         instance.give(lost)
         assert instance.outputs()[2] == "mpc"
@@ -270,7 +279,8 @@ wait
 
 
 def test_an_interrupt_leaves_no_files_of_the_compiler_and_none_of_its_processes(tmp_path):
-    temporary, told = tmp_path / "temporary", tmp_path / "told"
+    temporary = tmp_path / "temporary"
+    told = tmp_path / "told"
     temporary.mkdir()
     (tmp_path / "cc").write_text(SLOW.format(told))
     (tmp_path / "cc").chmod(0o755)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deployed import Compiled, disturbed, needs_compiler
+from deployed import Compiled, disturbed, needs_compiler, self_test
 from sb3_yann import LinearModel, LinearMPC, MixedBounds, RateLimits, SoftBounds, Terminal, export
 from sb3_yann.deployment.controller import Controller, Status
 
 
 def problem(n: int = 3, m: int = 1, horizon: int = 5, **changes: Any) -> LinearMPC:
     rng = np.random.default_rng(0)
-    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    A = rng.normal(size=(n, n))
+    B = rng.normal(size=(n, m))
     A *= 0.98 / np.abs(np.linalg.eigvals(A)).max()
     model = LinearModel(A, B, 1.0, x_ss=rng.normal(size=n), u_ss=rng.normal(size=m) / 4)
     box = {"u_min": -1, "u_max": 1, "theta_min": -20, "theta_max": 20}
@@ -43,13 +43,6 @@ CASES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def said_by_self_test(folder: Path) -> str:
-    parts = [str(folder / each) for each in ("plant.c", "plant_selftest.c")]
-    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-fsanitize=address,undefined"]
-    subprocess.run(["gcc", *flags, *parts, "-lm", "-o", str(folder / "test")], check=True)
-    return subprocess.run([folder / "test"], capture_output=True, text=True).stdout
-
-
 @needs_compiler
 @pytest.mark.parametrize("name", CASES)
 def test_code_and_controller_are_the_law(name: str, tmp_path: Path) -> None:
@@ -64,7 +57,7 @@ def test_code_and_controller_are_the_law(name: str, tmp_path: Path) -> None:
     assert inside.sum() > 20
     off = np.abs(actions - law.plant_input(theta)) / mpc.u_half
     assert off[inside].max() < 1e-9 and off.max() < 1e-6
-    assert "passed" in said_by_self_test(tmp_path)
+    assert "passed" in self_test(tmp_path).stdout
     np.testing.assert_array_equal((found & Status.OUTSIDE) == 0, inside)
     by_numpy = built.controller.evaluate(theta[:300])
     assert (np.abs(actions[:300] - by_numpy) / mpc.u_half).max() < 1e-6
@@ -76,7 +69,7 @@ def test_the_self_test_passes_under_sanitizers_and_nothing_is_allocated(tmp_path
     mpc = problem(x_min=-6, x_max=6)
     policy = disturbed(mpc, law="online", max_correction=0.2)
     export(policy, tmp_path / "plant.c")
-    assert "passed" in said_by_self_test(tmp_path)
+    assert "passed" in self_test(tmp_path).stdout
     text = (tmp_path / "plant.c").read_text()
     assert "malloc" not in text and "alloca(" not in text
 
@@ -94,10 +87,14 @@ def test_a_large_program_is_solved_as_by_daqp(
 ) -> None:
     mpc = problem(12, 3, 20)
     mpc.law("online")
-    built, program = Compiled(mpc, tmp_path), mpc.condensed()
+    built = Compiled(mpc, tmp_path)
+    program = mpc.condensed()
     theta = np.random.default_rng(3).uniform(mpc.theta_min, mpc.theta_max, (10_000, mpc.n_theta))
     theta = mpc.theta_ss + np.linspace(0.02, 1, 10_000)[:, None] * (theta - mpc.theta_ss)
-    own, daqp, worst, active = [], [], 0.0, 0
+    own = []
+    daqp = []
+    worst = 0.0
+    active = 0
     for row in theta:
         began = time.perf_counter()
         action = built.at(row[None])[0][0]

@@ -8,10 +8,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from deployed import CASES, observations, policy_of, with_faults
+from deployed import CASES, error, observations, policy_of
 from sb3_yann import Checks, Controller, export
 from sb3_yann.deployment.code import insensitive
-from sb3_yann.deployment.controller import MODES, Status
+from sb3_yann.deployment.controller import Status
 from structured_text import FunctionBlock
 
 
@@ -19,10 +19,6 @@ def both(name, folder, **options):
     export(policy_of(name), folder / "plant.npz", **options)
     export(policy_of(name), folder / "plant.st", **options)
     return Controller.load(folder / "plant.npz"), FunctionBlock((folder / "plant.st").read_text())
-
-
-def error(found, wanted, controller) -> float:
-    return float(np.max(np.abs(found - wanted) / (2 * controller.data["action_scale"])))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -35,25 +31,6 @@ def test_a_block_is_the_policy(name, tmp_path):
         assert mode == 0
         assert error(command, controller.evaluate(row), controller) < 1e-12
         assert status == (0 if controller.in_domain(row) else Status.OUTSIDE)
-
-
-@pytest.mark.parametrize("name", ["reactor", "references and rates", "two inputs, zero input"])
-def test_steps_with_faults_are_the_controllers(name, tmp_path):
-    checks, steps = with_faults(policy_of(name), 400)
-    controller, block = both(name, tmp_path, checks=checks)
-    met, modes, m = Status(0), set(), len(controller.data["action_scale"])
-    for k, (seen, elapsed, request, manual) in enumerate(steps):
-        controller.request = MODES[request]
-        wanted = controller(seen, elapsed, manual)
-        given = {"manual": [0.0] * m if manual is None else list(manual)}
-        given |= {"has_manual": manual is not None, "elapsed": elapsed, "request": request}
-        command, status, mode = block.step(obs=list(seen), **given)
-        assert error(command, wanted, controller) < 1e-12, k
-        assert (status, MODES[mode]) == (int(controller.status), controller.mode), k
-        met |= controller.status
-        modes.add(mode)
-    assert modes == {0, 1, 2}
-    assert Status.OUT_OF_RANGE | Status.FROZEN | Status.LATE | Status.NOT_FINITE in met
 
 
 def test_plcopen_holds_the_same_block(tmp_path):

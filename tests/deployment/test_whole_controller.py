@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deployed import COMPILERS, STRICT, Compiled, disturbed, needs_compiler
+from deployed import Compiled, disturbed, error, needs_compiler, policy_of, self_test, with_faults
 from sb3_yann import (
     Checks,
     Controller,
@@ -32,7 +31,8 @@ from structured_text import FunctionBlock
 A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.1], [0.05, 0.0, 0.8]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.4]])
 C = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-X_SS, U_SS = np.array([50.0, 2.0, 300.0]), np.array([3.0, 7.0])
+X_SS = np.array([50.0, 2.0, 300.0])
+U_SS = np.array([3.0, 7.0])
 LOAD = np.array([[0.0], [0.3], [0.1]])
 BEGIN = np.array([52.0, 2.0, 297.0])
 
@@ -100,8 +100,10 @@ def loop(
     controller: Any, steps: list[tuple[Any, ...]], extra: bool = False
 ) -> tuple[Array, list[tuple[int, int]]]:
     """Return inputs (T, 2), and status and mode, of a plant that the model does not quite know."""
-    x, u = BEGIN, U_SS
-    inputs, said = [], []
+    x = BEGIN
+    u = U_SS
+    inputs = []
+    said = []
     for k, (noise, load, reference, elapsed, request, manual, anew) in enumerate(steps):
         if anew:
             controller.begin()
@@ -130,8 +132,11 @@ class InPython:
 
 
 class InC:
+    """Of modes, which C does not return, it says -1."""
+
     def __init__(self, given: Any, folder: Path, **options: Any) -> None:
         self.compiled = Compiled(given, folder, **options)
+        self.controller = self.compiled.controller
         self.compiled.begin()
 
     def begin(self) -> None:
@@ -143,14 +148,17 @@ class InC:
 
 
 class InStructuredText:
-    def __init__(self, text: str) -> None:
-        self.block = FunctionBlock(text)
+    def __init__(self, given: Any, folder: Path, **options: Any) -> None:
+        export(given, folder / "plant.npz", **options)
+        export(given, folder / "plant.st", **options)
+        self.controller = Controller.load(folder / "plant.npz")
+        self.block = FunctionBlock((folder / "plant.st").read_text())
 
     def begin(self) -> None:
         self.block.vars["started"] = False
 
     def step(self, obs: Array, elapsed: float, request: int, manual: Any) -> Any:
-        given = [0.0, 0.0] if manual is None else list(manual)
+        given = [0.0] * len(self.controller.action_names) if manual is None else list(manual)
         command, status, mode = self.block.step(
             obs=list(obs), elapsed=elapsed, request=request, manual=given,
             has_manual=manual is not None,
@@ -158,48 +166,67 @@ class InStructuredText:
         return np.array(command), status, mode
 
 
-@needs_compiler
+IN_C = pytest.param(InC, marks=needs_compiler)
+
+
 @pytest.mark.parametrize(
-    ("kind", "rates", "extra"),
+    "name",
+    ["reactor", "references and rates", "mixed observations", "two inputs, zero input"],
+)
+@pytest.mark.parametrize("form", [IN_C, InStructuredText])
+def test_steps_with_faults_are_the_controllers(form, name, tmp_path) -> None:
+    checks, steps = with_faults(policy_of(name), 500)
+    coded = form(policy_of(name), tmp_path, checks=checks)
+    python = InPython(coded.controller)
+    met = Status(0)
+    modes = set()
+    for k, (seen, elapsed, request, manual) in enumerate(steps):
+        wanted, status, mode = python.step(seen, elapsed, request, manual)
+        found, *said = coded.step(seen, elapsed, request, manual)
+        assert error(found, wanted, coded.controller) < 1e-12, k
+        assert said in ([status, mode], [status, -1]), k
+        met |= Status(status)
+        modes.add(mode)
+    assert modes == {0, 1, 2}
+    assert Status.OUT_OF_RANGE | Status.FROZEN | Status.LATE | Status.NOT_FINITE in met
+
+
+@pytest.mark.parametrize(
+    ("form", "kind", "rates", "extra"),
     [
-        ("problem", False, False),
-        ("problem", True, False),
-        ("policy", False, False),
-        ("policy", True, False),
-        ("policy", False, True),
+        *(
+            pytest.param(InC, *case, marks=needs_compiler)
+            for case in [
+                ("problem", False, False),
+                ("problem", True, False),
+                ("policy", False, False),
+                ("policy", True, False),
+                ("policy", False, True),
+            ]
+        ),
+        (InStructuredText, "policy", False, False),
+        (InStructuredText, "policy", True, False),
+        (InStructuredText, "policy", False, True),
     ],
 )
-def test_C_in_closed_loop_is_python_over_1000_samples(kind, rates, extra, tmp_path) -> None:
+def test_a_closed_loop_is_that_of_python(form, kind, rates, extra, tmp_path) -> None:
     mpc, observer = problem(rates, extra)
     given = mpc if kind == "problem" else policy(rates, extra)
-    checks = WITH_EXTRA if extra else CHECKS
-    compiled = InC(given, tmp_path, estimator=observer, checks=checks)
-    python = InPython(compiled.compiled.controller)
-    steps = noisy_steps(1000)
-    wanted, said = loop(python, steps, extra)
-    found, own = loop(compiled, steps, extra)
+    coded = form(given, tmp_path, estimator=observer, checks=WITH_EXTRA if extra else CHECKS)
+    steps = noisy_steps(1000 if form is InC else 400)
+    wanted, said = loop(InPython(coded.controller), steps, extra)
+    found, own = loop(coded, steps, extra)
     np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)  # of a range of 4
     assert [each[0] for each in own] == [each[0] for each in said]
+    assert form is InC or own == said
+    if form is not InC:
+        return
     met = Status(0)
     for status, _ in said:
         met |= Status(status)
     assert met >= Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.LATE
     assert {mode for _, mode in said} == {0, 1, 2}
     assert sum(mode == 0 for _, mode in said) > 200  # a value of every seventh step is no fault
-
-
-@pytest.mark.parametrize(("rates", "extra"), [(False, False), (True, False), (False, True)])
-def test_structured_text_in_closed_loop_is_python(rates, extra, tmp_path) -> None:
-    given, observer = policy(rates, extra), problem(rates, extra)[1]
-    options = {"estimator": observer, "checks": WITH_EXTRA if extra else CHECKS}
-    export(given, tmp_path / "plant.npz", **options)
-    export(given, tmp_path / "plant.st", **options)
-    block = InStructuredText((tmp_path / "plant.st").read_text())
-    steps = noisy_steps(400)
-    wanted, said = loop(InPython(Controller.load(tmp_path / "plant.npz")), steps, extra)
-    found, own = loop(block, steps, extra)
-    np.testing.assert_allclose(found, wanted, atol=4e-10, rtol=0)
-    assert own == said
 
 
 @needs_compiler
@@ -209,25 +236,18 @@ def test_the_self_test_runs_a_closed_loop_and_can_fail(precision, tmp_path) -> N
     # A name that begins like tables of the code.
     export(policy(), tmp_path / "est.c", estimator=observer, precision=precision)
     code = tmp_path / "est.c"
-    assert self_test(tmp_path) == 0
+    assert self_test(tmp_path, "est").returncode == 0
     text = code.read_text()
     for old, factor in (("est_gain[j][i] * x[i]", "0.9"), ("state->output[i] * input", "1.01")):
         assert old in text
         code.write_text(text.replace(old, f"(real){factor} * {old}"))
-        assert self_test(tmp_path) == 1
-
-
-def self_test(folder: Path) -> int:
-    sources = [str(folder / "est.c"), str(folder / "est_selftest.c")]
-    guards = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    program = str(folder / "test")
-    subprocess.run([COMPILERS[0], *STRICT, *guards, *sources, "-lm", "-o", program], check=True)
-    return subprocess.run([program], capture_output=True).returncode
+        assert self_test(tmp_path, "est").returncode == 1
 
 
 def settled(controller: Controller, reference: Array, steps: int = 300) -> tuple[Array, Array]:
     """Return outputs (T, 2) and inputs of a plant with loads that nothing measures."""
-    x, u = BEGIN, []
+    x = BEGIN
+    u = []
     shown = []
     for _ in range(steps):
         shown.append(C @ x)
@@ -250,7 +270,9 @@ def test_it_is_the_estimator_and_the_law_of_the_wrapped_env(tmp_path) -> None:
     mpc, observer = problem()
     export(mpc, tmp_path / "plant.npz", estimator=observer)
     shown, inputs = settled(Controller.load(tmp_path / "plant.npz"), np.array([51.0, 301.0]), 50)
-    low, high, law = mpc.disturbances.d_min[1:], mpc.disturbances.d_max[1:], mpc.explicit()
+    low = mpc.disturbances.d_min[1:]
+    high = mpc.disturbances.d_max[1:]
+    law = mpc.explicit()
     for k, y in enumerate(shown):
         y = y - C @ X_SS
         found = observer.update(y, inputs[k - 1] - U_SS, [0.0]) if k else observer.reset(y)
@@ -259,7 +281,8 @@ def test_it_is_the_estimator_and_the_law_of_the_wrapped_env(tmp_path) -> None:
 
 
 def test_networks_see_an_extra_signal_beside_the_estimates(tmp_path) -> None:
-    given, observer = policy(extra=True), problem(extra=True)[1]
+    given = policy(extra=True)
+    observer = problem(extra=True)[1]
     export(given, tmp_path / "plant.npz", estimator=observer)
     controller = Controller.load(tmp_path / "plant.npz")
     assert controller.obs_names == ("x[0]", "x[2]", "r[0]", "r[1]", "d[0]", "d[1]")
@@ -278,7 +301,9 @@ def test_a_start_goes_on_from_the_plants_present_input(tmp_path) -> None:
     mpc, observer = problem()
     export(mpc, tmp_path / "plant.npz", estimator=observer, checks=Checks(transfer=20))
     controller = Controller.load(tmp_path / "plant.npz")
-    u, d = np.array([3.7, 6.6]), np.array([0.3, -0.2])  # a load that nothing measures
+    # a load that nothing measures
+    u = np.array([3.7, 6.6])
+    d = np.array([0.3, -0.2])
     deviation = np.linalg.solve(np.eye(3) - A, B @ (u - U_SS) + np.linalg.pinv(C) @ d)
     y = C @ (X_SS + deviation)
     inputs = [controller([*y, *y, 1.0], manual=u)]

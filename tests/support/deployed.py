@@ -154,6 +154,22 @@ def with_faults(policy: YannPolicy, steps: int) -> tuple[Checks, list[tuple[Any,
     return Checks(low, high, frozen_after=3, hold=2, recover=4, transfer=3), found
 
 
+def error(found: np.ndarray, wanted: np.ndarray, controller: Controller) -> float:
+    """Return the largest difference of inputs, in parts of an input's range."""
+    return float(np.max(np.abs(found - wanted) / (2 * controller.data["action_scale"])))
+
+
+def self_test(
+    folder: Path, name: str = "plant", compiler: str = ""
+) -> subprocess.CompletedProcess[str]:
+    """Build the self-test of exported C code under sanitizers, and run it."""
+    sources = [str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c")]
+    guards = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    build = [compiler or COMPILERS[0], *STRICT, *guards, *sources]
+    subprocess.run([*build, "-lm", "-o", str(folder / "test")], check=True)
+    return subprocess.run([folder / "test"], capture_output=True, text=True)
+
+
 class Compiled:
     """C code of an export, as a library."""
 
