@@ -33,8 +33,15 @@ from sb3_yann.improvement.confirmation import (
     Trial,
     confirm,
 )
-from sb3_yann.improvement.imitation import Teacher, imitate, policy_of, refit_critic
+from sb3_yann.improvement.imitation import (
+    Teacher,
+    controller_of,
+    imitate,
+    policy_of,
+    refit_critic,
+)
 from sb3_yann.improvement.simulator import (
+    Excited,
     OutOfStepsError,
     Scenarios,
     Simulator,
@@ -426,12 +433,15 @@ class _Work:
         # As many as are asked for, half of them as the log begins, half around.
         drawn = Trial.draw(twin, -(-self.n_starts // 2), self.rng)
         scenarios: Scenarios | None = drawn.scenarios(self.rng)
+        episodes: list[Episode] = []
         shown: Teacher | None = None
         self.say.end_of_round()
         for number in range(self.rounds):
             if scenarios is None:
                 break
             self.say(f"round {number + 1} of at most {self.rounds}: {len(scenarios)} plans")
+            if twin.dynamics.row.hidden:
+                scenarios = self._of_estimates(scenarios, episodes, self.seed + number)
             teacher = Teacher(scenarios, self.seed + number)
             teacher.show()
             gain = f"{100 * teacher.gain:.3g} %"
@@ -456,6 +466,20 @@ class _Work:
             if passes(share):
                 return improvement(True)
         return improvement(False)
+
+    def _of_estimates(self, scenarios: Scenarios, episodes: list[Episode], seed: int) -> Scenarios:
+        """Return scenarios of a twin of hidden states in a model of what the policy sees.
+
+        It is fitted to what comes of them in the twin, by the policy and with inputs moved at
+        random, and to all that came before.
+        """
+        row = scenarios.model.dynamics.row
+        for controller in (controller_of(self.act()), Excited(self.problem, seed)):
+            played = scenarios.play(controller)
+            pairs = zip(played.thetas.swapaxes(0, 1), played.inputs.swapaxes(0, 1), strict=True)
+            episodes += [Episode(*each) for each in pairs if np.isfinite(each[0]).all()]
+        model = model_of(self.problem, episodes, row.estimator, seed)
+        return Scenarios(model, None, row.shown(scenarios.starts), scenarios.given)
 
     def _check_in(self, trial: Trial, share: float = 1.0) -> Check:
         """Check the layer on the known starts of a twin, then on new ones, and by other models."""

@@ -43,6 +43,17 @@ class Residual:
         return cls([*hidden, np.zeros((0, n)), constant[None], L, quadratic.reshape(k, k * n)])
 
     @classmethod
+    def of_basis(cls, weights: Array, k: int, constant: bool) -> Residual:
+        """Return the polynomial of weights (f, n) of k features, one where it is, and products."""
+        first = k + int(constant)
+        n = weights.shape[1]
+        Q: Array = np.zeros((k, k, n))
+        if len(weights) > first:
+            Q[np.triu_indices(k)] = weights[first:] / 2
+            Q = Q + np.swapaxes(Q, 0, 1)
+        return cls.polynomial(weights[:k], weights[k:first].sum(axis=0), Q)
+
+    @classmethod
     def zero(cls, k: int, n: int) -> Residual:
         """Return zeros (n,) for k features."""
         return cls.polynomial(np.zeros((k, n)))
@@ -117,9 +128,10 @@ class Coordinates:
         problem: LinearMPC,
         episodes: Sequence[Episode],
         observer: StateEstimator | None = None,
+        hidden: bool = False,
     ) -> Coordinates:
         """Return those of a log, whose episodes hold rows of this layout."""
-        row = RowLayout(problem, observer)
+        row = RowLayout(problem, observer, hidden)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in episodes])
         half = row.half
         low = seen.min(0)

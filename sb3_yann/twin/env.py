@@ -136,7 +136,8 @@ class Starts:
             self.problem.deviations.theta_max,
         )
         outside = ~self.problem.law().in_domain(shown)
-        drawn = self.row.begin(shown)
+        drawn[:, : shown.shape[1]] = shown
+        drawn = self.row.begin(drawn)
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
         return drawn
 
@@ -299,7 +300,8 @@ class TwinEnv(gym.Env[Single, Single]):
         self._acting = Dynamics(problem, self.dynamics.coordinates, (members[acting],))
         self._episode = self.model.episodes[int(self.np_random.integers(len(self.model.episodes)))]
         row = self.dynamics.row
-        theta = row.shown(self._episode.thetas[0]).copy()
+        first = self._episode.thetas[0].copy()
+        theta = row.shown(first)
         state = problem.layout.state
         units = problem.units
         theta[state] = self.model.starts.draw(1, self.np_random)[0, state]
@@ -312,7 +314,7 @@ class TwinEnv(gym.Env[Single, Single]):
                     f"{sizes[0]} or {sizes[1]}."
                 )
             theta[: len(given)] = units.to_deviations(given)
-        self._theta = row.begin(theta)
+        self._theta = row.begin(first)
         self._steps = 0
         shown = units.to_plant(theta)
         return shown.astype(np.float32), {"state": shown.copy(), "member": acting}

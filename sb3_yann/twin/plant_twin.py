@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,7 @@ from sb3_yann.log import SECONDS, Log
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.env import LearntModel, TwinEnv
 from sb3_yann.twin.forecast import Forecast, Judge, forecast
+from sb3_yann.twin.hidden import GUESS, shoot
 from sb3_yann.twin.log import (
     Episode,
     as_episodes,
@@ -30,6 +31,7 @@ from sb3_yann.twin.selection import (
     FOLDS,
     KINDS,
     Candidate,
+    Setting,
     candidates,
     fit_ensemble,
     held_out,
@@ -52,6 +54,8 @@ if TYPE_CHECKING:
 
 BLOCKS = 40  # pieces of a log of few episodes that its members are fitted to some of
 AHEAD = 20  # steps of the windows that networks are fitted to
+HIDDEN = Setting(1, 1e-4, 1.0), Setting(2, 1e-4, 1.0), Setting(2, 1e-6, 1.0)
+"""How the residuals of states that nothing shows are fitted, the least free first."""
 ROWS = 100
 LACKS = 0.01
 """Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
@@ -200,42 +204,15 @@ class PlantTwin(LearntModel):
         if observer is None:
             warn_of_estimates(problem, log)
         log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)
-        coordinates = Coordinates.of(problem, log, observer)
-        parts = pieces(log, FOLDS)
-        blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
-        draws = np.random.default_rng(seed).integers(len(blocks), size=(n_members - 1, len(blocks)))
-        drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
+        fit = _Fit(problem, observer, residuals, n_members, updates, seed, units_confirmed, notes)
         with shown(progress_bar):
-            # The model as it is comes first, to compare with, whether it may be chosen or not.
-            choices = candidates(coordinates, parts, residuals)
-            first = int("none" not in residuals and len(residuals) > 0)
-            alone = first == len(choices)
-            runs = held_out(coordinates, parts, choices)
-            chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
-            known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
-            long = sum(map(len, parts)) >= ROWS and len(parts) > 1
-            members: list[Residual] = []
-            if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
-                kept = without_each_fold(parts)
-                networks = fit_ensemble(
-                    coordinates, [*kept, *drawn], seed, ahead=AHEAD, updates=updates
-                )
-                choices.append(Candidate("network", tuple(networks[: len(kept)])))
-                runs = held_out(coordinates, parts, choices)
-                chosen = runs.choose(first) if len(parts) > 1 else first
-                members = networks[len(kept) :]
-                known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
-            choice = choices[chosen]
-            if choice.setting is not None:
-                members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
-            elif choice.name == "none":
-                members = [
-                    Residual.zero(len(coordinates.scale), problem.model.n_states)
-                ] * n_members
-            dynamics = Dynamics(problem, coordinates, tuple(members))
-            trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
-            found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
-        return cls(problem, log, dynamics, choice.name, trust, notes, found)
+            found = fit.twin(log, hidden=False)
+            hidden = RowLayout(problem, observer, hidden=True)
+            if found.trust.lacks_alone and row.observer is None and hidden.observer is not None:
+                again = [Episode(*hidden.recovered(each.thetas, each.actions)) for each in log]
+                other = fit.twin(tuple(again), hidden=True)
+                found = other if other.trusted else found
+        return found
 
     @property
     def trusted(self) -> bool:
@@ -317,6 +294,71 @@ class PlantTwin(LearntModel):
         """
         self.require_trust()
         return TwinEnv(self, member)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What a twin is fitted with."""
+
+    problem: LinearMPC
+    observer: StateEstimator | None
+    residuals: Sequence[str]
+    n_members: int
+    updates: int
+    seed: int
+    units_confirmed: bool
+    notes: tuple[str, ...]
+
+    def twin(self, log: tuple[Episode, ...], hidden: bool) -> PlantTwin:
+        """Return the twin of a log in rows, whose own states are to be found where ``hidden``."""
+        problem = self.problem
+        residuals = self.residuals
+        coordinates = Coordinates.of(problem, log, self.observer, hidden)
+        if hidden:
+            log = tuple(shoot(coordinates, log, HIDDEN[-1], GUESS)[1])
+            box = Coordinates.of(problem, log, self.observer, hidden)
+            coordinates = replace(coordinates, low=box.low, high=box.high, units=box.units)
+        parts = pieces(log, FOLDS)
+        blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
+        rng = np.random.default_rng(self.seed)
+        draws = rng.integers(len(blocks), size=(self.n_members - 1, len(blocks)))
+        drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
+        kept = without_each_fold(parts)
+        # The model as it is comes first, to compare with, whether it may be chosen or not.
+        choices = candidates(coordinates, parts, residuals if not hidden else ())
+        if hidden:
+            for each in (each for each in HIDDEN if each.kind in residuals):
+                by_fold = [shoot(coordinates, fold, each)[0] for fold in kept]
+                choices.append(Candidate(str(each), tuple(by_fold), each))
+        first = int("none" not in residuals and len(residuals) > 0)
+        alone = first == len(choices)
+        runs = held_out(coordinates, parts, choices)
+        chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
+        known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
+        long = sum(map(len, parts)) >= ROWS and len(parts) > 1 and not hidden
+        members: list[Residual] = []
+        if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
+            networks = fit_ensemble(
+                coordinates, [*kept, *drawn], self.seed, ahead=AHEAD, updates=self.updates
+            )
+            choices.append(Candidate("network", tuple(networks[: len(kept)])))
+            runs = held_out(coordinates, parts, choices)
+            chosen = runs.choose(first) if len(parts) > 1 else first
+            members = networks[len(kept) :]
+            known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
+        choice = choices[chosen]
+        if choice.setting is not None and hidden:
+            members = [shoot(coordinates, each, choice.setting)[0] for each in drawn]
+        elif choice.setting is not None:
+            members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
+        elif choice.name == "none":
+            zero = Residual.zero(len(coordinates.scale), problem.model.n_states)
+            members = [zero] * self.n_members
+        dynamics = Dynamics(problem, coordinates, tuple(members))
+        trust = evidence(dynamics, parts, (runs, chosen, known), self.units_confirmed)
+        found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
+        name = f"hidden states, {choice.name}" if hidden else choice.name
+        return PlantTwin(problem, log, dynamics, name, trust, self.notes, found)
 
 
 def _require_same_sampling(log: Log, problem: LinearMPC) -> None:

@@ -28,11 +28,14 @@ class RowLayout:
 
     Where the measurements do not tell the plant's state, a row is theta, and the estimate itself is
     what is learnt: ``x_hat+ = A x_hat + B u + E d_hat + residual(x_hat, d_hat, u)``. This residual
-    is ``L_x e``, of the innovations e. So it moves d_hat by ``L_d L_x^+ residual``.
+    is ``L_x e``, of the innovations e. So it moves d_hat by ``L_d L_x^+ residual``. Or it is
+    ``hidden``: behind theta stands the plant's own state all the same, as a guess of what no
+    measurement shows, which `sb3_yann.twin.hidden` finds.
     """
 
     problem: LinearMPC
     estimator: StateEstimator | None = None
+    hidden: bool = False
 
     def __post_init__(self) -> None:
         estimator = self.estimator
@@ -55,10 +58,12 @@ class RowLayout:
             )
 
     @cached_property
-    def observer(self) -> DisturbanceObserver | None:
+    def observer(self) -> StateEstimator | None:
         """The estimator where it determines the plant's state and all disturbances, else None."""
         found = self.estimator
         n = self.problem.model.n_states
+        if self.hidden and found is not None and found.n_estimated == self._n_disturbances:
+            return found if np.linalg.cond(found.gain[:n]) < SINGULAR else None
         if not isinstance(found, DisturbanceObserver):
             return None
         square = found.C.shape == (n, n) and found.n_estimated == self._n_disturbances
@@ -105,6 +110,12 @@ class RowLayout:
     def _raw(self) -> slice:
         """The entries of the estimate of d before it is clipped."""
         return slice(self.state.stop, self.state.stop + self.problem.layout.n_disturbances)
+
+    @cached_property
+    def measured(self) -> Array:
+        """The part (n, n) of a state that the measurements show."""
+        assert self.observer is not None
+        return np.asarray(np.linalg.pinv(self.observer.C) @ self.observer.C)
 
     @property
     def _d(self) -> tuple[Array, Array]:
@@ -198,6 +209,9 @@ class RowLayout:
             return shown.copy()
         x = shown[..., parts.state]
         d = shown[..., parts.disturbance]
+        if self.hidden and thetas.shape[-1] == self.size:  # what is not measured stays
+            own = thetas[..., self.state]
+            x = own + (x - own) @ self.measured.T
         return np.concatenate([shown, x, d], axis=-1)
 
     def after(self, row: Array, u: Array, theta: Array) -> Array:
@@ -211,13 +225,14 @@ class RowLayout:
         parts = self.problem.layout
         n = self.problem.layout.n_states
         z = observer.A @ np.concatenate([row[parts.state], row[self._raw]]) + observer.B @ u
-        seen = np.linalg.solve(observer.gain[:n], theta[parts.state] - z[:n])
+        seen = np.linalg.pinv(observer.gain[:n]) @ (theta[parts.state] - z[:n])
         d = z[n:] + observer.gain[n:] @ seen
         shown = theta[parts.disturbance]
         (low, high) = self._d
         room = ROUNDED * (high - low)  # an observation rounds the bounds to float32
         d = np.where((shown > low + room) & (shown < high - room), shown, d)
-        x = np.linalg.solve(observer.C, observer.C @ z[:n] + seen)
+        shows = np.linalg.pinv(observer.C) @ seen + self.measured @ z[:n]
+        x = shows + theta[parts.state] - self.measured @ theta[parts.state]
         return np.concatenate([theta, x, d])
 
     def recovered(self, thetas: Array, actions: Array) -> tuple[Array, Array]:
@@ -230,7 +245,7 @@ class RowLayout:
         if self.observer is None:
             return thetas, actions
         parts = self.problem.layout
-        if np.isnan(thetas[:, parts.disturbance]).all():
+        if not self.hidden and np.isnan(thetas[:, parts.disturbance]).all():
             return self._run(thetas, actions), actions
         rows = [self.begin(thetas[0])]
         for theta, u in zip(thetas[1:], actions, strict=True):

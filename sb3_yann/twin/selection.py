@@ -225,11 +225,15 @@ class Setting(NamedTuple):
         """How far it may leave the given model."""
         return float(self.degree - 2 * np.log10(self.shrinkage) - np.log10(self.factor))
 
+    @property
+    def kind(self) -> str:
+        """The name of its degree."""
+        return next(name for name, degree in DEGREES.items() if degree == self.degree)
+
     def __str__(self) -> str:
         """Name the kind and the shrinkage."""
-        kind = next(name for name, degree in DEGREES.items() if degree == self.degree)
         strongest = self.shrinkage * self.factor
-        return f"{kind}, shrinkage {self.shrinkage:g} ({strongest:g} of inputs)"
+        return f"{self.kind}, shrinkage {self.shrinkage:g} ({strongest:g} of inputs)"
 
 
 @dataclass(frozen=True)
@@ -259,33 +263,40 @@ def ridge(
     problem = coordinates.row.problem
     (count, k) = z.shape
     n = y.shape[1]
-    i, j = np.triu_indices(k)
-    quadratic = max(each.degree for each in settings) > 1
-    F = np.hstack([z, np.ones((count, int(problem.layout.has_constants)))])
-    linear = F.shape[1]
-    F = np.hstack([F, z[:, i] * z[:, j]]) if quadratic else F
+    constant = bool(problem.layout.has_constants)
+    F = basis(z, constant, max(each.degree for each in settings))
     gram = F.T @ F
     cross = F.T @ y
     found = []
-    of_inputs = np.zeros(F.shape[1], dtype=bool)
-    of_inputs[k - problem.model.n_inputs : k] = True
-    of_inputs[linear:] = (j >= k - problem.model.n_inputs)[: len(of_inputs) - linear]
-    for degree, shrinkage, factor, gain in settings:
-        size = linear if degree == 1 else F.shape[1]
-        weight = shrinkage * np.where(of_inputs[:size], factor, 1.0)
-        weight[k:linear] = 1e-9
-        matrix = linalg.cho_factor(gram[:size, :size] + count * np.diag(weight + 1e-12))
+    for each in settings:
+        weight = shrinkage_of(each, problem, k)
+        size = len(weight)
+        matrix = linalg.cho_factor(gram[:size, :size] + count * np.diag(weight))
         about = np.zeros((size, n))
-        if gain is not None:
-            at = k - problem.model.n_inputs + gain[0]
-            about[at] = (gain[1] - 1) * coordinates.scale[at] * problem.model.B[:, gain[0]]
+        if each.gain is not None:
+            j, times = each.gain
+            at = k - problem.model.n_inputs + j
+            about[at] = (times - 1) * coordinates.scale[at] * problem.model.B[:, j]
         solved = about + linalg.cho_solve(matrix, cross[:size] - gram[:size, :size] @ about)
-        Q: Array = np.zeros((k, k, n))
-        if degree > 1:
-            Q[i, j] = solved[linear:] / 2
-            Q = Q + np.swapaxes(Q, 0, 1)
-        found.append(Residual.polynomial(solved[:k], solved[k:linear].sum(axis=0), Q))
+        found.append(Residual.of_basis(solved, k, constant))
     return found
+
+
+def basis(z: Array, constant: bool, degree: int) -> Array:
+    """Return the terms (count, f) of a polynomial of z (count, k): z, one, and products."""
+    i, j = np.triu_indices(z.shape[1])
+    F = np.hstack([z, np.ones((len(z), int(constant)))])
+    return np.hstack([F, z[:, i] * z[:, j]]) if degree > 1 else F
+
+
+def shrinkage_of(setting: Setting, problem: LinearMPC, k: int) -> Array:
+    """Return the weight (f,) of each squared coefficient of a basis of k features."""
+    inputs = np.arange(k) >= k - problem.model.n_inputs
+    products = inputs[np.triu_indices(k)[1]] if setting.degree > 1 else inputs[:0]
+    each = (setting.shrinkage * np.where(of, setting.factor, 1.0) for of in (inputs, products))
+    first, second = each
+    constant = [1e-9] * int(problem.layout.has_constants)
+    return np.concatenate([first, constant, second]) + 1e-12
 
 
 def candidates(

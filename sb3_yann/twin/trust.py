@@ -77,6 +77,11 @@ class Trust:
         return not self.problems
 
     @property
+    def lacks_alone(self) -> bool:
+        """Whether it is that costs err too much, and nothing else, that speaks against it."""
+        return len(self.problems) == 1 and not self.cost_error <= COST_ERROR
+
+    @property
     def cost_error(self) -> float:
         """Root mean square error of the predicted costs, relative to the mean cost."""
         return relative_error(self.predicted, self.actual)
