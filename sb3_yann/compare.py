@@ -55,8 +55,8 @@ class AcceptanceRule:
     ----------
     margin : float, default 0.01
         What the worst starts may cost more than with the MPC on average, as a fraction of the
-        MPC's median cost, or of its cost of that start where that is more. No single start may
-        cost ten times as much more.
+        MPC's median cost, of its cost of that start, or of what the policy saves on average,
+        whichever is most. No single start may cost ten times as much more.
     cvar_alpha : float, default 0.05
         Share of the starts that count as the worst ones. 0 is strict: no single
         start may cost more than the margin, of the median.
@@ -187,6 +187,7 @@ class Tolerance:
     excess_room: float = EXCESS_ROOM
     bounds: BoundNames = field(default_factory=BoundNames)
     worst_start: float = WORST_START
+    saved: float = 0.0
 
     def exceeded(self, policy: Scores, episode: int, mpc: Scores | None = None) -> str:
         """Return which bound an episode exceeds most, and by how much; empty where none is.
@@ -205,7 +206,8 @@ class Tolerance:
         """Return what each start may cost more, rounding at least."""
         margin: Any = self.margin
         if self.cvar_alpha:
-            margin = self.margin * np.maximum(1.0, np.abs(mpc_costs) / self.typical)
+            own = np.maximum(np.abs(mpc_costs), self.saved)
+            margin = self.margin * np.maximum(1.0, own / self.typical)
         return np.asarray(np.maximum(margin, COST_ROUNDING * np.abs(mpc_costs)))
 
     def excess(self, mpc_costs: Array, costs: Array) -> Array:
@@ -337,9 +339,10 @@ def no_worse(
     # Neither is exceeded: a tolerance over the accepted policy alone would add up.
     allowed = np.minimum(accepted.unsafe, mpc.unsafe)
     less = less_safe(policy.unsafe, allowed, tolerance.excess_room)
-    excess = tolerance.excess(mpc.costs, policy.costs)
     costs = policy.costs[n_hard:]
     of_mpc = mpc.costs[n_hard:]
+    tolerance = replace(tolerance, saved=float(np.mean(of_mpc - costs)) if len(costs) else 0.0)
+    excess = tolerance.excess(mpc.costs, policy.costs)
     before = of_mpc if accepted is mpc else accepted.costs[n_hard:]
     above_mpc = is_above(costs, of_mpc)
     gain = Difference.of(relative_costs(costs - before, of_mpc))

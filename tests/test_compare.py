@@ -171,6 +171,18 @@ def test_what_a_start_may_cost_more_grows_with_its_cost() -> None:
     assert lost.tolist() == [True, False, False]
 
 
+def test_a_policy_that_saves_a_few_dear_starts_may_lose_in_proportion_on_the_others() -> None:
+    mpc = np.append(np.ones(19), 1000.0)
+    rule = AcceptanceRule().tolerance(mpc)
+    policy = mpc.copy()
+    policy[0] = 1.4  # 40 % of the median, .8 % of what the policy saves on average
+    assert "start 0" in no_worse(scores(policy), scores(mpc), scores(mpc), rule).reason
+    policy[-1] = 1.0
+    assert no_worse(scores(policy), scores(mpc), scores(mpc), rule).accepted
+    policy[0] = 2.0
+    assert "start 0" in no_worse(scores(policy), scores(mpc), scores(mpc), rule).reason
+
+
 def test_a_single_start_ten_times_beyond_what_is_allowed_is_too_much_alone() -> None:
     rule, rest = Tolerance(1.0, 0.5), np.full(99, -50.0)
     assert rule.objection(np.append(rest, 10.0)) == rule.objection(np.append(rest, 1.0)) == ""

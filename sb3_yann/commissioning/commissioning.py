@@ -42,7 +42,7 @@ from sb3_yann.control.mpc.bound_excess import (
 from sb3_yann.env_pool import Source, one_env
 from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
-from sb3_yann.improvement.confirmation import RULE
+from sb3_yann.improvement.imitation import RULE
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin

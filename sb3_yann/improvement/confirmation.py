@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.compare import (
     LARGEST,
-    AcceptanceRule,
     Difference,
     PairedTrial,
     Scores,
@@ -30,7 +29,7 @@ from sb3_yann.compare import (
     unsafe_columns,
 )
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
-from sb3_yann.improvement.imitation import Inputs, controller_of
+from sb3_yann.improvement.imitation import RULE, Inputs, controller_of
 from sb3_yann.improvement.simulator import Scenarios, Simulator, of_law
 from sb3_yann.rollout import Rows, Trajectories
 from sb3_yann.twin.dynamics import law_of
@@ -38,8 +37,6 @@ from sb3_yann.twin.env import RARE
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
 
-RULE = AcceptanceRule()
-"""When a policy is no worse on the starts that begin as the log does: as a guard has it."""
 MARGIN = 0.01  # what one start around the log may cost more on one member, in mean costs of the MPC
 AROUND = 0.005
 RAREST = 10.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
-from sb3_yann.compare import less_safe, relative_costs
+from sb3_yann.compare import AcceptanceRule, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
 from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
 from sb3_yann.networks import RowAdam
@@ -20,15 +20,22 @@ from sb3_yann.networks.yann import LawLayer
 from sb3_yann.plan import PAUSE, Planning, Plans, follow
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Controller, Rows
+from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.env import LearntModel
 
+RULE = AcceptanceRule()
+"""When a policy is no worse: as a guard has it."""
 Inputs = Callable[[Array], Array]
 BATCH = 512  # rows in a step of Adam
 RATE = 1e-2  # of Adam at first; it falls to zero
 NEARBY = 3  # states beside each of a plan that its feedback answers
 SPREAD = 0.1  # how far they are, in standard deviations of the states in the episodes
-FITS = 6  # fits to plans in a model, at most: after each the policy's own states are planned from
-HARDEST = 20  # scenarios that are planned anew after a fit
+LARGE = 0.1
+"""Errors of an action, in half-ranges, from which they count by their size rather than its square:
+where plans go one way or the other, their mean goes nowhere."""
+PATIENCE = 3  # fits in a row that may bring no better policy
+FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
+HARDEST = 40  # scenarios that are planned anew after a fit
 NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
 RETURNS = 1000  # states whose returns the critic is fitted to
 RETURN_STEPS = 100  # steps of a return; the MPC's value counts after them
@@ -41,21 +48,25 @@ class Teacher:
 
     Plans are those of :func:`headroom`: differential dynamic programming, which knows neither
     changes of references nor disturbances before they come. ``best`` (k,) is the least cost that a
-    plan or the MPC had in each scenario.
+    plan or the MPC had in each scenario. The first ``n_planned`` are planned, by default all; the
+    others where a policy turns out to cost more than the MPC.
     """
 
-    def __init__(self, scenarios: Scenarios, seed: int) -> None:
+    def __init__(self, scenarios: Scenarios, seed: int, n_planned: int | None = None) -> None:
         self.scenarios = scenarios
+        self.planned = slice(n_planned)
         self.rng = np.random.default_rng([seed, 4])
         model = scenarios.model
         problem = scenarios.model.problem
         self.problem = problem
         self.units = model.dynamics.coordinates.units
         self.mpc = scenarios.play(of_law(problem))
+        self.law = law_of(problem)
         self.best = self.mpc.costs.copy()
+        self.known = np.zeros(len(scenarios), dtype=bool)
         self.steps = len(self.mpc.inputs)
         finite = self.mpc.costs[np.isfinite(self.mpc.costs)]
-        unit = max(float(np.abs(finite).mean()) / self.steps, 1e-300) if len(finite) else 1.0
+        unit = max(float(np.median(np.abs(finite))) / self.steps, 1e-300) if len(finite) else 1.0
         self.task = task_of(model, unit, priced=scenarios.members is None)
         self.thetas: list[Array] = []
         self.inputs: list[Array] = []
@@ -63,70 +74,108 @@ class Teacher:
     @property
     def gain(self) -> float:
         """What plans gain on average: see :meth:`saved`."""
-        return self.saved(self.best)
+        return self.saved(self.best, self.planned)
 
-    def saved(self, costs: Array) -> float:
+    def saved(self, costs: Array, part: slice = slice(None)) -> float:
         """Return what costs (k,) are below the MPC's on average, relative to those."""
-        finite = np.isfinite(self.mpc.costs)
-        mpc = self.mpc.costs[finite]
-        return float(-relative_costs(costs[finite] - mpc, mpc).mean()) if finite.any() else 0.0
+        finite = np.isfinite(self.mpc.costs[part])
+        mpc = self.mpc.costs[part][finite]
+        more = costs[part][finite] - mpc
+        return float(-relative_costs(more, mpc).mean()) if finite.any() else 0.0
+
+    def score(self, costs: Array) -> float:
+        """Return what costs (k,) are below the MPC's in all scenarios, by which fits are ranked.
+
+        A start counts as lost once at most: else one that falls would hide all the others.
+        """
+        with np.errstate(invalid="ignore"):
+            more = relative_costs(costs - self.mpc.costs, self.mpc.costs)
+        more = np.nan_to_num(more, nan=0.0, posinf=1.0, neginf=-1.0)
+        return float(-np.minimum(more, 1.0).mean())
 
     def show(self, act: Inputs | None = None, played: Imagined | None = None) -> None:
         """Plan the scenarios; those that a policy ``played``, from where it had got to.
 
-        What costs more than with the MPC, or breaks a bound by more, shows nothing.
+        Where plans cost more than the MPC, or break a bound by more, the MPC is shown.
         """
-        pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
-        planning = Planning(self.scenarios.plant, self.task, self.steps, pause)
-        first = self.hardest(played) if played else np.zeros(len(self.scenarios), dtype=np.int64)
+        model = self.scenarios.model
+        pause = PAUSE if model.dynamics.row.observer is not None else 0
+        if played:
+            chosen, begins = self.hardest(played)
+        else:
+            chosen = np.arange(len(self.scenarios))[self.planned]
+            begins = np.zeros(len(chosen), dtype=np.int64)
+        self.known[chosen] = True
+        scenarios = self.scenarios.of(chosen)
+        planning = Planning(scenarios.plant, self.task, self.steps, pause)
         before = controller_of(act or self.problem.law())
         plans: list[dict[int, tuple[int, Plans, Array]]] = []  # at each step
 
         def switched(t: int, theta: Array, rows: Rows) -> Array:
             u = np.array(before(t, theta, rows), np.float64)
-            begun = (first[rows] >= 0) & (first[rows] <= t)
+            begun = begins[rows] <= t
             if np.any(begun):
                 u[begun] = planning(t, theta[begun], rows[begun])
             plans.append({**planning.plans})
             return u
 
-        shown = self.scenarios.play(switched)
-        safe = ~less_safe(shown.unsafe, self.mpc.unsafe).any(axis=1)
-        taught = (first >= 0) & safe & (shown.costs <= self.mpc.costs)
-        self.best = np.where(taught, np.fmin(self.best, shown.costs), self.best)
-        for i in np.flatnonzero(taught):
-            for t in range(first[i], self.steps):
-                when, plan, _ = plans[t][i]
-                theta = shown.thetas[t, i]
-                near = np.tile(theta, (NEARBY, 1))
-                states = self.problem.layout.state
-                moved = self.rng.standard_normal(near[:, states].shape)
-                near[:, states] += SPREAD * self.units * moved
-                at = min(t, self.steps - 1) - when
-                answers = np.concatenate([follow(plan, at, each[None]) for each in near])
-                self.inputs += [shown.inputs[t, i], *np.clip(answers, *self.task.limits(near))]
-                self.scenarios.model.dynamics.coordinates.wrap(near)
-                self.thetas += [theta, *near]
+        shown = scenarios.play(switched)
+        better = shown.costs <= self.mpc.costs[chosen]
+        better &= ~less_safe(shown.unsafe, self.mpc.unsafe[chosen]).any(axis=1)
+        for i, scenario in enumerate(chosen):
+            begun = begins[i]
+            if better[i]:
+                self.best[scenario] = np.fmin(self.best[scenario], shown.costs[i])
+                acting = [plans[t][i] for t in range(begun, self.steps)]
+
+                def answers(near: Array, begun: int = begun, acting: Any = acting) -> Array:
+                    each = enumerate(zip(acting, near, strict=True), start=begun)
+                    return np.array([follow(plan, t - at, x) for t, ((at, plan, _), x) in each])
+
+                self._keep(shown.thetas[begun:-1, i], shown.inputs[begun:, i], answers)
+            elif not begun:
+                taught = self.mpc.thetas[:-1, scenario], self.mpc.inputs[:, scenario]
+                self._keep(*taught, lambda near: self.law(near.reshape(-1, near.shape[-1])))
+
+    def _keep(self, thetas: Array, inputs: Array, answers: Inputs) -> None:
+        """Keep inputs (T, m) at thetas (T, n_theta), and the answers to states near each."""
+        near = np.repeat(thetas[:, None], NEARBY, axis=1)
+        states = near[..., self.problem.layout.state]
+        states += SPREAD * self.units * self.rng.standard_normal(states.shape)
+        rows = near.reshape(-1, near.shape[-1])
+        answered = answers(near).reshape(len(rows), -1)
+        self.inputs += [inputs, np.clip(answered, *self.task.limits(rows))]
+        self.scenarios.model.dynamics.coordinates.wrap(rows)
+        self.thetas += [thetas, rows]
 
     def teach(self, layer: LawLayer, updates: int) -> None:
         """Fit a layer to all that was shown."""
-        fit_layer(
-            layer, self.problem, np.array(self.thetas), np.array(self.inputs), self.rng, updates
-        )
+        thetas = np.concatenate(self.thetas)
+        inputs = np.concatenate(self.inputs)
+        fit_layer(layer, self.problem, thetas, inputs, self.rng, updates)
 
-    def hardest(self, played: Imagined) -> NDArray[np.int64]:
-        """Return the steps (k,) to plan from next: -1 where a policy does nearly as well as plans.
+    def hardest(self, played: Imagined) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+        """Return the scenarios in which a policy lacks most, and the steps to plan from next.
 
-        Half of the others begin at their start, half amid the episode.
+        Those that were not planned before begin at their start, as half of the others do; the rest
+        amid the episode.
         """
         behind = np.where(np.isfinite(played.costs), played.costs - self.best, np.inf)
-        behind[less_safe(played.unsafe, self.mpc.unsafe).any(axis=1)] = np.inf
-        chosen = np.argsort(-behind, kind="stable")[:HARDEST]
-        chosen = chosen[behind[chosen] > 0]
-        begins = np.full(len(behind), -1, dtype=np.int64)
-        begins[chosen] = self.rng.integers(0, self.steps, size=len(chosen))
-        begins[chosen[::2]] = 0
-        return begins
+        unsafe = np.any(less_safe(played.unsafe, self.mpc.unsafe), axis=1)
+        chosen = np.lexsort((-behind, ~unsafe))[:HARDEST]
+        chosen = chosen[unsafe[chosen] | (behind[chosen] > 0) | ~self.known[chosen]]
+        begins = self.rng.integers(0, self.steps, size=len(chosen))
+        at_start = self.rng.random(len(chosen)) < 0.5
+        begins[at_start | unsafe[chosen] | ~self.known[chosen]] = 0
+        return chosen, begins
+
+    def objection(self, played: Imagined) -> str:
+        """Return what the rule of acceptance says against a policy, empty for nothing."""
+        finite = np.isfinite(self.mpc.costs)
+        mpc, policy = (
+            Scores(each.costs[finite], each.unsafe[finite]) for each in (self.mpc, played)
+        )
+        return no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
 
 
 def imitate(
@@ -138,27 +187,36 @@ def imitate(
     """Fit a layer to plans of a model's episodes, and to their feedback nearby.
 
     Then the policy plays these episodes in the model, and learns more where it does worse than
-    plans: from their starts, and from where it had got to (S. Ross, G. Gordon and D. Bagnell, *A
-    reduction of imitation learning and structured prediction to no-regret online learning*, AISTATS
-    2011). The layer ends with the fit that cost the least. Return what it saves in the model: see
-    :meth:`Teacher.saved`.
+    plans or the MPC: from their starts, and from where it had got to (S. Ross, G. Gordon and D.
+    Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
+    learning*, AISTATS 2011). The layer ends with the fit that cost the least. Return what it saves
+    in the model: see :meth:`Teacher.saved`.
     """
     most = -np.inf
+    promised = 0.0
     best = copy.deepcopy(layer.state_dict())
     for fit in range(FITS):
-        teacher.teach(layer, updates if fit == 0 else updates // 2)
+        teacher.teach(layer, updates)
         act = policy_of(layer, teacher.problem)
         played = teacher.scenarios.play(controller_of(act))
-        saved = teacher.saved(played.costs)
-        say(f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model")
-        if saved > most:
-            most = saved
+        saved = teacher.saved(played.costs, teacher.planned)
+        score = teacher.score(played.costs)
+        objection = teacher.objection(played)
+        say(
+            f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model"
+            f"{'; ' * bool(objection)}{objection}"
+        )
+        if score > most:
+            since = fit
+            most = score
+            promised = saved
             best = copy.deepcopy(layer.state_dict())
-        if most >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
+        done = saved >= (1 - NEAR) * teacher.gain and not objection
+        if done or fit == FITS - 1 or fit - since == PATIENCE:
             break
         teacher.show(act, played)
     layer.load_state_dict(best)
-    return most
+    return promised
 
 
 def fit_layer(
@@ -169,7 +227,7 @@ def fit_layer(
     rng: np.random.Generator,
     updates: int,
 ) -> None:
-    """Fit a layer to inputs (rows, m) at theta: least squares on actions in [-1, 1], with Adam.
+    """Fit a layer to inputs (rows, m) at theta: Huber's loss on actions in [-1, 1], with Adam.
 
     Rows that are not finite are left out. The networks go on from where they are.
     """
@@ -177,6 +235,8 @@ def fit_layer(
     half = problem.u_half
     wanted = np.clip((inputs - low) / half - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
+    # The slope of the loss does not vanish on the way to a bound, and ends there.
+    wanted += LARGE * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
     to = th.as_tensor(wanted[finite], dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
@@ -185,7 +245,8 @@ def fit_layer(
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()
-        th.nn.functional.mse_loss(layer(at[chosen]), to[chosen]).backward()  # type: ignore[no-untyped-call]
+        loss = th.nn.functional.smooth_l1_loss(layer(at[chosen]), to[chosen], beta=LARGE)
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     optimizer.zero_grad()
 

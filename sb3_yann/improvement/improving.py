@@ -27,13 +27,13 @@ from sb3_yann.improvement.confirmation import (
     ENOUGH,
     FIRST_LOOK,
     LOOKS,
-    RULE,
     Check,
     SimulatorTrial,
     Trial,
     confirm,
 )
 from sb3_yann.improvement.imitation import (
+    RULE,
     Teacher,
     controller_of,
     imitate,
@@ -69,6 +69,7 @@ LEAST = 2e-4  # what a policy must gain in a twin, relative to the MPC's mean co
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
 PROMISED = 0.95  # share of what the model promised that, shown by the simulator, ends the rounds
 LITTLE = 0.02  # share of a gain by which another round must raise it
+OTHERS = 9  # scenarios beside each that is planned, in which a policy shows what it has not learnt
 TRIES = 3  # confirmations of a policy that is taught what it has lost
 
 Weights = dict[str, th.Tensor]
@@ -563,11 +564,13 @@ class _Work:
             self.problem, simulator.episodes, simulator.row.estimator, self.seed + number
         )
         order = self.rng.permutation(len(simulator.episodes))
-        chosen = [simulator.episodes[i] for i in order]
         # Twice each: as it began, and elsewhere with the same references.
-        first = [each for one in lost[: self.n_starts // 4] for each in (one, one)]
-        scenarios = Scenarios.like(model, (first + chosen)[: self.n_starts], self.rng)
-        teacher = Teacher(scenarios, self.seed + number)
+        chosen = [each for one in lost[: self.n_starts // 4] for each in (one, one)]
+        chosen = [*chosen, *(simulator.episodes[i] for i in order)][: self.n_starts]
+        drawn = self.rng.integers(len(order), size=OTHERS * self.n_starts)
+        others = [simulator.episodes[i] for i in drawn]
+        scenarios = Scenarios.like(model, chosen + others, self.rng)
+        teacher = Teacher(scenarios, self.seed + number, len(chosen))
         teacher.show()
         return model, teacher
 
@@ -605,7 +608,8 @@ class _Work:
             elif least == best:
                 note = found.reason or "no gain in the simulator"
             kept = useful and found.accepted and -found.logged >= PROMISED * teacher.gain
-            if kept or (number and stalls):
+            known = -found.logged >= PROMISED * promised  # else the model has to learn more
+            if kept or (number and stalls and known):
                 break
         self.layer.load_state_dict(weights)
         return model, note if least == best else ""

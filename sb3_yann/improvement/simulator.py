@@ -467,6 +467,11 @@ class Scenarios:
         """What acts in them."""
         return TwinPlant(self.model.dynamics, self.members)
 
+    def of(self, chosen: NDArray[np.intp]) -> Scenarios:
+        """Return some of them."""
+        members = None if self.members is None else self.members[chosen]
+        return Scenarios(self.model, members, self.starts[chosen], self.given[:, chosen])
+
     def __len__(self) -> int:
         """Return how many there are."""
         return len(self.starts)

@@ -208,7 +208,7 @@ def forecast(
     follow earlier inputs and errors, the judge is asked again with a memory of them. The first
     judge is the twin's own; ``loosest`` is the input that follows the MPC most closely.
     """
-    independent = sum(len(each[::2]) for each in records(episodes))
+    independent = sum(len(each[::2]) for each in records(judges[0].dynamics.problem, episodes))
     count = len(episodes)
     rng = np.random.default_rng(0)
     some = -(-RUNS // count)

@@ -126,19 +126,20 @@ def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
     return tuple(found)
 
 
-def records(episodes: tuple[Episode, ...]) -> list[range]:
+def records(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[range]:
     """Return the numbers of the episodes of each record: one begins where the one before ends.
 
-    Two neighbors share a row and what the plant remembers. Every other one is independent.
+    Two neighbors share a state and what the plant remembers. Every other one is independent.
     """
-    follows = [np.array_equal(a.thetas[-1], b.thetas[0]) for a, b in pairwise(episodes)]
+    n = problem.model.n_states  # references may change where a record is cut
+    follows = [np.array_equal(a.thetas[-1, :n], b.thetas[0, :n]) for a, b in pairwise(episodes)]
     edges = [0, *(np.flatnonzero(~np.array(follows, dtype=bool)) + 1), len(episodes)]
     return [range(int(first), int(stop)) for first, stop in pairwise(edges)]
 
 
 def more_of(problem: LinearMPC, episodes: tuple[Episode, ...], count: int) -> str:
     """Return how much so many independent episodes are: of one record, its rows, and hours."""
-    whole = records(episodes)
+    whole = records(problem, episodes)
     if len(whole) > 1 or len(episodes) == 1:
         return f"{count} episodes"
     rows = 10 * round(count * sum(map(len, episodes)) / len(whole[0][::2]) / 10)

@@ -259,7 +259,7 @@ def evidence(
     shares = beyond_the_box(problem, log) * (not made_by_law(problem, log).all())
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
-    independent = sum(len(each[::2]) for each in records(log))
+    independent = sum(len(each[::2]) for each in records(problem, log))
     more = partial(more_of, problem, log)
     problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names, more)
     problems += foreign_previous(problem, log)
@@ -278,7 +278,7 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
     """Return what a twin explains, what it does not know, and whether to trust it, as text."""
     steps = sum(map(len, episodes))
     said = [f"The log: {len(episodes)} episodes, {steps} steps."]
-    for pieces in filter(lambda each: len(each) > 1, records(episodes)):
+    for pieces in filter(lambda each: len(each) > 1, records(problem, episodes)):
         said.append(
             f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "
             f"other one is independent: {len(pieces[::2])} of {len(pieces)}."

@@ -10,7 +10,8 @@ import pytest
 
 from sb3_yann.compare import UNSAFE, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundExcess
-from sb3_yann.improvement.confirmation import ENOUGH, LOOKS, RULE, SimulatorTrial, confirm
+from sb3_yann.improvement.confirmation import ENOUGH, LOOKS, SimulatorTrial, confirm
+from sb3_yann.improvement.imitation import RULE
 from twin_samples import problem
 
 

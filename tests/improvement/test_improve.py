@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import pickle
 from contextlib import closing
@@ -29,6 +30,7 @@ from sb3_yann import (
 from sb3_yann.audit.reward import CostMismatchWarning
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import Check, Improvement
+from sb3_yann.improvement.imitation import fit_layer
 from sb3_yann.wrappers import SetPoint
 from twin_samples import Calm, observed_env, offset_free_problem, problem
 from weights import is_mpc
@@ -461,6 +463,20 @@ def test_of_long_episodes_parts_are_planned_and_the_whole_is_checked(monkeypatch
     assert trial.steps == max(map(len, twin_of().episodes)) == 20
     lost = trial.hard((trial.mpc[0] + 1e3, trial.mpc[1]))  # every start of every member
     assert len(lost) == confirmation.HARDEST
+
+
+def test_a_fit_takes_the_way_of_most_plans_and_reaches_bounds() -> None:
+    layer = copy.deepcopy(model_of(networks="shared").policy.actor.mu)
+    rng = np.random.default_rng(0)
+    rows = rng.uniform(-1, 1, (600, problem().n_theta))
+    most = np.where(rng.random(600) < 0.7, 0.5, -0.5)  # their mean, .2, is what no plan does
+    wanted = np.where(rows[:, 0] > 0.5, 1.0, most)[:, None]
+    inputs = problem().deviations.u_min + problem().u_half * (1 + wanted)
+    fit_layer(layer, problem(), rows, inputs, rng, 1500)
+    with th.no_grad():
+        found = layer(th.as_tensor(rows)).numpy()[:, 0]
+    assert np.median(np.abs(found - 0.5)[rows[:, 0] < 0.3]) < 0.1
+    assert np.mean(found[rows[:, 0] > 0.6] == 1.0) > 0.9
 
 
 def test_a_twin_takes_no_steps_of_a_simulator() -> None:

@@ -7,9 +7,10 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, identify
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import alignment
+from sb3_yann.twin.log import Episode, records
 from sb3_yann_envs import cstr, problems
 from twin_samples import log, problem
 
@@ -126,6 +127,17 @@ def test_consecutive_pieces_of_a_record_are_tested_as_episodes() -> None:
     twin = fitted([(states[i : i + 61], u[i : i + 60]) for i in range(0, 600, 60)])
     assert twin.trusted
     assert "Every other one is independent: 5 of 10." in twin.report()
+
+
+def test_pieces_belong_to_one_record_where_a_set_point_changes_between_them() -> None:
+    tracking = LinearMPC(
+        mpc().model, Q=np.eye(2), R=np.eye(2), horizon=3, tracking=Tracking([0], [-1], [1]),
+        u_min=-1, u_max=1, theta_min=-4, theta_max=4,
+    )  # fmt: skip
+    theta = np.random.default_rng(0).normal(size=(3, 4, 3))
+    theta[1, 0, :2] = theta[0, -1, :2]
+    episodes = tuple(Episode(each, np.zeros((3, 2))) for each in theta)
+    assert records(tracking, episodes) == [range(2), range(2, 3)]
 
 
 @cache
