@@ -181,8 +181,9 @@ def test_theta_may_come_in_any_array_or_list(given) -> None:
 def test_without_a_compiler_the_law_is_the_same(tmp_path: Path) -> None:
     cart().save(tmp_path / "law.npz")
     program = (
-        "from test_walk import *; law = PiecewiseAffine.load(sys.argv[1])\n"
-        "points = around(law, 200, 1.5)\n"
+        "import sys, numpy as np; from sb3_yann.control import PiecewiseAffine\n"
+        "law = PiecewiseAffine.load(sys.argv[1])\n"
+        "points = np.random.default_rng(0).uniform(-7.5, 7.5, (200, 2))\n"
         "print(law(points).tobytes().hex(), law(points[0]).tobytes().hex())"
     )
     here = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
