@@ -282,6 +282,8 @@ class Log:
             should, or one that is longer than the header. An episode ends where a reading is
             missing, but for states that are read now and then, as a laboratory's: these stay NaN.
         """
+        disturbances = disturbances or ()
+        references = references or ()
         for name, given in (("states", states), ("inputs", inputs)):
             if isinstance(given, str) or not given:
                 raise ValueError(f"{name} = {given!r} must be a list of column names.")
@@ -418,7 +420,8 @@ def _column(path: object, name: str, header: Sequence[str]) -> str:
     """Return the column of this name, with or without its unit."""
     found = [each for each in header if name in (each, _name_and_unit(each)[0])]
     if not found:
-        raise ValueError(f"{path} has no column {name!r}; it has {list(header)}.")
+        hint = " Its delimiter seems to be another: pass delimiter=';'." * (";" in "".join(header))
+        raise ValueError(f"{path} has no column {name!r}; it has {list(header)}.{hint}")
     if len(found) > 1:
         raise ValueError(f"{path} has several columns {name!r}: give each its own name.")
     return found[0]
@@ -498,7 +501,7 @@ def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np
     if 2 * np.sum(np.abs(whole - dt) > 0.1 * dt) > len(whole):
         raise ValueError(
             f"dt = {dt:g}, but a step of the log takes {np.nanmedian(whole):g} (the median). Give "
-            "time and dt in the same unit."
+            'time and dt in the same unit; of time stamps dt is in seconds, or in time_unit="h".'
         )
     return [np.abs(each - dt) <= 0.1 * dt for each in spans]
 

@@ -22,6 +22,7 @@ from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers import SetPoint
 from sb3_yann.wrappers.theta import require_vector
 
+MOSTLY = 0.5  # share of the starts beyond a box that is no chance
 WRONG = 0.5
 """Share of the states' movement in a step that the model leaves open, at least, as they are shown.
 """
@@ -85,6 +86,21 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
                 f"a step, and {100 * max(1 - shown, 0):.0f} % as it is. {cure}"
             )
     return ""
+
+
+def warn_of_box(problem: LinearMPC, theta: Array) -> None:
+    """Warn of a state that reads beyond theta's box where episodes begin (starts, n_theta)."""
+    n = problem.model.n_states
+    low = problem.deviations.theta_min[:n]
+    high = problem.deviations.theta_max[:n]
+    share = np.mean((theta[:, :n] < low) | (theta[:, :n] > high), axis=0)
+    i = int(np.argmax(share))
+    if share[i] > MOSTLY:
+        warn(
+            f"{labels_of(problem.model)[0][i]} reads beyond theta's box, for which the MPC is "
+            f"made, where {share[i]:.0%} of the episodes begin: does the env show it in another "
+            "unit, or in another order? Else widen theta_min and theta_max."
+        )
 
 
 def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:

@@ -146,8 +146,8 @@ def _extrapolated(levels: Array, power: float, rounding: Array) -> tuple[Array, 
     return limits[best, rows], errors[best, rows]
 
 
-def notes_of(found: Jacobian, labels: list[str]) -> list[str]:
-    """Return notes on what has no effect, dropped entries and strong nonlinearity.
+def notes_of(found: Jacobian, labels: list[str], of: str = "the next state") -> list[str]:
+    """Return notes on what has no effect on values, dropped entries and strong nonlinearity.
 
     An input without effect is warned of as well.
     """
@@ -155,7 +155,7 @@ def notes_of(found: Jacobian, labels: list[str]) -> list[str]:
     idle = ~np.any(found.value, axis=0)
     if inputs := ", ".join(labels[i] for i in np.flatnonzero(idle) if labels[i][0] == "u"):
         notes.append(
-            f"{inputs} has no effect on the next state. With a delay or an actuator, make the "
+            f"{inputs} has no effect on {of}. With a delay or an actuator, make the "
             "inputs on their way part of the state; leave out an idle input."
         )
         warn(notes[0])
@@ -172,7 +172,7 @@ def notes_of(found: Jacobian, labels: list[str]) -> list[str]:
                 f"along {labels[i]}: {what}."
             )
         elif idle[i] and labels[i][0] != "u":
-            notes.append(f"{labels[i]} has no effect on the next state.")
+            notes.append(f"{labels[i]} has no effect on {of}.")
     return notes
 
 
@@ -515,7 +515,7 @@ def linearize_dynamics(
     A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
     A, B, E = zero_order_hold(A, B, E, dt)
     x, u, d = np.split(point, np.cumsum(sizes[:2]))
-    notes += notes_of(found, names(sizes))
+    notes += notes_of(found, names(sizes), "any slope")
     return LinearSystem(A, B, dt, x, u, E, d, tuple(notes))
 
 

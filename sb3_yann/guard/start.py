@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 
 from sb3_yann._validation import warn
-from sb3_yann.audit.meaning import warn_of_order, warn_of_signs
+from sb3_yann.audit.meaning import warn_of_box, warn_of_order, warn_of_signs
 from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, Scores, Starts
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundNames
@@ -127,6 +127,7 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
     before = np.concatenate([each[:-1] for each in thetas])
     after = np.concatenate([each[1:] for each in thetas])
     warn_of_order(policy.problem, before, np.concatenate(inputs), after)
+    warn_of_box(policy.problem, np.array([each[0] for each in thetas]))
     options = policy.critic_options
     rewards = np.concatenate(mpc.own_rewards)
     cost = policy.problem.deviations.stage_cost(before, np.concatenate(inputs))

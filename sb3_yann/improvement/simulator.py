@@ -20,6 +20,7 @@ from sb3_yann.audit.meaning import (
     below_set_points,
     in_deviations,
     require_theta_shown,
+    warn_of_box,
     warn_of_order,
     warn_of_own_reward,
     warn_of_signs,
@@ -178,6 +179,7 @@ class Simulator:
         if not checked:
             return played
         warn_of_order(problem, *played.steps())
+        warn_of_box(problem, np.array([each[0] for each, _ in played.pairs]))
         with self.envs.acquire(1) as (one,):
             warn_of_signs(problem, one, seeds, played)
         if not self.unaware:

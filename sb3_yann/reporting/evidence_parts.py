@@ -490,7 +490,10 @@ def cost_part(subject: Subject) -> Part:
     checked = policy.first_obs_checked
     policy.first_obs_checked = True  # no observation of the env
     rows = [
-        ["model.predict, one observation", *times(lambda: subject.model.predict(observation))],
+        [
+            "model.predict, one observation",
+            *times(lambda: subject.model.predict(observation, deterministic=True)),
+        ],
         ["the MPC's law, one theta", *times(lambda: law(theta))],
     ]
     policy.first_obs_checked = checked

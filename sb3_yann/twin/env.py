@@ -54,7 +54,8 @@ class Starts:
         half = (x.max(0) - x.min(0)) / 2 * _widened(k)
         low = np.maximum(middle - half, problem.deviations.theta_min[:n])
         high = np.minimum(middle + half, problem.deviations.theta_max[:n])
-        return cls(row, low, high, first, rows)
+        # Where all begin beyond theta's box, they begin there.
+        return cls(row, np.minimum(low, high), np.maximum(low, high), first, rows)
 
     @property
     def problem(self) -> LinearMPC:

@@ -18,7 +18,7 @@ from sb3_yann import (
     headroom,
     report,
 )
-from sb3_yann.audit.meaning import warn_of_order
+from sb3_yann.audit.meaning import warn_of_box, warn_of_order
 from sb3_yann.improvement.simulator import of_law
 from sb3_yann.rollout import rollout
 from sb3_yann.wrappers import StageCost
@@ -196,3 +196,12 @@ def test_headroom_tells_it_and_points_to_the_call() -> None:
         headroom(MPC, Shuffled([1, 0, 2]), n_starts=2)
     (order,) = [each for each in found if "in the order" in str(each.message)]
     assert order.filename == __file__
+
+
+def test_states_that_begin_beyond_the_box_are_named() -> None:
+    mpc = problems.cstr()
+    theta = np.zeros((10, mpc.n_theta))
+    warn_of_box(mpc, theta)  # a warning would be an error
+    theta[:6, 3] += 273.15
+    with pytest.warns(UserWarning, match=r"T reads beyond theta's box, .* 60% of .* another unit"):
+        warn_of_box(mpc, theta)
