@@ -126,7 +126,10 @@ class Improvement:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Where the last policy's change lies with 90 %: in the simulator, or on a twin's plant."""
+        """Where the last policy's change lies with 90 %: in the simulator, or on a twin's plant.
+
+        Infinite where no policy came so far that its change was estimated.
+        """
         known = [each.interval for each in self.checks if each.interval is not None]
         return known[-1] if known else (-np.inf, np.inf)
 
