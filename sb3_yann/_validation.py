@@ -23,7 +23,7 @@ class NonFiniteWarning(RuntimeWarning):
     """An observation, a reward, an action or a gradient is not a finite number."""
 
 
-LIBRARIES = frozenset(
+NOT_THE_USERS = frozenset(
     "sb3_yann sb3_yann_envs stable_baselines3 sb3_contrib gymnasium torch numpy joblib dataclasses "
     "contextlib functools".split()
 )
@@ -34,7 +34,7 @@ def warn(words: str, kind: type[Warning] = UserWarning) -> None:
     """Warn at the line of the user's that led here, however deep this is called."""
     frame = sys._getframe(1)
     level = 2
-    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in LIBRARIES:
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in NOT_THE_USERS:
         frame = frame.f_back
         level += 1
     warnings.warn(words, kind, stacklevel=level)

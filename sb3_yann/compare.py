@@ -123,6 +123,9 @@ class AcceptanceRule:
         return float(special.ndtri(1 - self.significance)) if self.cvar_alpha else 0.0
 
 
+RULE = AcceptanceRule()  # by which policies from a twin, a simulator or a plant are judged
+
+
 class Verdict(NamedTuple):
     """Whether a policy is no worse, and whether more starts would change that.
 
@@ -176,8 +179,9 @@ class Tolerance:
 
     ``margin`` is in units of cost: what a start may cost more; with a CVaR, what the worst of them
     may on average, the share ``cvar_alpha``. Then a start that costs the MPC more than ``typical``,
-    its median cost, may cost more in proportion, and none more than ``worst_start`` times as much
-    as the average may. ``excess_room`` is by how many half-widths an excess over the ``bounds`` may
+    its median cost, may cost more in proportion, and so may all where the policy has ``saved`` more
+    than that on average; none may cost ``worst_start`` times as much as the average may.
+    ``excess_room`` is by how many half-widths an excess over the ``bounds`` may
     be larger.
     """
 

@@ -28,6 +28,7 @@ from sb3_yann.commissioning.journal import (
 from sb3_yann.commissioning.plant import AcceptedPolicy, Inputs, Plant, PlantEpisode
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import (
+    RULE,
     Difference,
     allowed_excess,
     level_of_look,
@@ -42,7 +43,6 @@ from sb3_yann.control.mpc.bound_excess import (
 from sb3_yann.env_pool import Source, one_env
 from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
-from sb3_yann.improvement.imitation import RULE
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.compare import (
     LARGEST,
+    RULE,
     Difference,
     PairedTrial,
     Scores,
@@ -29,7 +30,7 @@ from sb3_yann.compare import (
     unsafe_columns,
 )
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
-from sb3_yann.improvement.imitation import RULE, Inputs, controller_of
+from sb3_yann.improvement.imitation import Inputs, controller_of
 from sb3_yann.improvement.simulator import Scenarios, Simulator, of_law
 from sb3_yann.rollout import Rows, Trajectories
 from sb3_yann.twin.dynamics import law_of

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
-from sb3_yann.compare import AcceptanceRule, Scores, less_safe, no_worse, relative_costs
+from sb3_yann.compare import RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
 from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
 from sb3_yann.networks import RowAdam
@@ -23,17 +23,16 @@ from sb3_yann.rollout import Controller, Rows
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.env import LearntModel
 
-RULE = AcceptanceRule()
-"""When a policy is no worse: as a guard has it."""
 Inputs = Callable[[Array], Array]
 BATCH = 512  # rows in a step of Adam
 RATE = 1e-2  # of Adam at first; it falls to zero
 NEARBY = 3  # states beside each of a plan that its feedback answers
 SPREAD = 0.1  # how far they are, in standard deviations of the states in the episodes
-LARGE = 0.1
+HUBER = 0.1
 """Errors of an action, in half-ranges, from which they count by their size rather than its square:
-where plans go one way or the other, their mean goes nowhere."""
-PATIENCE = 3  # fits in a row that may bring no better policy
+where plans go one way or the other, their mean goes nowhere. Labels on a bound lie as far beyond
+it, so that the slope does not vanish on the way."""
+VAIN_FITS = 3  # fits in a row that may bring no better policy
 FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
 HARDEST = 40  # scenarios that are planned anew after a fit
 NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
@@ -194,6 +193,7 @@ def imitate(
     """
     most = -np.inf
     promised = 0.0
+    since = 0
     best = copy.deepcopy(layer.state_dict())
     for fit in range(FITS):
         teacher.teach(layer, updates)
@@ -212,7 +212,7 @@ def imitate(
             promised = saved
             best = copy.deepcopy(layer.state_dict())
         done = saved >= (1 - NEAR) * teacher.gain and not objection
-        if done or fit == FITS - 1 or fit - since == PATIENCE:
+        if done or fit == FITS - 1 or fit - since == VAIN_FITS:
             break
         teacher.show(act, played)
     layer.load_state_dict(best)
@@ -235,8 +235,7 @@ def fit_layer(
     half = problem.u_half
     wanted = np.clip((inputs - low) / half - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
-    # The slope of the loss does not vanish on the way to a bound, and ends there.
-    wanted += LARGE * np.sign(wanted) * (np.abs(wanted) == 1)
+    wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
     to = th.as_tensor(wanted[finite], dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
@@ -245,7 +244,7 @@ def fit_layer(
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()
-        loss = th.nn.functional.smooth_l1_loss(layer(at[chosen]), to[chosen], beta=LARGE)
+        loss = th.nn.functional.smooth_l1_loss(layer(at[chosen]), to[chosen], beta=HUBER)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     optimizer.zero_grad()

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
+from sb3_yann.compare import RULE
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
 from sb3_yann.env_pool import Source, maker, name_of
@@ -33,7 +34,6 @@ from sb3_yann.improvement.confirmation import (
     confirm,
 )
 from sb3_yann.improvement.imitation import (
-    RULE,
     Teacher,
     controller_of,
     imitate,

@@ -18,14 +18,16 @@ from sb3_yann.twin.dynamics import Coordinates, Residual
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import Setting, basis, shrinkage_of
 
-WINDOWS = (5, 15, 60)  # steps of the windows: long ones begin where short ones have led
-ROUNDS = 15
-SETTLED = 1e-3  # a search is done when a correction saves less than this part of its errors
+SHOOTING_STEPS = (5, 15, 60)  # steps of the windows: long ones begin where short ones have led
+CORRECTIONS = 15  # of a search, at most
+LEAST_SAVED = 1e-3  # a search is done when a correction saves less than this part of its errors
 GUESS = 1e-5
 KNOWN = 1e-2
 """Weight of the given states where windows begin, beside the outputs'; of those that another fit
 found: what is hidden has the same coordinates then."""
-FAR = 3.0  # times the largest magnitude in the log: a residual goes no farther while it is fitted
+FARTHEST = (
+    3.0  # times the largest magnitude in the log: a residual goes no farther while it is fitted
+)
 Run = Callable[[Array, Array], tuple[Array, Array]]
 
 
@@ -41,13 +43,13 @@ def shoot(
     C = row.observer.C
     state = row.state
     units = coordinates.units
-    box = FAR * coordinates.scale
+    box = FARTHEST * coordinates.scale
     wide = replace(coordinates, low=-box, high=box)
     constant = row.problem.layout.has_constants
     price = sum(map(len, episodes)) * shrinkage_of(setting, row.problem, len(box))
     weights: Array = np.zeros((len(price), len(units)))
     found = [each.thetas[:, state] for each in episodes]
-    for steps in WINDOWS:
+    for steps in SHOOTING_STEPS:
         at = [np.arange(0, len(e), steps)[:, None] + np.arange(steps + 1) for e in episodes]
         every = [*zip(episodes, at, strict=True)]
         given = np.concatenate([e.thetas[np.minimum(i, len(e)), state] for e, i in every])
@@ -132,7 +134,7 @@ def _descended(
 
     damping = 1e-2
     cost, e, J = judged(weights, begin)
-    for _ in range(ROUNDS):
+    for _ in range(CORRECTIONS):
         of_begin = J[:, :, :n]
         of_weights = J[:, :, n:]
         own = of_begin.swapaxes(1, 2) @ of_begin + trust * np.eye(n)
@@ -161,6 +163,6 @@ def _descended(
         begin = start
         e, J = now
         damping = max(damping / 10, 1e-9)
-        if before - cost < SETTLED * before:
+        if before - cost < LEAST_SAVED * before:
             break
     return weights, begin

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 BLOCKS = 40  # pieces of a log of few episodes that its members are fitted to some of
 AHEAD = 20  # steps of the windows that networks are fitted to
-HIDDEN = Setting(1, 1e-4, 1.0), Setting(2, 1e-4, 1.0), Setting(2, 1e-6, 1.0)
+HIDDEN_SETTINGS = Setting(1, 1e-4, 1.0), Setting(2, 1e-4, 1.0), Setting(2, 1e-6, 1.0)
 """How the residuals of states that nothing shows are fitted, the least free first."""
 ROWS = 100
 LACKS = 0.01
@@ -315,7 +315,7 @@ class _Fit:
         residuals = self.residuals
         coordinates = Coordinates.of(problem, log, self.observer, hidden)
         if hidden:
-            log = tuple(shoot(coordinates, log, HIDDEN[-1], GUESS)[1])
+            log = tuple(shoot(coordinates, log, HIDDEN_SETTINGS[-1], GUESS)[1])
             box = Coordinates.of(problem, log, self.observer, hidden)
             coordinates = replace(coordinates, low=box.low, high=box.high, units=box.units)
         parts = pieces(log, FOLDS)
@@ -327,7 +327,7 @@ class _Fit:
         # The model as it is comes first, to compare with, whether it may be chosen or not.
         choices = candidates(coordinates, parts, residuals if not hidden else ())
         if hidden:
-            for each in (each for each in HIDDEN if each.kind in residuals):
+            for each in (each for each in HIDDEN_SETTINGS if each.kind in residuals):
                 by_fold = [shoot(coordinates, fold, each)[0] for fold in kept]
                 choices.append(Candidate(str(each), tuple(by_fold), each))
         first = int("none" not in residuals and len(residuals) > 0)

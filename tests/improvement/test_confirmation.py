@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann.compare import UNSAFE, unsafe_columns
+from sb3_yann.compare import RULE, UNSAFE, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundExcess
 from sb3_yann.improvement.confirmation import ENOUGH, LOOKS, SimulatorTrial, confirm
-from sb3_yann.improvement.imitation import RULE
 from twin_samples import problem
 
 

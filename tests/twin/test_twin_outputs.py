@@ -167,9 +167,9 @@ def test_a_policy_from_outputs_alone_is_no_worse_on_the_plant(hidden: Any) -> No
     """Plans are made in a model of the estimates, and checked as any other from a log."""
     found = improve(MPC, hidden, rounds=1, n_starts=6, updates=300)
     assert found.where == "the twin" and not found.steps
-    if found.accepted:
-        costs = np.array([[cost(act, k) for k in range(900, 910)] for act in (law, learnt(found))])
-        assert costs[1].mean() <= costs[0].mean()
+    assert found.checks  # a candidate was taught and judged
+    before, after = ([cost(act, k) for k in range(900, 910)] for act in (law, learnt(found)))
+    assert np.mean(after) <= (1 + 1e-6) * np.mean(before)
 
 
 def learnt(found: Any) -> Any:
