@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 DIGEST = "digest"
-MOST = 2**32
+MAX_SIZE = 2**32
 """Bytes of a file. What is larger is refused: a reader holds all of it in memory."""
 
 
@@ -63,8 +63,10 @@ def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
     larger than what is read.
     """
     size = sum(np.asarray(each).nbytes for each in arrays.values())
-    if size > 0.99 * MOST:
-        raise ValueError(f"{fspath(path)} would hold {size} bytes, more than {MOST} are not read.")
+    if size > 0.99 * MAX_SIZE:
+        raise ValueError(
+            f"{fspath(path)} would hold {size} bytes, more than {MAX_SIZE} are not read."
+        )
     with atomic_write(path) as part, part.open("wb") as file:
         np.savez(file, **{**arrays, DIGEST: digest_of(arrays)})
 
@@ -78,8 +80,8 @@ def read_arrays(path: str | PathLike[str]) -> dict[str, Any]:
     found = os.stat(path)
     if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
         raise ValueError("it is no file but a device or a pipe")
-    if found.st_size > MOST:
-        raise ValueError(f"it has {found.st_size} bytes, more than {MOST} are not read")
+    if found.st_size > MAX_SIZE:
+        raise ValueError(f"it has {found.st_size} bytes, more than {MAX_SIZE} are not read")
     with open(path, "rb") as file:
         content = file.read(found.st_size)
     if not zipfile.is_zipfile(BytesIO(content)):

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from sb3_yann._progress import is_watched
 
 Integers = NDArray[np.int64]
-Single = NDArray[np.float32]
 F = TypeVar("F", bound=Callable[..., Any])
 
 

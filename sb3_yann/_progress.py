@@ -16,7 +16,7 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from sb3_yann._validation import check_bool
 
 DELAY = 3.0  # seconds that pass without a word
-APART = 30.0  # seconds between two states of bars in a file
+FILE_INTERVAL = 30.0  # seconds between two states of bars in a file
 
 _silent = ContextVar("silent", default="TQDM_DISABLE" in os.environ)
 _parts = ContextVar("parts", default=False)
@@ -59,12 +59,12 @@ class _Lines:
     """A file in which bars leave their state, a line every thirty seconds."""
 
     def __init__(self) -> None:
-        self.latest = -APART
+        self.latest = -FILE_INTERVAL
 
     def write(self, text: str) -> None:
         """Write what a bar shows, unless there was a line of late."""
         now = time.monotonic()
-        if text.strip() and now >= self.latest + APART:
+        if text.strip() and now >= self.latest + FILE_INTERVAL:
             self.latest = now
             print(text.strip(), file=sys.stderr)
 

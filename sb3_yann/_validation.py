@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
 from unicodedata import category
@@ -13,6 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Given = ArrayLike | None
+Bounds = tuple[Array, Array]  # low, high
+Feedback = Callable[[Array], Array]  # thetas (batch, n_theta) -> inputs (batch, m)
 Options = TypeVar("Options")
 Kind = TypeVar("Kind")
 LARGEST_BOUND = 1e100

@@ -28,7 +28,7 @@ UNSAFE = (
 """What the first columns of ``unsafe`` are; the others are what it takes to compare them."""
 ENDED = 1
 INPUT_STEP = 3
-LARGEST = 4
+LARGEST_EXCESS = 4
 ANY_BOUND = 6
 MISSING = 7
 WORST = 8
@@ -43,7 +43,7 @@ COST_ROUNDING = 1e-6
 WORST_START = 10.0  # with a CVaR: how many times as much as on average a single start may cost more
 FEW_PAIRS = 12
 """Pairs that a drift can line up by the order that is drawn, which no standard error shows."""
-HARDEST = 10  # new starts that join those of every later candidate at a time
+MAX_NEW_HARD = 10  # new starts that join those of every later candidate at a time
 TOO_LITTLE = "too little a gain"
 
 
@@ -204,7 +204,7 @@ class Tolerance:
             allowed = allowed_excess(mpc.unsafe[episode, ANY_BOUND], self.excess_room)
             if row[ANY_BOUND] <= allowed:
                 return ""
-        return self.bounds.in_words(row[WORST], row[LARGEST] or row[ANY_BOUND])
+        return self.bounds.in_words(row[WORST], row[LARGEST_EXCESS] or row[ANY_BOUND])
 
     def allowed(self, mpc_costs: Array) -> Array:
         """Return what each start may cost more, rounding at least."""
@@ -412,7 +412,7 @@ class Starts:
         less = less_safe(policy.unsafe, mpc.unsafe, self.tolerance.excess_room).any(axis=1)
         order = np.argsort(np.where(less, -np.inf, -excess), kind="stable")
         count = self.lost(policy).sum() or np.count_nonzero(excess > 0)
-        return order[: min(HARDEST, count)]
+        return order[: min(MAX_NEW_HARD, count)]
 
 
 @dataclass

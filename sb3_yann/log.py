@@ -353,7 +353,7 @@ SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
 """In a unit of time."""
 
 
-RARE = 2 / 3
+OFTEN_READ = 2 / 3
 """Share of the samples below which isolated readings make a state one that is read now and then."""
 
 
@@ -363,7 +363,7 @@ def _read_now_and_then(records: Sequence[Episode]) -> NDArray[np.bool_]:
     # A reading whose sample before has none begins a run; records count as one.
     runs = np.sum(read[1:] > read[:-1], axis=0) + read[0]
     count = np.sum(read, axis=0)
-    return np.asarray((0 < count) & (count < RARE * len(read)) & (runs > count / 2))
+    return np.asarray((0 < count) & (count < OFTEN_READ * len(read)) & (runs > count / 2))
 
 
 def _cut(

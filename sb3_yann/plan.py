@@ -18,20 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, Feedback, Mask
 from sb3_yann.control import LinearMPC, lqr
 from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond, mixed_half
 from sb3_yann.control.mpc.problem import Value
 from sb3_yann.rollout import Rows
 from sb3_yann.twin.dynamics import Dynamics, law_of
 
-Mask = NDArray[np.bool_]
 Policy = Callable[[int, Array], Array]  # step and thetas (k, n_theta) -> inputs (k, m)
 
 SIZES = (1.0, 0.5, 0.2, 0.05)  # parts of a correction that are tried, the first first
 SETTLED = 1e-5  # A start is done when a correction saves less than this part of its cost
 # corrections at most; after how many the best of several guesses goes on
-ROUNDS = 40
+SWEEPS = 40
 RACE = 4
 SOFT = 1e-2  # bounds count so much less at first: stiff ones would end a search where it meets them
 DAMPED = 10.0
@@ -46,7 +45,6 @@ WEIGHTS = 0.1, 10.0  # factors of weights of the MPC, for laws that are tried in
 CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
 PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new one
-Law = Callable[[Array], Array]
 
 
 class TwinPlant:
@@ -268,14 +266,14 @@ def planned(
         thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
         gains = np.zeros((*inputs.shape, starts.shape[1]))
         first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs), turn)
-        found.append(improved(plant, soft, first, rows, RACE if len(policies) > 1 else ROUNDS))
+        found.append(improved(plant, soft, first, rows, RACE if len(policies) > 1 else SWEEPS))
     best = np.argmin([each.costs for each in found], axis=0)
     names = "thetas", "inputs", "gains"
     kept = {k: np.stack([getattr(each, k) for each in found], 1)[:, best, every] for k in names}
     costs = np.array([each.costs for each in found])[best, every]
-    plans = improved(plant, soft, Plans(**kept, costs=costs, turn=turn), rows, ROUNDS)
+    plans = improved(plant, soft, Plans(**kept, costs=costs, turn=turn), rows, SWEEPS)
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
-    plans = improved(plant, task, hard, rows, ROUNDS)
+    plans = improved(plant, task, hard, rows, SWEEPS)
     # The last search may have been damped, and its feedback with it.
     _, gains = _backward(plant, task, plans, rows, np.zeros(len(rows)))
     return dataclasses.replace(plans, gains=gains)
@@ -453,7 +451,7 @@ def initial_guesses(
     return [*first, lambda t, theta: best[t]] if cheaper.any() else first
 
 
-def _pushed(u: Array, until: int, law: Law) -> Policy:
+def _pushed(u: Array, until: int, law: Feedback) -> Policy:
     """Return a policy with inputs u (m,) for some steps, those of a law after them."""
     return lambda t, theta: np.tile(u, (len(theta), 1)) if t < until else law(theta)
 
@@ -500,7 +498,7 @@ class Planning:
         steps: int,
         pause: int = 0,
         room: float = np.inf,
-        law: Law | None = None,
+        law: Feedback | None = None,
     ) -> None:
         self.plant = plant
         self.task = task

@@ -17,7 +17,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 
 Space = Callable[..., dict[str, Any]]
 WIDTHS = {"small": [8, 8], "paper": [16, 16], "large": [32, 32], "largest": [64, 64]}
-POLICY = "actor_lr_mult", "critic_warmup", "networks"
+POLICY_OPTIONS = "actor_lr_mult", "critic_warmup", "networks"
 """Those of the parameters that are the policy's."""
 
 _entry: ContextVar[Mapping[str, Any] | None] = ContextVar("entry", default=None)
@@ -56,7 +56,7 @@ def convert(params: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of such a model for the parameters of a trial, as a study keeps them."""
     found = dict(params)
     widths = {"pi": WIDTHS[found.pop("widths")], "qf": WIDTHS[found.pop("critic_widths")]}
-    policy_kwargs = {name: found.pop(name) for name in POLICY if name in found}
+    policy_kwargs = {name: found.pop(name) for name in POLICY_OPTIONS if name in found}
     return {**found, "policy_kwargs": {**policy_kwargs, "net_arch": widths}}
 
 

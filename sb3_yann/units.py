@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
 
+FLOAT32_ROUNDING = 1e-6
+"""Half-widths, or a relative difference, that float32 observations and actions make."""
+
 
 @dataclass(frozen=True, eq=False)
 class Units(ReadOnlyArrays):

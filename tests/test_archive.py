@@ -137,7 +137,7 @@ def test_other_numbers_under_the_old_digest_are_refused(path: Path) -> None:
 def test_files_that_are_too_large_are_neither_written_nor_read(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_archive, "MOST", 100)
+    monkeypatch.setattr(_archive, "MAX_SIZE", 100)
     with pytest.raises(ValueError, match="100 are not read"):
         read_arrays(path)
     with pytest.raises(ValueError, match="100 are not read"):

@@ -130,7 +130,7 @@ def test_the_examples_of_a_docstring_run(example: doctest.DocTest, monkeypatch, 
         if example.name.startswith(f"{module}.") and importlib.util.find_spec(library) is None:
             pytest.skip(f"{library} is not installed")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(plant_twin, "ROWS", 10**9)  # a fit of networks takes seconds
+    monkeypatch.setattr(plant_twin, "LONG_LOG", 10**9)  # a fit of networks takes seconds
     quickest(monkeypatch)
     found = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example)
     assert found.attempted and not found.failed, "\n" + (example.docstring or "")

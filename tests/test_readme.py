@@ -90,7 +90,7 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, quick_fits) -> None:
 @pytest.fixture
 def quick_fits(monkeypatch) -> None:
     """Let twins be of polynomials, and improvements short."""
-    monkeypatch.setattr(plant_twin, "ROWS", 10**9)
+    monkeypatch.setattr(plant_twin, "LONG_LOG", 10**9)
     quickest(monkeypatch)
 
 

@@ -214,7 +214,7 @@ def test_an_operators_output_has_the_shape_of_the_inputs(tmp_path) -> None:
 
 
 def test_a_plants_episode_that_never_ends_is_an_error(monkeypatch) -> None:
-    monkeypatch.setattr("sb3_yann.commissioning.plant.LONGEST", 20)
+    monkeypatch.setattr("sb3_yann.commissioning.plant.ENDLESS", 20)
     env = Endless(scalar_mpc())
     plant = Plant(env, DDPG("YannPolicy", env, policy_kwargs={"problem": scalar_mpc()}))
     with pytest.raises(RuntimeError, match="An episode of the plant did not end in 20 steps"):

@@ -11,9 +11,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from sb3_yann._validation import Array, warn
+from sb3_yann._validation import Array, Mask, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.wrapper_stack import require_state_shown
@@ -42,7 +41,6 @@ Reading = tuple[Array, Array]
 SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
 LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
-Mask = NDArray[np.bool_]
 EXPLAINED_REWARD = 0.95
 """Share of the rewards' variance from which on they are taken for minus the stage cost."""
 FEWEST_REWARDS = 10  # steps that must be seen

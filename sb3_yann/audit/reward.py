@@ -22,7 +22,7 @@ EXACT = 1e-5
 """What rounding to float32 leaves of an agreement, relative to the spread of the rewards."""
 MIN_STEPS = 10  # steps that must be compared
 
-_NAMES = ("observation", "following", "action", "reward", "counted")
+_RECORDED = ("observation", "following", "action", "reward", "counted")
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class CostAudit(BaseCallback):
             )
 
     def _judge(self) -> None:
-        records = {name: np.array([each[name] for each in self._records]) for name in _NAMES}
+        records = {name: np.array([each[name] for each in self._records]) for name in _RECORDED}
         shown = records["observation"], records["following"]
         finite = np.isfinite(records["reward"])
         for each in shown:

@@ -15,9 +15,9 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._progress import bar, shown
-from sb3_yann._validation import Array, check_bool, check_int, check_range
+from sb3_yann._validation import Array, Feedback, check_bool, check_int, check_range
 from sb3_yann.commissioning.journal import (
-    MPC,
+    ACCEPTED_MPC,
     Accepted,
     Batch,
     CommissioningState,
@@ -25,7 +25,7 @@ from sb3_yann.commissioning.journal import (
     Record,
     Verdict,
 )
-from sb3_yann.commissioning.plant import AcceptedPolicy, Inputs, Plant, PlantEpisode
+from sb3_yann.commissioning.plant import AcceptedPolicy, Plant, PlantEpisode
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import (
     RULE,
@@ -253,7 +253,7 @@ class Commissioning:
         first = plant.begin(self.seed + len(journal.episodes) - again)
         journal.begin(acts)
         try:
-            act: Inputs = plant.policy if acts else plant.mpc
+            act: Feedback = plant.policy if acts else plant.mpc
             if excites:
                 act = plant.excited_mpc(self.seed + len(journal.episodes), self.excite)
             limit = float(allowed_excess(excess_of_mpc(journal, plant.problem).largest.max()))
@@ -302,7 +302,7 @@ class Commissioning:
                 state = replace(state, acting=acting, since=number)
             elif verdict != "stays":
                 self.accepted.keep(False)
-                state = replace(state, acting=MPC, kept=MPC, since=0)
+                state = replace(state, acting=ACCEPTED_MPC, kept=ACCEPTED_MPC, since=0)
             self.accepted.limit(state.max_correction)
             shown = costs.actual, costs.predicted, costs.mpc
             sizes = number, len(journal.batch), alarms
@@ -610,7 +610,7 @@ def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode], own_reward: boo
     return np.asarray(stage + soft.penalty)
 
 
-def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inputs) -> Array:
+def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Feedback) -> Array:
     """Return what a policy would have cost from each episode's start, by the members' mean.
 
     References and measured disturbances are those of the episodes.

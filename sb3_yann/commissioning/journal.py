@@ -191,7 +191,7 @@ class Accepted(NamedTuple):
     bound: float = 0.0
 
 
-MPC = Accepted()
+ACCEPTED_MPC = Accepted()
 
 
 @dataclass(frozen=True)
@@ -205,8 +205,8 @@ class CommissioningState:
     """
 
     max_correction: float
-    acting: Accepted = MPC
-    kept: Accepted = MPC
+    acting: Accepted = ACCEPTED_MPC
+    kept: Accepted = ACCEPTED_MPC
     first: int = 0
     anew: int = 0
     twin: list[int] | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
@@ -14,7 +14,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array, warn
+from sb3_yann._validation import Array, Feedback, warn
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
@@ -33,8 +33,7 @@ from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.rollout import limit_of, preserve_rng
 from sb3_yann.twin.dynamics import law_of
 
-Inputs = Callable[[Array], Array]
-LONGEST = 1_000_000  # steps after which an episode is taken for one that never ends
+ENDLESS = 1_000_000  # steps after which an episode is taken for one that never ends
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ class Plant:
         """Return the MPC's inputs (rows, m)."""
         return self.law(theta)
 
-    def excited_mpc(self, seed: int, share: float) -> Inputs:
+    def excited_mpc(self, seed: int, share: float) -> Feedback:
         """Return the MPC of one episode, moved at random by a share of the range at most."""
         moved = Excited(self.problem, seed, 2 * share)
         steps = count()
@@ -137,7 +136,7 @@ class Plant:
     def play(
         self,
         known: Array,
-        act: Inputs,
+        act: Feedback,
         watchdog: Watchdog | None,
         allowed: float = np.inf,
     ) -> PlantEpisode:
@@ -194,8 +193,8 @@ class Plant:
             passed.update()
             thetas.append(known)
             actions.append(u.astype(np.float64))
-            if len(actions) >= LONGEST:
-                raise RuntimeError(f"An episode of the plant did not end in {LONGEST} steps.")
+            if len(actions) >= ENDLESS:
+                raise RuntimeError(f"An episode of the plant did not end in {ENDLESS} steps.")
         passed.close()
         played = np.array(thetas), np.array(actions)
         return PlantEpisode(*played, reward, violations, alarm, step, apart, excited)

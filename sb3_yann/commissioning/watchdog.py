@@ -8,27 +8,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_array
+from sb3_yann.control.identification.residuals import FOLDS
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.log import pieces
 from sb3_yann.twin.plant_twin import PlantTwin
-from sb3_yann.twin.selection import FOLDS
 
-GAINS = np.array([1.0, 0.2, 0.05, 0.02])
+CHART_GAINS = np.array([1.0, 0.2, 0.05, 0.02])
 """Of the charts: one without a memory, others with one of 5, 20 and 50 samples."""
 FACTOR = 2.0
 FACTOR_OF_FEW = 7.5
 """A band is so many times the largest held-out ratio: 2 + 7.5 / episodes."""
 LEAST_RATIO = 0.5
 """The largest ratio is taken to be at least this, however well the log is predicted."""
-LEAST = 0.1
+LEAST_ERROR = 0.1
 """The residual is taken to be at least so large, in standard deviations of one-step errors."""
 NORMAL_MEDIAN = 0.6745
 """Median of what is normally distributed, without its sign, in standard deviations."""
-NOISY = 0.3
+NOISE_CORRELATION = 0.3
 """Correlation of successive errors below which they are noise; those of a model change slowly."""
 FROZEN = 3  # repeats of a reading from which on it may be frozen
-MOVED = 3.0
+PREDICTED_MOVE = 3.0
 """Standard deviations that the twin's prediction moves in a sample while a reading stands."""
 
 
@@ -83,12 +83,12 @@ class _Charts:
     """Exponentially weighted averages of innovations, and of what is not known (Roberts 1959)."""
 
     def __init__(self, n: int) -> None:
-        self.means, self.doubts = np.zeros((2, len(GAINS), n))
+        self.means, self.doubts = np.zeros((2, len(CHART_GAINS), n))
 
     def take(self, innovation: Array, doubt: Array) -> None:
         """Take in those of a sample, (n,) each."""
-        self.means += GAINS[:, None] * (innovation - self.means)
-        self.doubts += GAINS[:, None] * (doubt - self.doubts)
+        self.means += CHART_GAINS[:, None] * (innovation - self.means)
+        self.doubts += CHART_GAINS[:, None] * (doubt - self.doubts)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Bands:
         lag = products / np.maximum(squares, 1e-300)
         error = np.maximum(np.sqrt(squares / sum(map(len, left))), 1e-9 * units)
         explained = [twin.dynamics.residual(e.thetas[None, :-1], e.actions[None])[0] for e in log]
-        size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST * error) ** 2)
+        size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST_ERROR * error) ** 2)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log])
         known = PredictiveVariance(unseen, seen.min(axis=0), seen.max(axis=0), size)
         means = []
@@ -148,7 +148,7 @@ class Bands:
         repeats = np.max([_repeats(e.thetas[:, row.state]) for e in twin.episodes], axis=0)
         factor = FACTOR + FACTOR_OF_FEW / len(twin.episodes)
         most = np.maximum(most, LEAST_RATIO)
-        return cls(known, error, spread, most, lag < NOISY, repeats, factor)
+        return cls(known, error, spread, most, lag < NOISE_CORRELATION, repeats, factor)
 
     def ratios(self, charts: _Charts) -> Array:
         """Return charts (gains, n) in units of their bands: beyond 1 something is wrong."""
@@ -305,7 +305,7 @@ class Watchdog:
         bands = self.bands
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
         unsure = np.hypot(bands.error, self._charts.doubts[0])  # what is not familiar counts
-        moving = np.abs(self._moved) > MOVED * stands * unsure
+        moving = np.abs(self._moved) > PREDICTED_MOVE * stands * unsure
         problem = self.dynamics.problem
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             name = problem.model.state_names
@@ -324,7 +324,7 @@ class Watchdog:
         gain, i = np.unravel_index(int(np.argmax(at_once)), at_once.shape)
         name = labels_of(self.dynamics.problem.model)[0][int(i)]
         said = f"{name} is off the twin's prediction by {self._charts.means[gain, i]:.3g}"
-        if GAINS[gain] < 1.0:
-            said += f" on an average of {1 / GAINS[gain]:.0f} samples"
-        kind = "outside the band" if GAINS[gain] == 1.0 else "drift"
+        if CHART_GAINS[gain] < 1.0:
+            said += f" on an average of {1 / CHART_GAINS[gain]:.0f} samples"
+        kind = "outside the band" if CHART_GAINS[gain] == 1.0 else "drift"
         return kind, f"{said}, {ratios[gain, i]:.3g} bands"

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 T = TypeVar("T")
-INFEASIBLE = ("nearest_region", "zero_input")
+INFEASIBLE_OPTIONS = ("nearest_region", "zero_input")
 
 
 class PlantLaw(ReadOnlyArrays):
@@ -297,7 +297,7 @@ class PiecewiseAffine(PlantLaw):
         values = {"gains": gains, "A": A, "b": check_array("b", self.b, (len(A),))}
         values["offsets"] = check_array("offsets", self.offsets, (p, m))
         values |= bounds_of(self, m, n)
-        check_choice("infeasible", self.infeasible, INFEASIBLE)
+        check_choice("infeasible", self.infeasible, INFEASIBLE_OPTIONS)
         check_bool("disjoint", self.disjoint)
         rows = check_array("starts", self.starts, (p,))
         if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):

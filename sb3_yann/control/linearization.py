@@ -21,7 +21,7 @@ from sb3_yann._validation import (
 from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.lqr import unreached
 from sb3_yann.control.simulator import (
-    MOST,
+    MAX_NOISE,
     Simulator,
     borrow,
     connect,
@@ -228,7 +228,7 @@ def _least_moved(
 
 MOVED = 1e-3  # largest residual of a given steady state in one step, relative to the scale
 AWAY = 1e-2  # largest distance to the linear model's steady state, relative to the scale
-SOLVED = 1e-6  # largest residual of a steady state that was solved for
+STEADY_RESIDUAL = 1e-6  # largest residual of a steady state that was solved for
 NOTHING = 1e-9  # a solved entry that is smaller, relative to its scale, is zero
 SETTLES = 2_000  # steps in which a plant may come to rest by itself
 SEARCH_STEP = 1e-3  # in scales, as a float32 state needs: SciPy's own would vanish in its rounding
@@ -261,24 +261,24 @@ def _steady_state(
         return _least_moved(motion, start, free, scale, SEARCH_STEP, (low, high))
 
     point, most = search(start)
-    if most > SOLVED and np.all(free[:n]) and not np.any(free[n:]):
+    if most > STEADY_RESIDUAL and np.all(free[:n]) and not np.any(free[n:]):
         # A search may run away from where the plant comes to rest by itself.
         settled = start.copy()
         for _ in range(SETTLES):
             left = motion(settled)
-            if not SOLVED < np.max(np.abs(left)) < np.inf:
+            if not STEADY_RESIDUAL < np.max(np.abs(left)) < np.inf:
                 break
             settled[:n] += left * scale[:n]
         other, most_of_other = search(settled)
-        if most_of_other <= SOLVED:
+        if most_of_other <= STEADY_RESIDUAL:
             point = other
             most = most_of_other
-    if most > SOLVED:
+    if most > STEADY_RESIDUAL:
         # What is left of the motion may be no more than the simulator's own error.
         left = motion(point)
         noise = noise_of(simulator.step, point, np.where(np.arange(scale.size) < n, scale, 0.0))
         noise /= scale[:n]
-        if not (np.all(np.abs(left) <= SOLVED + 5 * noise) and np.all(noise <= MOST)):
+        if not (np.all(np.abs(left) <= STEADY_RESIDUAL + 5 * noise) and np.all(noise <= MAX_NOISE)):
             at_bound = [
                 f"u[{i - n}] is at its {side} bound, {bound[i]:g}"
                 for side, bound in (("lower", low), ("upper", high))
@@ -312,7 +312,7 @@ def _require_steady_state(moved: Array, point: Array, slopes: Array, scale: Arra
 
 
 LONGEST_EPISODE = 400  # steps after which an episode counts as one without an end of its own
-SECONDS = 1.0  # after which a slow one does
+EPISODE_SECONDS = 1.0  # after which a slow one does
 
 
 def _time_limit_fault(env: Any, action: Array) -> str:
@@ -342,17 +342,17 @@ def _termination(env: Any, seed: int, action: Array) -> int:
     begun = perf_counter()
     for step in range(1, LONGEST_EPISODE + 1):
         _, _, terminated, truncated, _ = env.step(action.astype(env.action_space.dtype))
-        if terminated or truncated or perf_counter() - begun > SECONDS:
+        if terminated or truncated or perf_counter() - begun > EPISODE_SECONDS:
             return step if terminated else 0
     return 0
 
 
-LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
+LONGEST_STEP = 0.01  # longest step of a difference, relative to the scale of its coordinate
 LONGEST_SINGLE = 0.05  # the same where states are read in float32
 LONGEST_NOISY = 0.2  # the same where an adaptive integrator leaves noise
 # from where on noise counts: beside rounding, and in scales
 NOISY = 10.0
-LEAST = 1e-10
+LEAST_NOISE = 1e-10
 
 
 def linearize_env(
@@ -454,14 +454,14 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Ja
 
     # What is read may be float32: then every number read is one, and steps have to be longer.
     of_states = np.where(np.arange(scale.size) < n, scale, 0.0)
-    readings = np.array([simulator.step(point + k * LONGEST / 3 * of_states) for k in (0, 1)])
+    readings = np.array([simulator.step(point + k * LONGEST_STEP / 3 * of_states) for k in (0, 1)])
     single = np.array_equal(readings, readings.astype(np.float32), equal_nan=True)
-    longest = (LONGEST_SINGLE if single else LONGEST) * scale
+    longest = (LONGEST_SINGLE if single else LONGEST_STEP) * scale
     spacing = np.finfo(np.float32 if single else np.float64).eps
     rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
     noise = noise_of(lambda z: simulator.step(actual(z)), point, of_states)
-    noise[noise <= np.maximum(NOISY * rounding, LEAST * scale[:n])] = 0.0
-    if np.any(noise > MOST * scale[:n]):
+    noise[noise <= np.maximum(NOISY * rounding, LEAST_NOISE * scale[:n])] = 0.0
+    if np.any(noise > MAX_NOISE * scale[:n]):
         noise[:] = 0.0  # no noise that differences could cope with
     rough = float(np.max(noise / scale[:n]))
     longest = np.maximum(longest, np.minimum(1e6 * rough, LONGEST_NOISY) * scale)
@@ -511,7 +511,7 @@ def linearize_dynamics(
     check_array(f"f({', '.join(f'{name}_ss' for name in labels)})", rate(point), (x.size,))
     _require_steady(rate, np.split(point, ends), size[: x.size], dt, scale is not None)
     rounding = np.finfo(float).eps * np.maximum(np.abs(point), size)[: x.size] / dt
-    found = jacobian(rate, point, LONGEST * size, rounding, names(sizes))
+    found = jacobian(rate, point, LONGEST_STEP * size, rounding, names(sizes))
     A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
     A, B, E = zero_order_hold(A, B, E, dt)
     x, u, d = np.split(point, np.cumsum(sizes[:2]))

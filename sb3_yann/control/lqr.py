@@ -12,7 +12,7 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import LinearSystem
 
-ON_CIRCLE = 1e-3
+NEAR_CIRCLE = 1e-3
 """Distance from the unit circle at which rounding may put the poles of a chain of integrators."""
 
 
@@ -113,7 +113,7 @@ def _why_no_solution(A: Array, B: Array) -> str:
             "sqrt(gamma) A. Remove the mode from the model, add an input, lower gamma, or take "
             "another steady state: model.report() names those that were found."
         )
-    if np.any(np.abs(np.abs(np.linalg.eigvals(A)) - 1) < ON_CIRCLE):
+    if np.any(np.abs(np.abs(np.linalg.eigvals(A)) - 1) < NEAR_CIRCLE):
         return (
             "The Riccati equation has no stabilizing solution: a mode on the unit circle carries "
             "no weight in Q. Give it a positive weight, use gamma < 1, or pass a Terminal(cost)."

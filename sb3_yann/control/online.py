@@ -21,7 +21,7 @@ from sb3_yann.control.explicit.parametric_qp import (
     moderated,
     slack_costs,
 )
-from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine, PlantLaw, as_points, bounds_of
+from sb3_yann.control.law import INFEASIBLE_OPTIONS, PiecewiseAffine, PlantLaw, as_points, bounds_of
 
 if TYPE_CHECKING:
     from sb3_yann._numba import Integers
@@ -108,7 +108,7 @@ class OnlineLaw(PlantLaw):
             "S": check_array("S", self.S, (len(G), n)),
             **bounds_of(self, m, n),
         }
-        check_choice("infeasible", self.infeasible, INFEASIBLE)
+        check_choice("infeasible", self.infeasible, INFEASIBLE_OPTIONS)
         slacks = check_int("n_slacks", self.n_slacks, 0)
         check_int("n_input_rows", self.n_input_rows, 0)
         if m == 0 or (v - slacks) % m or v == slacks:
@@ -233,7 +233,7 @@ class OnlineLaw(PlantLaw):
         feasible = found.status == kernels.SOLVED
         if feasible.all() and not len(self.dual.fixed[1]):
             return u, feasible, found, None  # mostly: the rest takes microseconds
-        for i in np.flatnonzero(found.status == kernels.UNKNOWN):
+        for i in np.flatnonzero(found.status == kernels.UNCERTIFIED):
             feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
         feasible &= self.dual.meets_fixed(rows)
         softened = None

@@ -111,9 +111,9 @@ def equal_rows(A: Array, slack: Array, radius: float) -> NDArray[np.bool_]:
 
     ``slack`` (q,) is their distance from a point inside.
     """
-    from sb3_yann.control._kernels.polyhedra import NOISE, SAME
+    from sb3_yann.control._kernels.polyhedra import SAME, SLACK_ROUNDING
 
-    near = np.abs(slack[:, None] - slack) <= SAME * radius + NOISE
+    near = np.abs(slack[:, None] - slack) <= SAME * radius + SLACK_ROUNDING
     # Most pairs differ in their distance.
     first, second = np.nonzero(near)
     near[first, second] = np.abs(A[first] - A[second]).max(axis=1) <= SAME

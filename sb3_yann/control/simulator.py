@@ -246,7 +246,7 @@ POINTS = 10
 ORDER = 6
 """Points on a line, and the order of the differences that leave nothing of a smooth function."""
 UNLIKE = 4.0  # ratio of what two spacings show from which it is a kink rather than noise
-MOST = 1e-3  # largest noise, relative to the scale, that differences can cope with
+MAX_NOISE = 1e-3  # largest noise, relative to the scale, that differences can cope with
 
 
 def noise_of(f: Callable[[Array], Array], point: Array, scale: Array) -> Array:
@@ -270,8 +270,8 @@ def noise_of(f: Callable[[Array], Array], point: Array, scale: Array) -> Array:
 
 
 LONGEST_DELAY = 20  # longest input delay, in samples, that is detected
-HIDDEN = "the plant has states besides these, which setting this one"
-ADVICE = (
+UNSEEN = "the plant has states besides these, which setting this one"
+SET_STATE_ADVICE = (
     "Make them part of the state (of a delay, the inputs on their way), have set_state set them "
     "too, or identify the plant: LinearModel.from_data"
 )
@@ -364,8 +364,8 @@ def _hidden_state(simulator: Simulator, x: Array, u: Array, first: Array, scale:
     if np.any(np.abs(again - first) > 1e-6 * (scale + np.abs(first))):
         return (
             f"the step from {x.tolist()} with the action {u.tolist()} ends in {first.tolist()}, "
-            f"and after other actions in {again.tolist()}: {HIDDEN} leaves alone (a delay of the "
-            f"input, an actuator). {ADVICE}"
+            f"and after other actions in {again.tolist()}: {UNSEEN} leaves alone (a delay of the "
+            f"input, an actuator). {SET_STATE_ADVICE}"
         )
     states = [simulator.next_state(x, push)]
     while len(states) < LONGEST_DELAY and not simulator.over:
@@ -379,7 +379,7 @@ def _hidden_state(simulator: Simulator, x: Array, u: Array, first: Array, scale:
         if np.any(np.abs(reached - after) > doubt):
             return (
                 f"going on from {before.tolist()}, the action {push.tolist()} leads to "
-                f"{after.tolist()}, and set there to {reached.tolist()}: {HIDDEN} starts anew "
-                f"(a delay of the input, an actuator, a clock). {ADVICE}"
+                f"{after.tolist()}, and set there to {reached.tolist()}: {UNSEEN} starts anew "
+                f"(a delay of the input, an actuator, a clock). {SET_STATE_ADVICE}"
             )
     return ""

@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_yann._validation import warn
 
-LIBRARIES = {"gymnasium", "stable_baselines3"}
+WRAPPER_LIBRARIES = {"gymnasium", "stable_baselines3"}
 LEAVE_OUT = (
     "Leave it out. For observations that are scaled by fixed numbers, pass "
     "policy_kwargs={'observation': AffineObservation.normalized(mean, std)}."
@@ -72,7 +72,7 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
 
 def _library_names(layer: Any) -> set[str]:
     """Return the names of a layer's classes that are a library's."""
-    return {each.__name__ for each in type(layer).__mro__ if _library(each) in LIBRARIES}
+    return {each.__name__ for each in type(layer).__mro__ if _library(each) in WRAPPER_LIBRARIES}
 
 
 def _library(kind: type) -> str:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array, warn
 from sb3_yann.deployment import code
 from sb3_yann.deployment.code import (
-    Arrays,
+    ControllerArrays,
     input_ranges,
     insensitive,
     literal,
@@ -36,7 +36,7 @@ from sb3_yann.deployment.code import (
 from sb3_yann.deployment.controller import MODES, Controller, steps_of
 
 
-def known_answers(data: Arrays, precision: str) -> dict[str, str]:
+def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
     """Return what the self-test in C is filled with: points and steps, and what they must give.
 
     ValueError if a rounding changes all answers.
@@ -118,7 +118,7 @@ class Run:
         )
 
     @classmethod
-    def with_estimator(cls, data: Arrays, seen: Array) -> Run:
+    def with_estimator(cls, data: ControllerArrays, seen: Array) -> Run:
         """Return a closed loop with the estimator's own model as the plant.
 
         It begins beside the operating point, with a load that the estimator must find; references
@@ -184,7 +184,7 @@ class Run:
         }
 
 
-def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, str]:
+def c_files(data: ControllerArrays, precision: str, about: str, file: str) -> dict[str, str]:
     """Return the texts of the C files by their names."""
     lines = [f"  {line}" for line in code.signal_lines(data, "action")]
     n_obs = len(data["obs_rest"])
@@ -214,7 +214,7 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
     }
 
 
-def fill(template: str, entries: Mapping[str, str], data: Arrays) -> str:
+def fill(template: str, entries: Mapping[str, str], data: ControllerArrays) -> str:
     """Return a template of C with its entries, ``@KEY@``, and with the controller's prefix."""
     text = _template(template)
     for key, entry in entries.items():
@@ -234,7 +234,7 @@ def comment(lines: list[str]) -> str:
     return "\n".join(f" * {line}".rstrip().rstrip("\\") for line in safe.splitlines())
 
 
-def _definitions(data: Arrays, precision: str) -> str:
+def _definitions(data: ControllerArrays, precision: str) -> str:
     """Return sizes, options and tables."""
     numbers, indices = code.controller_tables(data, precision)
     search_numbers, search_indices = code.search_tables(data)
@@ -305,7 +305,7 @@ COMPILERS = "cc", "gcc", "clang"
 FLAGS = "-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"
 
 
-def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
+def fmu_file(data: ControllerArrays, precision: str, about: str) -> bytes:
     """Return the bytes of an FMU.
 
     It holds the C code, and a library for this machine where a C compiler is at hand. A step is a
@@ -383,7 +383,7 @@ def _library(sources: dict[str, str]) -> bytes:
     return b""
 
 
-def _description(data: Arrays, about: str, identity: str, units: list[str]) -> bytes:
+def _description(data: ControllerArrays, about: str, identity: str, units: list[str]) -> bytes:
     """Return modelDescription.xml."""
     name = str(data["name"])
     dt = float(data["dt"])
@@ -416,7 +416,7 @@ def _description(data: Arrays, about: str, identity: str, units: list[str]) -> b
     return bytes(ET.tostring(root, "utf-8", xml_declaration=True)) + b"\n"
 
 
-def _add_variables(within: ET.Element, data: Arrays) -> None:
+def _add_variables(within: ET.Element, data: ControllerArrays) -> None:
     """Add all variables, in the order of their value references."""
     inputs = [*map(str, data["action_names"])]
     who = "0 the policy, 1 the MPC, 2 manual"

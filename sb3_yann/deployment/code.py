@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.deployment.controller import FAR, Controller, steps_of
+from sb3_yann.deployment.controller import MAX_THETA, Controller, steps_of
 
-Arrays = Mapping[str, Any]
+ControllerArrays = Mapping[str, Any]
 Tables = dict[str, NDArray[Any]]
 ROOM = {"double": 1e-12, "float": 1e-5}
 """How far exported code may be off, in parts of an input's range, by its precision."""
 
 
-def room_of(data: Arrays, precision: str, inside: bool = True) -> float:
+def room_of(data: ControllerArrays, precision: str, inside: bool = True) -> float:
     """Return how far code of a controller may be off, in parts of an input's range.
 
     Where the MPC has no solution, constraints that give way cost an online law more digits.
@@ -47,7 +47,7 @@ def scale_within(
     return np.where(inside.any(0), best, found)
 
 
-def action_scale(data: Arrays, precision: str) -> NDArray[Any]:
+def action_scale(data: ControllerArrays, precision: str) -> NDArray[Any]:
     """Return the scale of a controller's outputs for code of that precision."""
     scale = data["action_scale"]
     shift = data["action_shift"]
@@ -56,7 +56,7 @@ def action_scale(data: Arrays, precision: str) -> NDArray[Any]:
     return scale_within(scale, shift, shift - scale, shift + scale, np.float32)
 
 
-def search_tolerances(data: Arrays, precision: str) -> dict[str, float]:
+def search_tolerances(data: ControllerArrays, precision: str) -> dict[str, float]:
     """Return the tolerances of a search for a region, in half-widths of the box of theta.
 
     ``tolerance``: so far outside, a point counts as inside. ``tie``: slacks that differ by less,
@@ -74,13 +74,13 @@ def search_tolerances(data: Arrays, precision: str) -> dict[str, float]:
 # ---- Tables ----
 
 
-def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
+def controller_tables(data: ControllerArrays, precision: str) -> tuple[Tables, Tables]:
     """Return the tables of numbers and those of indices, by their names in code."""
     same = "A b gains offsets obs_matrix obs_offset obs_rest seen_rest obs_min obs_max action_shift"
     numbers: Tables = {name: data[name] for name in same.split()}
     numbers["action_scale"] = action_scale(data, precision)
     numbers["input_min"], numbers["input_max"] = data["bounds"]
-    numbers["far"] = FAR * np.abs(data["box"]).max(0)
+    numbers["far"] = MAX_THETA * np.abs(data["box"]).max(0)
     starts = np.array([*data["starts"], len(data["b"])])
     indices: Tables = {"starts": starts, "watched": data["watched"].astype(np.int64)}
     indices |= {"source": data["source"], "missing": data["missing"]}
@@ -115,7 +115,7 @@ def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
     return numbers, indices
 
 
-def search_tables(data: Arrays) -> tuple[Tables, Tables]:
+def search_tables(data: ControllerArrays) -> tuple[Tables, Tables]:
     """Return the tables of a walk; none where all regions are asked."""
     if not data["neighbors"].size:
         return {}, {}
@@ -139,7 +139,7 @@ class Cost:
     locals: int  # numbers that a step keeps on the stack
 
     @classmethod
-    def of(cls, data: Arrays) -> Cost:
+    def of(cls, data: ControllerArrays) -> Cost:
         """Return the cost of a controller's arrays."""
         numbers, indices = controller_tables(data, "double")
         search_numbers, search_indices = search_tables(data)
@@ -188,7 +188,7 @@ class Cost:
 # ---- Text ----
 
 
-def signal_lines(data: Arrays, output: str) -> list[str]:
+def signal_lines(data: ControllerArrays, output: str) -> list[str]:
     """Return a line for each entry of an observation and of the output: name, unit and values.
 
     The values tell deviations from the plant's own units.

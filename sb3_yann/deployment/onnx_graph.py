@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann.deployment.code import Arrays, action_scale, search_tolerances
+from sb3_yann.deployment.code import ControllerArrays, action_scale, search_tolerances
 from sb3_yann.deployment.controller import ACTIVATIONS
 
 
-def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
+def onnx_model(data: ControllerArrays, precision: str, digest: str) -> bytes:
     """Return the file of a graph that is `Controller.evaluate`.
 
     ``obs`` (batch, n_obs) to ``action`` (batch, m) and ``outside`` (batch,): where the MPC has no
@@ -105,7 +105,7 @@ class _Graph:
         return self.op("Squeeze", self.op("MatMul", matrices, column), last)
 
 
-def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
+def _policy(graph: _Graph, data: ControllerArrays, precision: str) -> tuple[str, str]:
     """Return the names of action and outside."""
     op = graph.op
     constant = graph.constant
@@ -160,7 +160,7 @@ def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
 
 
 def _locate(
-    graph: _Graph, data: Arrays, theta: str, tolerances: dict[str, float]
+    graph: _Graph, data: ControllerArrays, theta: str, tolerances: dict[str, float]
 ) -> tuple[str, str]:
     """Return the region (batch,) that theta violates least, and whether it holds it (batch, 1)."""
     op = graph.op
@@ -185,7 +185,7 @@ def _locate(
     return region, op("Not", op("Less", largest, constant(-tolerances["tolerance"])))
 
 
-def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
+def _correction(graph: _Graph, data: ControllerArrays, theta: str, region: str) -> str:
     """Return what the networks add, (batch, m)."""
     op = graph.op
     constant = graph.constant
@@ -231,7 +231,7 @@ def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
 
 
 def _kept(
-    graph: _Graph, data: Arrays, theta: str, law: str, action: str, low: str, high: str
+    graph: _Graph, data: ControllerArrays, theta: str, law: str, action: str, low: str, high: str
 ) -> str:
     """Return actions that break no row further than the law, as `Controller` does."""
     op = graph.op
@@ -263,7 +263,7 @@ def _kept(
     return op("Where", op("Greater", most, zero), moved, action)
 
 
-def _activate(graph: _Graph, x: str, data: Arrays) -> str:
+def _activate(graph: _Graph, x: str, data: ControllerArrays) -> str:
     """Return the activation of x."""
     kind = str(data["activation"])
     op = graph.op

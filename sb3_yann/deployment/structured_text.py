@@ -9,7 +9,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from sb3_yann.deployment import code
-from sb3_yann.deployment.code import Arrays, decimal
+from sb3_yann.deployment.code import ControllerArrays, decimal
 
 ACTIVATE = {
     "tanh": """k := 0;
@@ -43,8 +43,8 @@ RESERVED = set(
     """.split()
 )
 """Words of the language that a function block cannot be called."""
-LARGEST = 1e37
-SMALLEST = 1e-37
+MAX_REAL = 1e37
+MIN_REAL = 1e-37
 """Larger readings count as infinite, which no standard function asks; smaller entries are zero.
 
 Both are for LREAL too: MatIEC, the compiler of OpenPLC and Beremiz, reads its literals as REAL
@@ -52,7 +52,7 @@ first. It also leaves out a FOR loop of one turn, so all loops are WHILE.
 """
 
 
-def st_text(data: Arrays, precision: str, about: str) -> str:
+def st_text(data: ControllerArrays, precision: str, about: str) -> str:
     """Return a FUNCTION_BLOCK with the step of a controller."""
     interface, constants, variables, body = _parts(data, precision)
     top = "\n".join(f"  {line}".rstrip() for line in _comment(data, about))
@@ -64,7 +64,7 @@ def st_text(data: Arrays, precision: str, about: str) -> str:
     )
 
 
-def plcopen_xml(data: Arrays, precision: str, about: str) -> str:
+def plcopen_xml(data: ControllerArrays, precision: str, about: str) -> str:
     """Return the function block in the XML of PLCopen's TC6, version 2.01; as :func:`st_text`."""
     interface, constants, variables, body = _parts(data, precision)
     groups = []
@@ -92,7 +92,7 @@ def plcopen_xml(data: Arrays, precision: str, about: str) -> str:
     )
 
 
-def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str]:
+def _parts(data: ControllerArrays, precision: str) -> tuple[str, list[str], list[str], str]:
     """Return the interface, declarations of constants and of variables, and the body."""
     networks = len(data["pinned"]) > 0
     n_layers = int(data["n_layers"])
@@ -165,25 +165,25 @@ def _activated(body: str, lines: str) -> str:
     return "\n".join(found) + "\n"
 
 
-def _constants(data: Arrays, precision: str, kind: str) -> list[str]:
+def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:
     """Return declarations of numbers and tables; these are flat, their rows follow each other."""
     tolerances = code.search_tolerances(data, precision)
     fade_start, fade_end = data["fades"]
     reals = {
         "TOLERANCE": tolerances["tolerance"],
         "TIE": tolerances["tie"],
-        "BEYOND_ALL": LARGEST,
-        "REACH": min(float(data["reach"]), LARGEST),
+        "BEYOND_ALL": MAX_REAL,
+        "REACH": min(float(data["reach"]), MAX_REAL),
         "FADES_FROM": fade_start,
         "FADES_TO": fade_end,
-        "LATE_AFTER": min(float(data["late_after"]), LARGEST),
+        "LATE_AFTER": min(float(data["late_after"]), MAX_REAL),
     }
     lines = [f"{name} : {kind} := {decimal(value, precision)};" for name, value in reals.items()]
     for name in ("frozen_after", "hold", "recover", "transfer"):
         lines.append(f"{name.upper()} : DINT := {int(data[name])};")
     numbers, indices = code.controller_tables(data, precision)
     for name, values in numbers.items():
-        kept = np.where(np.abs(values) < SMALLEST, 0.0, np.clip(values, -LARGEST, LARGEST))
+        kept = np.where(np.abs(values) < MIN_REAL, 0.0, np.clip(values, -MAX_REAL, MAX_REAL))
         texts = [decimal(float(each), precision) for each in kept.flat]
         lines.append(_array(name, kind, texts))
     for name, values in indices.items():
@@ -221,7 +221,7 @@ def _variable(declared: str) -> str:
     return f'<variable name="{name}"><type>{shown}</type>{given}</variable>'
 
 
-def _comment(data: Arrays, about: str) -> list[str]:
+def _comment(data: ControllerArrays, about: str) -> list[str]:
     """Return the lines of the comment, in ASCII, which nothing in them can end."""
     plain = code.ascii_text([about, *code.signal_lines(data, "command")])
     return plain.replace("*)", "* )").replace("(*", "( *").splitlines()

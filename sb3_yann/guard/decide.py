@@ -34,13 +34,13 @@ from sb3_yann.compare import (
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.env_pool import EnvPool, Source
-from sb3_yann.guard.state import Decision, Evidence, Outcome, Play
+from sb3_yann.guard.state import Decision, DecisionKind, Evidence, Play
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Rows, Trajectories, preserve_rng, rollout
 
-FIRST_LOOK = 5  # starts of a trial of its first look
+FIRST_STARTS = 5  # starts of a trial of its first look
 FIRST_FINAL_LOOK = 40  # the same at the end: the worst 5 % of so many are two
 INTERIM_LEVEL = 0.2
 """Of what confirms a policy until the end, one-sided: it has passed on the known starts."""
@@ -181,7 +181,7 @@ def try_on_known(
     known = evidence.starts
     verdict = Verdict()
     trial = PairedTrial(play, evidence.mpc, known, NewSeeds(evidence.next_seed))
-    counts = [known.n_hard + each for each in looks(FIRST_LOOK, len(settings.seeds))]
+    counts = [known.n_hard + each for each in looks(FIRST_STARTS, len(settings.seeds))]
     try:
         for look in trial.stages(candidate, counts):
             count = len(trial.scores.costs)
@@ -270,7 +270,7 @@ def _confirm(
     rule = settings.rule
     at_end = significance is not None
     strict = not rule.cvar_alpha
-    counts = looks(FIRST_LOOK, settings.n_new_starts)
+    counts = looks(FIRST_STARTS, settings.n_new_starts)
     if at_end:
         counts = looks(FIRST_FINAL_LOOK, settings.n_final_starts)
     verdict = Verdict()
@@ -366,7 +366,7 @@ def _decision(
 ) -> Decision:
     starts = evidence.starts
     costs = evidence.scores.costs
-    verdict: Outcome = "accepted"
+    verdict: DecisionKind = "accepted"
     if reason:
         verdict = "accepted in part" if regions or share else "rejected"
     more = (costs - starts.mpc.costs[: len(costs)])[starts.n_hard :]

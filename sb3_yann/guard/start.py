@@ -26,7 +26,7 @@ from sb3_yann.policy.policies import StartsAsMPC, require_problem_of_twin
 from sb3_yann.rollout import Trajectories, preserve_rng
 
 REPEATED = 2  # starts from which the MPC plays twice: a simulator repeats itself
-SAME = 0.01  # of the mean cost: a reward that differs by more is another one
+OTHER_REWARD = 0.01  # of the mean cost: a reward that differs by more is another one
 
 
 def first_evidence(
@@ -134,7 +134,7 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
     error = np.abs(options.reward_scale * cost + rewards - options.reward_offset)
     error = error[np.isfinite(error)]  # steps that violate may cost more
     error = error if len(error) else np.zeros(1)
-    player.pays_cost = not np.mean(error) > SAME * options.reward_scale * np.mean(cost)
+    player.pays_cost = not np.mean(error) > OTHER_REWARD * options.reward_scale * np.mean(cost)
     with preserve_rng(), player.envs.acquire(1) as (env,):
         maps = {"theta": player.theta, "inputs": policy.inputs}
         warn_of_signs(policy.problem, env, seeds, mpc, **maps)

@@ -25,7 +25,7 @@ from sb3_yann.policy.policies import StartsAsMPC
 
 Play = Callable[[ActorCheckpoint, Sequence[int]], Scores]
 """From a checkpoint and seeds to the scores of its episodes."""
-Outcome = Literal["accepted", "accepted in part", "rejected"]
+DecisionKind = Literal["accepted", "accepted in part", "rejected"]
 MAX_PASSED = 5  # earlier accepted checkpoints that are kept, at most
 MAX_PASSED_BYTES = 10_000_000  # their size, at most
 
@@ -152,7 +152,7 @@ class Decision:
 
     timestep: int = 0
     episode: int = 0
-    verdict: Outcome
+    verdict: DecisionKind
     reason: str = ""
     restored: bool = False
     candidate_cost: float
@@ -283,7 +283,7 @@ def as_csv(decisions: list[Decision]) -> str:
     return text.getvalue()
 
 
-ADVICE = {
+REFUSAL_ADVICE = {
     "too little a gain": "see by headroom(mpc, env) what can be gained",
     "new starts": "raise n_eval_episodes: the known starts do not show what the new ones do",
     "violation": "bound the policy (max_correction), or tighten the MPC's own limits",
@@ -323,7 +323,7 @@ def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
         )
     counts = Counter(each.verdict for each in decisions)
     refused = [each.reason for each in decisions if each.verdict == "rejected"]
-    kinds = [next((words for words in ADVICE if words in why), why) for why in refused]
+    kinds = [next((words for words in REFUSAL_ADVICE if words in why), why) for why in refused]
     candidates = refusals = more = ""
     if decisions:
         candidates = (
@@ -338,7 +338,7 @@ def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
     if kinds:
         kind, times = Counter(kinds).most_common(1)[0]
         refusals = f"most often ({times} times): {refused[kinds.index(kind)]}"
-        more = ADVICE.get(kind, "")
+        more = REFUSAL_ADVICE.get(kind, "")
     return summary_lines(
         verdict,
         **paired_rows(ours.costs, mpc.costs),

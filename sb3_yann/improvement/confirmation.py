@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, Feedback
 from sb3_yann.compare import (
-    LARGEST,
+    LARGEST_EXCESS,
     RULE,
     Difference,
     PairedTrial,
@@ -30,7 +30,7 @@ from sb3_yann.compare import (
     unsafe_columns,
 )
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
-from sb3_yann.improvement.imitation import Inputs, controller_of
+from sb3_yann.improvement.imitation import HARDEST, controller_of
 from sb3_yann.improvement.simulator import Scenarios, Simulator, of_law
 from sb3_yann.rollout import Rows, Trajectories
 from sb3_yann.twin.dynamics import law_of
@@ -44,11 +44,10 @@ RAREST = 10.0
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
 many times as much at most where it is rare."""
 FURTHER = 0.01  # how much farther than the MPC a run may leave what the log shows, in its widths
-HARDEST = 40  # scenarios that are planned anew after a check, at most
 WINDOW = 200  # steps that are planned of a run of more than twice as many
 NEARLY = 0.5  # A start that loses so much of what it may lose is a hard one
 
-Outcome = tuple[Array, Array]  # costs, and what is unsafe (`unsafe_columns`), of all starts
+CostsAndUnsafe = tuple[Array, Array]  # costs, and what is unsafe (`unsafe_columns`), of all starts
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ class Trial:
     given: Array = field(init=False)
     far: Array = field(init=False)
     rows: Array = field(init=False)
-    mpc: Outcome = field(init=False)
+    mpc: CostsAndUnsafe = field(init=False)
 
     @classmethod
     def draw(cls, twin: PlantTwin, count: int, rng: np.random.Generator) -> Trial:
@@ -151,11 +150,11 @@ class Trial:
         """The MPC's mean cost from the known starts."""
         return float(np.abs(self.mpc[0][self.known]).mean())
 
-    def play(self, act: Inputs) -> Outcome:
+    def play(self, act: Feedback) -> CostsAndUnsafe:
         """Return what comes of a policy."""
         return self._outcome(*self._run(act))
 
-    def _outcome(self, thetas: Array, inputs: Array) -> Outcome:
+    def _outcome(self, thetas: Array, inputs: Array) -> CostsAndUnsafe:
         twin = self.twin
         shown = twin.dynamics.row.shown(thetas[:-1])
         excess = bound_excess(twin.problem, twin.dynamics.row.shown(thetas), inputs)
@@ -168,7 +167,7 @@ class Trial:
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
         return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
 
-    def _run(self, act: Inputs) -> tuple[Array, Array]:
+    def _run(self, act: Feedback) -> tuple[Array, Array]:
         with np.errstate(all="ignore"):
             return self.twin.dynamics.roll_out(act, self.starts, self.steps, self.given)
 
@@ -179,7 +178,7 @@ class Trial:
         over = np.maximum(x - limits.high, limits.low - x) / (limits.high - limits.low)
         return np.asarray(np.maximum(over, 0.0).max(axis=(0, -1)).ravel())
 
-    def check(self, iteration: int, played: Outcome) -> Check:
+    def check(self, iteration: int, played: CostsAndUnsafe) -> Check:
         """Compare a policy with the MPC, by what came of it."""
         costs, unsafe = played
         known = self.known
@@ -245,7 +244,7 @@ class Trial:
             self.twin, members, self.rows[begins, members, starts], self.given[times, starts]
         )
 
-    def hard(self, played: Outcome) -> Scenarios | None:
+    def hard(self, played: CostsAndUnsafe) -> Scenarios | None:
         """Return the scenarios that a policy loses, or nearly, the worst first; None where none."""
         loses = (played[0] - self.mpc[0]) / np.maximum(NEARLY * self.room(), 1e-300)
         loses[np.any(less_safe(played[1], self.mpc[1]), axis=1)] = np.inf
@@ -283,7 +282,7 @@ class SimulatorTrial(PairedTrial):
             self._play, None, Starts((), none, Tolerance(0.0)), simulator.new_seeds, self._tolerated
         )
 
-    def _play(self, act: Inputs | None, seeds: Sequence[int]) -> Scores:
+    def _play(self, act: Feedback | None, seeds: Sequence[int]) -> Scores:
         controller = of_law(self.simulator.problem) if act is None else controller_of(act)
         self.played = self.simulator.play(controller, seeds)
         if act is not None:
@@ -296,7 +295,7 @@ class SimulatorTrial(PairedTrial):
         # A rare loss has been taught: the mean of the worst 5 % decides.
         return replace(RULE.tolerance(mpc_costs, names), worst_start=np.inf)
 
-    def stages(self, policy: Inputs, counts: Sequence[int]) -> Iterator[int]:
+    def stages(self, policy: Feedback, counts: Sequence[int]) -> Iterator[int]:
         """Play a policy from ever more starts; see :class:`PairedTrial`."""
         self.episodes.clear()
         return super().stages(policy, counts)
@@ -322,7 +321,7 @@ class SimulatorTrial(PairedTrial):
     def rides_a_bound(self) -> bool:
         """Whether a hard bound is in force: it is exceeded in some episode, also by the MPC."""
         both = self.starts.mpc.unsafe, self.scores.unsafe
-        return any(bool(each[:, LARGEST].any()) for each in both)
+        return any(bool(each[:, LARGEST_EXCESS].any()) for each in both)
 
     def check(self, number: int, level: float, final: bool) -> tuple[Check, Verdict]:
         """Return what the pairs say of the policy, at a one-sided level of significance."""
@@ -349,7 +348,7 @@ class SimulatorTrial(PairedTrial):
 
 
 def confirm(
-    act: Inputs,
+    act: Feedback,
     simulator: Simulator,
     number: int,
     say: Callable[[str, int], None] = lambda text, pairs: None,

@@ -11,7 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, Feedback
 from sb3_yann.compare import RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
 from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
@@ -23,7 +23,6 @@ from sb3_yann.rollout import Controller, Rows
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.env import LearntModel
 
-Inputs = Callable[[Array], Array]
 BATCH = 512  # rows in a step of Adam
 RATE = 1e-2  # of Adam at first; it falls to zero
 NEARBY = 3  # states beside each of a plan that its feedback answers
@@ -34,7 +33,7 @@ where plans go one way or the other, their mean goes nowhere. Labels on a bound 
 it, so that the slope does not vanish on the way."""
 VAIN_FITS = 3  # fits in a row that may bring no better policy
 FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
-HARDEST = 40  # scenarios that are planned anew after a fit
+HARDEST = 40  # scenarios that are planned anew after a fit or a check, at most
 NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
 RETURNS = 1000  # states whose returns the critic is fitted to
 RETURN_STEPS = 100  # steps of a return; the MPC's value counts after them
@@ -92,7 +91,7 @@ class Teacher:
         more = np.nan_to_num(more, nan=0.0, posinf=1.0, neginf=-1.0)
         return float(-np.minimum(more, 1.0).mean())
 
-    def show(self, act: Inputs | None = None, played: Imagined | None = None) -> None:
+    def show(self, act: Feedback | None = None, played: Imagined | None = None) -> None:
         """Plan the scenarios; those that a policy ``played``, from where it had got to.
 
         Where plans cost more than the MPC, or break a bound by more, the MPC is shown.
@@ -136,7 +135,7 @@ class Teacher:
                 taught = self.mpc.thetas[:-1, scenario], self.mpc.inputs[:, scenario]
                 self._keep(*taught, lambda near: self.law(near.reshape(-1, near.shape[-1])))
 
-    def _keep(self, thetas: Array, inputs: Array, answers: Inputs) -> None:
+    def _keep(self, thetas: Array, inputs: Array, answers: Feedback) -> None:
         """Keep inputs (T, m) at thetas (T, n_theta), and the answers to states near each."""
         near = np.repeat(thetas[:, None], NEARBY, axis=1)
         states = near[..., self.problem.layout.state]
@@ -250,7 +249,7 @@ def fit_layer(
     optimizer.zero_grad()
 
 
-def policy_of(layer: LawLayer, problem: LinearMPC) -> Inputs:
+def policy_of(layer: LawLayer, problem: LinearMPC) -> Feedback:
     """Return an actor of now as a function from theta (rows, n_theta) to inputs (rows, m)."""
     middle = (problem.deviations.u_max + problem.deviations.u_min) / 2
     half = problem.u_half
@@ -258,7 +257,7 @@ def policy_of(layer: LawLayer, problem: LinearMPC) -> Inputs:
     return lambda theta: np.asarray(middle + half * act(theta))
 
 
-def controller_of(act: Inputs) -> Controller:
+def controller_of(act: Feedback) -> Controller:
     """Return a policy as what acts in episodes side by side; on what is not finite, as at rest."""
 
     def controller(t: int, theta: Array, rows: Rows) -> Array:

@@ -63,12 +63,12 @@ from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.row_layout import RowLayout
+from sb3_yann.units import FLOAT32_ROUNDING
 
-ROUNDING = 1e-6  # of a half-width, in float32 observations: no error of a model
 LEAST = 2e-4  # what a policy must gain in a twin, relative to the MPC's mean cost
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
 PROMISED = 0.95  # share of what the model promised that, shown by the simulator, ends the rounds
-LITTLE = 0.02  # share of a gain by which another round must raise it
+LITTLE_MORE = 0.02  # share of a gain by which another round must raise it
 OTHERS = 9  # scenarios beside each that is planned, in which a policy shows what it has not learnt
 TRIES = 3  # confirmations of a policy that is taught what it has lost
 
@@ -415,7 +415,7 @@ class _Work:
         """Let the layer keep as far from bounds as the MPC's model errs, if no margin was given."""
         if len(self.layer.rows) and float(self.layer.margin) == 0:
             error = one_step_error(row, episodes)
-            self.layer.keep(error if error > ROUNDING else 0.0)
+            self.layer.keep(error if error > FLOAT32_ROUNDING else 0.0)
 
     def in_twin(self, twin: PlantTwin) -> Improvement:
         """Plan in the members of a twin, imitate, and check on every member."""
@@ -603,7 +603,7 @@ class _Work:
             )
             lost = trial.lost
             useful = found.safe and found.change < least
-            stalls = least < best and found.change > (1 + LITTLE) * least
+            stalls = least < best and found.change > (1 + LITTLE_MORE) * least
             if useful:
                 weights = self.weights()
                 least = found.change

@@ -37,7 +37,7 @@ from sb3_yann.twin.selection import reidentified
 LITTLE = 0.005
 """A gain below this, relative to the MPC's cost, is not worth an observer or a new model."""
 WORTH = 0.02  # A gain below this is not worth learning, which finds a part of it
-ROUNDING = 1e-9  # of an episode's cost: so much more is the same
+SAME_COST = 1e-9  # of an episode's cost: so much more is the same
 CURE = (
     "mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, observer, "
     "mpc.disturbances.d_min, mpc.disturbances.d_max)."
@@ -156,7 +156,7 @@ class Headroom:
         if costs is None:
             return "not played"
         each = (costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
-        more = np.count_nonzero(each > ROUNDING)
+        more = np.count_nonzero(each > SAME_COST)
         return (
             f"{change_in_percent(-gain(self.mpc_costs, costs))} as it was played, worst start "
             f"{change_in_percent(each.max())} of its own cost; {more} of {len(costs)} cost more"

@@ -20,14 +20,13 @@ from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.mpc.invariant_sets import KeptSet
 from sb3_yann.control.online import Law
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
+from sb3_yann.units import FLOAT32_ROUNDING
 
-Rate = tuple[Array, Array]
+ChangeBounds = tuple[Array, Array]
 FADE_START = 1.0
 """Within how many half-widths of a box a correction counts in full."""
 FADE_END = 1.25
 """Beyond how many half-widths of a box a correction does not count."""
-ROUNDING = 1e-6
-"""Half-widths from a row that float32 actions keep, and what an input must move one by."""
 
 
 class LawLayer(nn.Module):
@@ -43,7 +42,7 @@ class LawLayer(nn.Module):
     reach: float | None
     constants: tuple[Array, Array, Array, float]  # for compiled code
 
-    def __init__(self, law: Law, rate: Rate | None, kept: KeptSet | None) -> None:
+    def __init__(self, law: Law, rate: ChangeBounds | None, kept: KeptSet | None) -> None:
         super().__init__()
         # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
         import_module("sb3_yann.networks._kernels.yann_layer")
@@ -225,7 +224,7 @@ class LawLayer(nn.Module):
         scaling = np.concatenate([scaling[: -len(confines) - 2], confines, [FADE_START, FADE_END]])
         margin = float(self.margin)
         kept = self.rows.copy() if margin >= 0 else self.rows[:0]
-        kept[:, -1] *= margin + ROUNDING
+        kept[:, -1] *= margin + FLOAT32_ROUNDING
         self.constants = (scaling, change, kept, limit)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
@@ -243,7 +242,7 @@ def _kept_in_actions(kept: KeptSet, middle: Array, half_range: Array) -> Array:
     c = c - (b @ middle)[:, None]
     b = b * half_range
     length = np.linalg.norm(b, axis=1, keepdims=True)
-    moved = length[:, 0] > ROUNDING
+    moved = length[:, 0] > FLOAT32_ROUNDING
     return np.ascontiguousarray(np.hstack([a, b, c, np.ones_like(c)])[moved] / length[moved])
 
 
@@ -296,7 +295,7 @@ class YannLayer(LawLayer):
         activation: Activation = th.tanh,
         max_correction: float | None = None,
         pinned: bool = True,
-        rate: Rate | None = None,
+        rate: ChangeBounds | None = None,
         kept: KeptSet | None = None,
     ) -> None:
         super().__init__(law, rate, kept)
@@ -419,7 +418,7 @@ class SharedYannLayer(LawLayer):
         activation: Activation = th.tanh,
         max_correction: float | None = None,
         pinned: bool = True,
-        rate: Rate | None = None,
+        rate: ChangeBounds | None = None,
         kept: KeptSet | None = None,
     ) -> None:
         super().__init__(law, rate, kept)

@@ -36,7 +36,7 @@ from sb3_yann.policy.checks import require_own_problem
 from sb3_yann.policy.observations import SeesTheta, keeps_entries, without_entries
 from sb3_yann.policy.sb3_hooks import KeepsPrecision, what_is_not_finite
 
-LONGEST = 100
+MAX_VALUE_SAMPLES = 100
 """Samples that a cost counts for good as, at most."""
 NETWORKS = ("per_region", "shared")
 CRITICS = ("afterstate", "state_action")
@@ -321,7 +321,7 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
     def scale_values(self, stage_cost: float) -> None:
         """Set the factor of networks that are zero to that cost for good, where it is known."""
         for q_network in cast("list[Any]", self.q_networks if stage_cost > 0 else []):
-            q_network.value_scale.fill_(stage_cost / max(1 - self.gamma, 1 / LONGEST))
+            q_network.value_scale.fill_(stage_cost / max(1 - self.gamma, 1 / MAX_VALUE_SAMPLES))
 
     def rescale(self, stage_cost: float, optimizer: th.optim.Optimizer | None = None) -> float:
         """Double or halve the factor where that cost for good is beyond; return the factor.
@@ -329,7 +329,7 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         What the networks put out stays as it is, and their last layer's moments stay true.
         """
         scale: float = cast("Any", self.q_networks[0]).scale
-        wanted = stage_cost / max(1 - self.gamma, 1 / LONGEST)
+        wanted = stage_cost / max(1 - self.gamma, 1 / MAX_VALUE_SAMPLES)
         exponent = round(math.log2(wanted / scale)) if wanted > 0 else 0
         factor = 2.0**exponent
         for q_network in cast("list[Any]", self.q_networks if factor != 1 else []):
@@ -420,7 +420,7 @@ def _with_one(terms: Value, n: int) -> Array:
 
 EPS = 1e-8
 """Of Adam, for gradients in units of the values' scale."""
-FOLLOWS = 10
+SCALE_CHECK = 10
 RECENT = 0.1
 """Updates after which the values' scale is checked; share of that batch in the mean cost."""
 
@@ -439,10 +439,10 @@ def follow_scale(
     many orders of magnitude*, 2016). ``mean`` is the mean stage cost until now, which takes in that
     of the critic's batch, after every tenth of ``taken`` updates.
     """
-    if taken % FOLLOWS:
+    if taken % SCALE_CHECK:
         return
     cost = critic.stage_cost_of_batch()
-    share = max(FOLLOWS / (taken + FOLLOWS), RECENT)
+    share = max(SCALE_CHECK / (taken + SCALE_CHECK), RECENT)
     mean.add_(share * (cost - mean))
     if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
         target.load_state_dict(critic.state_dict())

@@ -20,8 +20,8 @@ from sb3_yann.policy.actor_critic import YannActor, YannCritic
 from sb3_yann.policy.policies import NOT_OURS, StartsAsMPC
 from sb3_yann.policy.sb3_hooks import restore_learning_rate, single_precision
 
-SMALLEST = math.log(1e-4)
-LARGEST = math.log(2.0)
+MIN_LOG_STD = math.log(1e-4)
+MAX_LOG_STD = math.log(2.0)
 """Bounds of the logarithm of a standard deviation, of actions in [-1, 1]."""
 EDGE = 1e-12
 """A quantile stays so far from 0 and 1, where the normal distribution's inverse is not finite."""
@@ -41,7 +41,7 @@ class TruncatedNormal:
         self.center = center
         # Float64: the tails of float32 end at five standard deviations.
         self.m = center.double()
-        self.std = log_std.double().clamp(SMALLEST, LARGEST).exp()
+        self.std = log_std.double().clamp(MIN_LOG_STD, MAX_LOG_STD).exp()
         self.low = (-1 - self.m) / self.std
         self.high = (1 - self.m) / self.std
         self.below = th.special.ndtr(self.low)

@@ -35,8 +35,8 @@ from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of
 from sb3_yann.improvement.improving import fingerprint
 from sb3_yann.reporting.subject import (
-    MPC,
-    POLICY,
+    OF_MPC,
+    OF_POLICY,
     Finding,
     Html,
     Part,
@@ -52,10 +52,10 @@ from sb3_yann.reporting.subject import (
     tag,
 )
 from sb3_yann.twin.env import TwinEnv
+from sb3_yann.units import FLOAT32_ROUNDING
 
 NO_ENV = "No env was given: closed loops are left out. Pass report(model, env=...) to play them."
 FAR = 50.0  # % of the range of an input: as far from the MPC as its middle from a bound
-ROUNDING = 1e-6  # a relative difference of costs, or one in half-widths of inputs, that is none
 
 
 def loops_part(subject: Subject) -> Part:
@@ -64,8 +64,8 @@ def loops_part(subject: Subject) -> Part:
     loops = subject.loops
     if loops is None:
         return left_out(title, NO_ENV)
-    mpc = loops[MPC]
-    policy = loops[POLICY]
+    mpc = loops[OF_MPC]
+    policy = loops[OF_POLICY]
     rows = []
     for name, of in (("mean", np.mean), ("median", np.median), ("worst", np.max)):
         old = float(of(mpc.costs))
@@ -108,7 +108,7 @@ def loops_part(subject: Subject) -> Part:
         for seed, a, b, v, w in each
     ]
     head = ["seed", "MPC", "policy", "change", "MPC: violations", "policy: violations"]
-    apart = np.abs(policy.costs - mpc.costs) > ROUNDING * np.abs(mpc.costs)
+    apart = np.abs(policy.costs - mpc.costs) > FLOAT32_ROUNDING * np.abs(mpc.costs)
     same: Html | str = ""
     if not apart.any() and np.array_equal(mpc.violations, policy.violations):
         same = paragraph("Each costs what it costs with the MPC, and violates as often.")
@@ -145,15 +145,15 @@ def statistics_part(subject: Subject) -> Part:
     title = "Statistics in words"
     if subject.loops is None:
         return left_out(title)
-    mpc = subject.loops[MPC]
-    policy = subject.loops[POLICY]
+    mpc = subject.loops[OF_MPC]
+    policy = subject.loops[OF_POLICY]
     change = policy.costs - mpc.costs
     count = len(policy.costs)
     if not np.all(np.isfinite(change)):
         text = "Some costs are not finite: no average says anything."
         return Part(title, paragraph(text), (make_finding(False, text),))
     mean, finding = _mean_in_words(change, float(np.mean(mpc.costs)))
-    rounding = ROUNDING * np.abs(mpc.costs)
+    rounding = FLOAT32_ROUNDING * np.abs(mpc.costs)
     less = int(np.sum(change < -rounding))
     more = int(np.sum(change > rounding))
     worst = int(np.argmax(np.where(change > rounding, change, 0.0)))
@@ -178,7 +178,7 @@ def _mean_in_words(change: Array, typical: float) -> tuple[str, Finding]:
     mean = float(change.mean())
     count = len(change)
     scale = abs(typical) or 1.0
-    if np.all(np.abs(change) <= ROUNDING * scale):
+    if np.all(np.abs(change) <= FLOAT32_ROUNDING * scale):
         text = "From these starts the policy costs what the MPC costs."
         return text, Finding("note", text)
     word = "less" if mean < 0 else "more"
@@ -206,7 +206,7 @@ def distance_part(subject: Subject) -> Part:
     theta = subject.samples
     points = {"random points of the box": theta}
     if subject.loops is not None:
-        visited = [x[:-1] for x in subject.loops[POLICY].observations]
+        visited = [x[:-1] for x in subject.loops[OF_POLICY].observations]
         points["steps of the closed loops"] = np.concatenate(visited)
     rows = []
     for where, of in points.items():
@@ -249,7 +249,7 @@ def distance_part(subject: Subject) -> Part:
         *_pictures(subject),
     ]
     u = inputs_of(problem, policy, theta)
-    rounding = ROUNDING * problem.u_half
+    rounding = FLOAT32_ROUNDING * problem.u_half
     low, high = problem.deviations.input_range(theta)
     # Where the MPC has no solution, bounds that change may give way: no further than with it.
     law = subject.law(theta)
@@ -277,7 +277,7 @@ def _farthest(subject: Subject) -> Html:
     problem = subject.problem
     theta = subject.samples
     apart = (_distance(subject, theta) / problem.u_half).max(axis=1)
-    if apart.max() < ROUNDING:
+    if apart.max() < FLOAT32_ROUNDING:
         return paragraph(
             "At the random points the policy is the MPC: nothing has been learnt there."
         )
@@ -303,7 +303,7 @@ def _pictures(subject: Subject) -> list[Html]:
             "each, in the input that is farthest."
         )
         found.append(
-            picture(partial(use_figure, problem, policy, subject.shown_loops[POLICY]), caption)
+            picture(partial(use_figure, problem, policy, subject.shown_loops[OF_POLICY]), caption)
         )
     if problem.n_theta < 2:
         return found
@@ -312,7 +312,7 @@ def _pictures(subject: Subject) -> list[Html]:
     low = problem.theta_min[entries]
     high = problem.theta_max[entries]
     if loops is not None:
-        shown = subject.shown_loops[POLICY].observations
+        shown = subject.shown_loops[OF_POLICY].observations
         visited = np.concatenate([x[:, entries] for x in shown])
         visited = visited[np.isfinite(visited).all(axis=1)]
         room = 0.05 * np.ptp(visited, axis=0)

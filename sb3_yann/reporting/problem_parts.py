@@ -17,8 +17,8 @@ from sb3_yann.control.linear_system import labels_of, missing_observer, with_uni
 from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
 from sb3_yann.reporting.subject import (
-    MPC,
-    POLICY,
+    OF_MPC,
+    OF_POLICY,
     Finding,
     Html,
     Part,
@@ -131,8 +131,8 @@ def constraints_part(subject: Subject) -> Part:
 
 def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple[Finding, ...]:
     """Return whether the policy exceeds bounds of the problem by more than the MPC does."""
-    mpc = loops[MPC].excess
-    policy = loops[POLICY].excess
+    mpc = loops[OF_MPC].excess
+    policy = loops[OF_POLICY].excess
     assert mpc is not None and policy is not None
     is_worse = bool(
         np.any(less_safe(unsafe_columns(0, 0, 0, policy), unsafe_columns(0, 0, 0, mpc)))
@@ -160,7 +160,7 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
                 [np.sum(problem.deviations.stage_cost(x[:-1], u)) for x, u in _pairs(loops[who])]
             )
             + each.penalty.mean()
-            for who, each in ((MPC, mpc), (POLICY, policy))
+            for who, each in ((OF_MPC, mpc), (OF_POLICY, policy))
         )
         costs_more = new > old * (1 + 1e-6) and policy.penalty.mean() > mpc.penalty.mean()
         text = (

@@ -190,8 +190,8 @@ def page(title: str, body: Iterable[Any]) -> str:
     return PAGE.substitute(title=clean(title), style=STYLE, body=join(body))
 
 
-POLICY = "policy"
-MPC = "MPC"
+OF_POLICY = "policy"
+OF_MPC = "MPC"
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ class Subject:
         with one_env(self.env) as env:
             require_state_shown(env, self.policy.observation_given)
         found = {}
-        for name, act in {MPC: self.act_as_mpc, POLICY: self.act_as_policy}.items():
+        for name, act in {OF_MPC: self.act_as_mpc, OF_POLICY: self.act_as_policy}.items():
             played = rollout(_as_controller(act), self.env, self.seeds)
             found[name] = replace(
                 played,

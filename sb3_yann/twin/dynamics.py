@@ -100,7 +100,7 @@ class Residual:
         return np.asarray(flat.reshape(*rows.shape[:-1], -1) + found)
 
 
-MARGIN = 0.25  # how far the residual reaches beyond the data, in widths of the data
+BEYOND_DATA = 0.25  # how far the residual reaches beyond the data, in widths of the data
 FULL_TURNS = 2 * np.pi, 360.0
 """By which an angle jumps that is shown between two ends, such as -pi and pi."""
 
@@ -142,7 +142,7 @@ class Coordinates:
         turn = (
             None if row.observer is not None else _turns([e.thetas[:, row.state] for e in episodes])
         )
-        return cls(low - MARGIN * width, high + MARGIN * width, scale, units, row, turn)
+        return cls(low - BEYOND_DATA * width, high + BEYOND_DATA * width, scale, units, row, turn)
 
     def scaled(self, features: Array) -> Array:
         """Return what residuals are fed, inside the box."""

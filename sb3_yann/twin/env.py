@@ -10,16 +10,16 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array, check_int
+from sb3_yann._validation import Array, Single, check_int
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import bound_excess
-from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, Residual, law_of
+from sb3_yann.twin.dynamics import BEYOND_DATA, Coordinates, Dynamics, Residual, law_of
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann_envs.spaces import ProblemBox
 
-AROUND = 3.0
+WIDEST_DRAW = 3.0
 WIDEST = 2.0
 RARE = 0.05
 """How many boxes wide starts are drawn at most; how much wider than the log's starts their box is
@@ -128,8 +128,8 @@ class Starts:
         half = (self.high - self.low) / 2
         nearest = (1 + _widened(k)) / 2
         ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
-        wide = np.maximum(ranges / _widened(k), rng.uniform(1, AROUND, (count, 1)))
-        reach = np.minimum(wide, AROUND) * half
+        wide = np.maximum(ranges / _widened(k), rng.uniform(1, WIDEST_DRAW, (count, 1)))
+        reach = np.minimum(wide, WIDEST_DRAW) * half
         drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
         shown = np.clip(
             self.row.shown(drawn),
@@ -164,7 +164,7 @@ def _widened(k: int) -> float:
     return min(WIDEST, (k + 1) / max(k - 1, 1))
 
 
-ROUNDING = 1e-9
+ON_BOUND = 1e-9
 PLANNED = 200  # runs of the MPC on its own model that tell where it means to go
 
 
@@ -190,10 +190,10 @@ class Limits:
         high = coordinates.high[:n]
         planned = [_planned(coordinates, starts)] if problem.layout.has_constants else []
         for least, most in [(starts.low, starts.high), *planned]:
-            width = MARGIN * (most - least)
+            width = BEYOND_DATA * (most - least)
             low = np.minimum(low, least - width)
             high = np.maximum(high, most + width)
-        room = ROUNDING * problem.theta_half[:n]
+        room = ON_BOUND * problem.theta_half[:n]
         bounded = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min))
         limited = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max))
         return cls(coordinates.row, bounded - room, limited + room)
@@ -217,9 +217,6 @@ def _planned(coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
     least = problem.deviations.theta_min[:n]
     most = problem.deviations.theta_max[:n]
     return np.clip(x.min(axis=0), least, most), np.clip(x.max(axis=0), least, most)
-
-
-Single = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -16,23 +16,21 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, Feedback
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.twin.dynamics import Dynamics, law_of
 from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
-SURE = 0.95  # probability that a change is not above an interval's end, or not below
+ONE_SIDED = 0.95  # probability that a change is not above an interval's end, or not below
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
-ROUNDING = 1e-20  # of squared errors, in how far the states move
+TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
 EACH = 5  # episodes, at least, all of which speak against a judge
-LAGS = 2  # earlier samples that a memory knows
+MEMORY = 2  # earlier samples that a memory knows
 LESS = 0.02  # share of the errors of one step that it must explain on held-out episodes
-RIDGE = 1e-3  # of its standardized regressors
-RUNS = 100  # from new starts, at least
-ROWS = 4  # steps of a log for each coefficient, at least
-
-Inputs = Callable[[Array], Array]
+MEMORY_RIDGE = 1e-3  # of its standardized regressors
+MIN_RUNS = 100  # from new starts, at least
+STEPS_PER_WEIGHT = 4  # steps of a log for each coefficient, at least
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class _Replays:
             self.errors = self.errors - self._remembered_of_log()
         number = np.arange(len(episodes))
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
-        sizes = np.log(np.sum(unseen**2, axis=-1) + ROUNDING)
+        sizes = np.log(np.sum(unseen**2, axis=-1) + TINY_SQUARE)
         self.left = np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0)
 
     def _logged(self) -> list[tuple[Array, Array]]:
@@ -99,7 +97,7 @@ class _Replays:
         with np.errstate(all="ignore"):
             return self.dynamics.step(rows, u)
 
-    def costs(self, act: Inputs, starts: Array) -> Array:
+    def costs(self, act: Feedback, starts: Array) -> Array:
         """Return what episodes like each logged one cost with a policy on average, (members, N).
 
         Those that go on as episode i does begin at ``starts[i]`` (some, size).
@@ -137,8 +135,8 @@ class _Replays:
         return np.asarray(found.reshape(self.members, count, some).mean(axis=2))
 
     def _regressors(self, t: int, rows: Array, inputs: Array, missed: Array) -> Array:
-        past = [inputs[t - lag] if t >= lag else 0 * inputs[0] for lag in range(1, LAGS + 1)]
-        before = [missed[t - lag] if t >= lag else 0 * missed[0] for lag in range(1, LAGS + 1)]
+        past = [inputs[t - lag] if t >= lag else 0 * inputs[0] for lag in range(1, MEMORY + 1)]
+        before = [missed[t - lag] if t >= lag else 0 * missed[0] for lag in range(1, MEMORY + 1)]
         one = np.ones((*rows.shape[:-1], 1))
         x = rows[..., self.dynamics.row.state]
         return np.concatenate([one, x, inputs[t], *past, *before], axis=-1)
@@ -164,10 +162,10 @@ class _Replays:
         basis = self._basis()
         count = self.rows.shape[1]
         plain = 1 + self.errors.shape[3] + self.inputs.shape[2]
-        if self.alive.sum() < ROWS * basis.shape[-1] or count < 2:
+        if self.alive.sum() < STEPS_PER_WEIGHT * basis.shape[-1] or count < 2:
             return None
         known = self.alive.copy()
-        known[:LAGS] = False
+        known[:MEMORY] = False
         weights = []
         left = np.zeros(2)
         for k in range(self.members):
@@ -189,7 +187,7 @@ def _ridge(z: Array, y: Array) -> Array:
     size = np.sqrt(np.mean(z**2, axis=0))
     size = np.where(size > 0, size, 1.0)
     z = z / size
-    gram = z.T @ z + RIDGE * len(z) * np.eye(z.shape[1])
+    gram = z.T @ z + MEMORY_RIDGE * len(z) * np.eye(z.shape[1])
     return np.asarray(np.linalg.solve(gram, z.T @ y) / size[:, None])
 
 
@@ -197,7 +195,7 @@ def forecast(
     judges: Sequence[Judge],
     episodes: tuple[Episode, ...],
     starts: Starts,
-    act: Inputs,
+    act: Feedback,
     loosest: str,
 ) -> Forecast:
     """Return what a policy changes on the plant: 90 % of true changes shall lie inside.
@@ -211,7 +209,7 @@ def forecast(
     independent = sum(len(each[::2]) for each in records(judges[0].dynamics.problem, episodes))
     count = len(episodes)
     rng = np.random.default_rng(0)
-    some = -(-RUNS // count)
+    some = -(-MIN_RUNS // count)
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
     begins = [np.stack([each.thetas[:1] for each in episodes]), drawn.reshape(count, some, -1)]
     found: list[tuple[float, float, float, str]] = []
@@ -259,7 +257,7 @@ def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float,
     apart = (changes - ratios[:, None] * size) / size.mean(axis=1, keepdims=True)
     of_episodes = np.sqrt(apart.mean(axis=0).var(ddof=1) / independent)
     of_fits = np.sqrt((len(ratios) - 1) * ratios.var())
-    likely = [stats.t.ppf(SURE, max(k - 1, 1)) for k in (independent, len(ratios))]
+    likely = [stats.t.ppf(ONE_SIDED, max(k - 1, 1)) for k in (independent, len(ratios))]
     mean = float(ratios.mean())
     up = down = float(likely[0] * of_episodes)
     if independent >= EACH:

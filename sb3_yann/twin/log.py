@@ -18,7 +18,7 @@ from sb3_yann.log import SECONDS, Log
 from sb3_yann.twin.row_layout import ROUNDED
 
 SHORTEST = 5  # steps that an episode has at least
-LARGE = 1e100  # beyond this, squares and their sums overflow
+OVERFLOW = 1e100  # beyond this, squares and their sums overflow
 EXPLAINED = 1e-3  # an estimate's moves follow the model's errors but for so much of their squares
 
 
@@ -164,7 +164,7 @@ def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
 
 def _finite(name: str, values: ArrayLike) -> Array:
     array = to_float(name, values)
-    finite = np.abs(array) < LARGE  # nor is NaN
+    finite = np.abs(array) < OVERFLOW  # nor is NaN
     if not np.all(finite):
         row = int(np.argwhere(~finite)[0][0])
         raise ValueError(

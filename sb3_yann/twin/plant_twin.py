@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._progress import shown
 from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.control import LinearMPC, StateEstimator
+from sb3_yann.control.identification.residuals import FOLDS
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.log import SECONDS, Log
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
@@ -28,7 +29,6 @@ from sb3_yann.twin.log import (
 )
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import (
-    FOLDS,
     KINDS,
     Candidate,
     Setting,
@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BLOCKS = 40  # pieces of a log of few episodes that its members are fitted to some of
-AHEAD = 20  # steps of the windows that networks are fitted to
+WINDOW_STEPS = 20  # steps of the windows that networks are fitted to
 HIDDEN_SETTINGS = Setting(1, 1e-4, 1.0), Setting(2, 1e-4, 1.0), Setting(2, 1e-6, 1.0)
 """How the residuals of states that nothing shows are fitted, the least free first."""
-ROWS = 100
+LONG_LOG = 100
 LACKS = 0.01
 """Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
 episodes err by so much of the mean."""
@@ -335,11 +335,11 @@ class _Fit:
         runs = held_out(coordinates, parts, choices)
         chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
         known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
-        long = sum(map(len, parts)) >= ROWS and len(parts) > 1 and not hidden
+        long = sum(map(len, parts)) >= LONG_LOG and len(parts) > 1 and not hidden
         members: list[Residual] = []
         if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
             networks = fit_ensemble(
-                coordinates, [*kept, *drawn], self.seed, ahead=AHEAD, updates=self.updates
+                coordinates, [*kept, *drawn], self.seed, ahead=WINDOW_STEPS, updates=self.updates
             )
             choices.append(Candidate("network", tuple(networks[: len(kept)])))
             runs = held_out(coordinates, parts, choices)

@@ -19,17 +19,19 @@ from scipy import linalg
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearModel, LinearMPC, Terminal
+from sb3_yann.control.identification.residuals import FOLDS
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.coordinates import steady_states
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.forecast import Judge, surely_worse
 from sb3_yann.twin.log import Episode, pieces
+from sb3_yann.units import FLOAT32_ROUNDING
 
 HIDDEN = 48  # units in each of two hidden layers
-BATCH = 256  # rows in a step of Adam
+ROWS_OF_STEP = 256  # rows in a step of Adam
 WINDOWS = 32  # windows of a log in a step of Adam
-RATE = 5e-3  # of Adam at first, for single steps; it falls to zero
-ROUNDING = 1e-6  # of float32 observations, in how far the states move
+FIT_RATE = 5e-3  # of Adam at first, for single steps; it falls to zero
+
 RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
 
 
@@ -54,7 +56,7 @@ def fit_ensemble(
     pairs = [[np.concatenate(part) for part in zip(*each, strict=True)] for each in rows]
     # Single steps of a simulator are known to many digits, those of a log are not.
     dtype = th.float64 if ahead == 1 else th.float32
-    networks = _Networks(pairs, ROUNDING * coordinates.units, generator, dtype)
+    networks = _Networks(pairs, FLOAT32_ROUNDING * coordinates.units, generator, dtype)
     networks.fit_steps(pairs, updates if ahead == 1 else updates // 2)
     if ahead > 1:
         networks.fit_windows(coordinates, logs, ahead, updates // 5)
@@ -112,8 +114,8 @@ class _Networks:
     def fit_steps(self, pairs: list[list[Array]], updates: int) -> None:
         """Fit them to single steps."""
         z, y = (self.tensor(_same_length([each[i] for each in pairs])) for i in (0, 1))
-        for _ in self._steps(RATE, updates):
-            chosen = th.randint(z.shape[1], (BATCH,), generator=self.generator)
+        for _ in self._steps(FIT_RATE, updates):
+            chosen = th.randint(z.shape[1], (ROWS_OF_STEP,), generator=self.generator)
             (((self(z[:, chosen]) - y[:, chosen]) / self.unit) ** 2).mean().backward()  # type: ignore[no-untyped-call]
 
     def fit_windows(
@@ -138,7 +140,7 @@ class _Networks:
         )
         turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
         per_turn = th.where(turn > 0, 1 / turn, 0.0)
-        for _ in self._steps(RATE / 5, updates):
+        for _ in self._steps(FIT_RATE / 5, updates):
             chosen = th.randint(data.shape[1], (WINDOWS,), generator=self.generator)
             window = data[:, chosen]
             x = window[..., :n, 0]
@@ -198,9 +200,9 @@ KINDS = ("none", *DEGREES, "network")
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 INPUT_FACTORS = (1.0, 30.0)
 """How many times as strongly inputs are shrunk: the log of a closed loop shows little of them."""
-LONGEST = 100  # steps of a free run, at most
+LONGEST_RUN = 100  # steps of a free run, at most
 RUNS = 20  # free runs in an episode
-FOLDS = 5
+
 GAINS = (0.6, 1.7)  # times the model's: an input may act so, unless the log refutes it
 LOOSE = 1e-3
 FIRM = 1e3
@@ -362,7 +364,7 @@ def held_out(
     """Return the errors of free runs of candidates over episodes, each without its fold."""
     if len(parts) < 2:
         return FreeRuns(np.array([1]), np.full((len(choices), 1, 1), np.inf))
-    longest = min(LONGEST, int(np.median([*map(len, parts)])))
+    longest = min(LONGEST_RUN, int(np.median([*map(len, parts)])))
     horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
     errors = np.empty((len(choices), len(parts), len(horizons)))
     for i, episode in enumerate(bar("candidates on held-out episodes", parts)):

@@ -19,6 +19,7 @@ from sb3_yann.twin.alignment import made_by_law, objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual, law_of
 from sb3_yann.twin.log import Episode, more_of, records
 from sb3_yann.twin.selection import FreeRuns
+from sb3_yann.units import FLOAT32_ROUNDING
 
 COST_ERROR = 0.25
 """The largest error of a predicted episode cost, relative to the mean cost, that is trusted."""
@@ -27,7 +28,7 @@ FOREIGN = 10.0  # A model that errs by so many times what moves describes anothe
 POOR = 2.0  # from so many times on, a report asks whether it is the same plant
 OUTSIDE = 0.05  # share of logged rows beyond the box of theta from which on units are doubted
 PREVIOUS = 0.01  # how far theta's previous input may be from the one before it, in half-widths
-ROUNDING = 1e-6  # of a half-width: float32 rounds so much
+
 ALONE = 0.02
 """An input's gain is known from the data where at least this share of its variance is its own."""
 
@@ -148,7 +149,7 @@ def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array
 def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
     """Return the share of logged rows (n_theta,) where an entry lies beyond the box of theta."""
     theta = np.concatenate([each.thetas[:, : problem.n_theta] for each in episodes])
-    room = ROUNDING * problem.theta_half
+    room = FLOAT32_ROUNDING * problem.theta_half
     low = problem.deviations.theta_min - room
     high = problem.deviations.theta_max + room
     return np.asarray(np.mean((theta < low) | (theta > high), axis=0))

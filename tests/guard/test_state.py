@@ -43,7 +43,7 @@ from sb3_yann.compare import Scores, Starts, Tolerance
 from sb3_yann.evaluation.plots import plot_decisions, plot_headroom
 from sb3_yann.guard import callback
 from sb3_yann.guard import state as record
-from sb3_yann.guard.state import ADVICE, Evidence, summary_of
+from sb3_yann.guard.state import REFUSAL_ADVICE, Evidence, summary_of
 from weights import is_mpc
 
 NAMES = [each.name for each in dataclasses.fields(Decision)]
@@ -265,7 +265,7 @@ def said_of(
 
 
 def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
-    kind = next(iter(ADVICE))
+    kind = next(iter(REFUSAL_ADVICE))
     refused = [decision("rejected", 39.0, f"seed {i}: {kind}, by {i}") for i in (3, 4)]
     others = [decision("rejected", 39.0, "mean cost 5"), decision("accepted", 39.0)]
     decisions = [*refused, *others, decision("accepted in part", 30.0, "half")]
@@ -276,7 +276,7 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
         "  violations   more than the MPC's from 0 of 12 starts",
         "  candidates   1 accepted, 1 in part, 3 refused, in 7 episodes",
         f"  refused      most often (2 times): seed 3: {kind}, by 3",
-        f"  next         {ADVICE[kind]}",
+        f"  next         {REFUSAL_ADVICE[kind]}",
     ]
 
 

@@ -10,4 +10,4 @@ from sb3_yann.twin import plant_twin
 @pytest.fixture(autouse=True)
 def no_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no log be long enough for them."""
-    monkeypatch.setattr(plant_twin, "ROWS", 10**9)
+    monkeypatch.setattr(plant_twin, "LONG_LOG", 10**9)

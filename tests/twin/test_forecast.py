@@ -172,7 +172,7 @@ def episodes(mpc: LinearMPC, act: Any, seeds: range) -> tuple[list[Any], np.ndar
 def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_networks(
     monkeypatch,
 ) -> None:
-    monkeypatch.setattr(plant_twin, "ROWS", 100)
+    monkeypatch.setattr(plant_twin, "LONG_LOG", 100)
     mpc = motor()
     logged, (_, before) = episodes(mpc, None, range(100, 130))[0], episodes(mpc, None, TESTS)
     for kinds in (("none", "linear", "quadratic"), ("none", "network")):

@@ -20,8 +20,8 @@ from sb3_yann._validation import Array
 
 INFEASIBLE = 0
 SOLVED = 1
-UNKNOWN = 2
-"""What comes of a point. What is UNKNOWN has no certificate, and another solver is asked."""
+UNCERTIFIED = 2
+"""What comes of a point. What is UNCERTIFIED has no certificate, and another solver is asked."""
 
 ENTERING_TOL = 1e-10
 """Relative to 1 + |d|: a constraint that is violated by more enters the active set."""
@@ -255,7 +255,7 @@ def solve_batch(
             slack[j] = d[j]
         least = np.abs(d).max() if soft else 0.0
         size = 0
-        status[at] = UNKNOWN
+        status[at] = UNCERTIFIED
         own_set = active[at]
         lam = multipliers[at]
         for _ in range(10 * (rows + 10)):
@@ -268,7 +268,7 @@ def solve_batch(
                 gram, extra, entering, -slack[entering], own_set, lam, size, factor, step, column
             )
             if found < 0:
-                status[at] = INFEASIBLE if found == -1 else UNKNOWN
+                status[at] = INFEASIBLE if found == -1 else UNCERTIFIED
                 break
             size = found
             _slacks(d, gram, own_set, lam, size, slack)

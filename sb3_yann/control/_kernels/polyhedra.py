@@ -18,7 +18,7 @@ UNBOUNDED = 2
 STUCK = 3
 SAME = 1e-9
 """Rows that differ by less, their distances relative to the polyhedron's radius, are equal."""
-NOISE = 1e-14
+SLACK_ROUNDING = 1e-14
 """Distances differ by so much from rounding alone."""
 
 
@@ -207,12 +207,12 @@ def _facets(A: Array, b: Array, inside: Array, radius: float, kept: Integers, me
     x = np.empty(n)
     mean[:] = 0.0
     count = 0
-    room = SAME * radius + 10 * NOISE
+    room = SAME * radius + 10 * SLACK_ROUNDING
     free = np.empty(m, np.int64)
     for k in range(m):
         twins = 1
         for i in range(m):
-            same = abs(slack[i] - slack[k]) <= SAME * radius + NOISE
+            same = abs(slack[i] - slack[k]) <= SAME * radius + SLACK_ROUNDING
             for j in range(n):
                 same = same and abs(A[i, j] - A[k, j]) <= SAME
             twins = 2 if same and i != k and kept[i] else twins

@@ -180,7 +180,7 @@ def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Arr
     return A, B
 
 
-CHANCE = 0.01  # significance level of an input's effect
+EFFECT_LEVEL = 0.01  # significance level of an input's effect
 
 
 def input_notes(
@@ -194,7 +194,7 @@ def input_notes(
     lags = found_delays(episodes, m + d)
     notes = []
     for column, (name, lag) in enumerate(zip(names(sizes)[n:], lags, strict=True), n):
-        idle = _chance(found, n, column) > CHANCE
+        idle = _chance(found, n, column) > EFFECT_LEVEL
         if lag:
             start = f"{name} has no effect beyond chance, and t" if idle else "T"
             cure = f" Move its measurements {lag} samples down, in the log and on the plant."

@@ -20,13 +20,13 @@ from sb3_yann.control.identification.dead_time import (
     with_memory_point,
 )
 from sb3_yann.control.identification.least_squares import (
-    FAR,
+    EXTRAPOLATED,
     Regression,
     operating_point,
     regress,
     regularized,
 )
-from sb3_yann.control.identification.residuals import AHEAD, listed, quality_notes
+from sb3_yann.control.identification.residuals import LONG_PREDICTION, listed, quality_notes
 from sb3_yann.control.linear_system import LinearSystem, names
 from sb3_yann.log import Episode, Log, split_episodes
 
@@ -76,7 +76,7 @@ def fit_log(
     shrunk = list[str]()
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
-    fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
+    fits = (_fit(found, tested, 1), _fit(found, tested, LONG_PREDICTION))
     system = system_of(found, sizes, given, log.dt, delays)
     system = replace(_with_exact_memory(system, delays, sizes[0]), time_unit=log.time_unit)
     late = [] if any(delays) else input_notes(found, episodes, sizes)
@@ -117,7 +117,7 @@ def system_of(
     if drifts:
         words = f"moves by {listed(drift)} in one step. The model leaves that out."
         notes.append(f"At the operating point the fitted plant {words}")
-    away = np.flatnonzero(np.abs(x - found.center[:n]) > FAR * found.spread[:n])
+    away = np.flatnonzero(np.abs(x - found.center[:n]) > EXTRAPOLATED * found.spread[:n])
     if away.size:
         notes.append(f"x_ss[{away[0]}] lies far outside the data: the model is extrapolated.")
     return LinearSystem(A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None)
@@ -186,9 +186,9 @@ def _memory_notes(delays: list[int], sizes: tuple[int, int, int], u_ss: Array) -
     ]
 
 
-SHARE = 0.05
+REPEATED_SHARE = 0.05
 """Of all rows: so many repeated readings of one sensor are too many."""
-LEAST = 10
+LEAST_REPEATS = 10
 TIMES = 10.0
 """Equal readings in a row that a frozen sensor shows at least; how many times as many as usual."""
 
@@ -219,9 +219,9 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
     for i in range(states[0].shape[1]):
         runs = [*_runs([x[:, i] for x in states], i)]
         usual = float(np.median([*map(len, runs)]))
-        long = [each for each in runs if len(each) >= max(LEAST, TIMES * usual)]
+        long = [each for each in runs if len(each) >= max(LEAST_REPEATS, TIMES * usual)]
         those = _unexplained(states, driven, i, runs, long) if long else []
-        if sum(map(len, those)) > SHARE * rows:
+        if sum(map(len, those)) > REPEATED_SHARE * rows:
             found += those
     return found
 
@@ -286,7 +286,7 @@ def _unexplained(
         alive = bool(some) and all(np.median(each) > 0.2 * typical for each in some)
         rests = clipped or (comes_back and predicted < 1)
         sure = predicted > 1 or (predicted > 1e-3 and alive)
-        if np.any(moving > SHARE * spread) and sure and not rests:
+        if np.any(moving > REPEATED_SHARE * spread) and sure and not rests:
             found.append(run)
     return found
 

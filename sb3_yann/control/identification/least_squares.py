@@ -225,8 +225,8 @@ def pole_note(found: Regression, n: int) -> str:
     return text
 
 
-FAR = 5.0  # spreads from the mean of the data beyond which a model is extrapolated
-SURE = 5.0
+EXTRAPOLATED = 5.0  # spreads from the mean of the data beyond which a model is extrapolated
+SURE_ERRORS = 5.0
 """Standard errors above which a direction does not integrate: those of an integrator are not normal
 (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
 
@@ -278,11 +278,11 @@ def _directions(moves: Array, doubt: Array) -> tuple[Array, Array, Array, NDArra
     """Return the singular value decomposition, and which directions differ from an integrator."""
     left, sizes, right = np.linalg.svd(moves, full_matrices=False)
     errors = np.sqrt(np.sum((left.T**2 @ doubt**2) * right**2, axis=1))
-    return left, sizes, right, (sizes > SURE * errors) & (sizes > 1e-9)
+    return left, sizes, right, (sizes > SURE_ERRORS * errors) & (sizes > 1e-9)
 
 
 def _way(moves: Array, drift: Array, doubt: Array) -> Array:
     """Return the step to the steady state along the directions that the data determine."""
     left, sizes, right, known = _directions(moves, doubt)
     steps = -(left.T @ drift) / np.where(known, sizes, 1.0)
-    return np.asarray(right.T @ np.where(known & (np.abs(steps) <= FAR), steps, 0.0))
+    return np.asarray(right.T @ np.where(known & (np.abs(steps) <= EXTRAPOLATED), steps, 0.0))

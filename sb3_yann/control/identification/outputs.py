@@ -28,15 +28,15 @@ from sb3_yann.control.identification.least_squares import NOT_EXCITED
 from sb3_yann.control.identification.residuals import curvature_test, project_out
 from sb3_yann.log import Episode, split_episodes
 
-AHEAD = 20
+RUN_AHEAD = 20
 """Samples of the free runs over held-out data."""
 MAX_ORDER = 16
 BETTER = 0.85
 """Mean square of free runs, relative to the criterion's choice, below which another is taken."""
-PATIENCE = 4  # orders without a better criterion after which none is tried any more
-SURE = 10.0
+ORDER_PATIENCE = 4  # orders without a better criterion after which none is tried any more
+SURE_DELAY = 10.0
 """By so much, over all steps, dead time must lower the criterion."""
-ROUNDING = 1e-12
+NO_MOVE = 1e-12
 SETTLING = 30  # samples in which a filter finds the first state
 FOLLOWS = 0.1  # share of an input that its feedback law leaves, below which the notes say so
 WORSE = 1.1
@@ -52,7 +52,7 @@ class Structure:
     errors: Array  # (q,), root mean square of free runs, in spreads of the outputs
     criterion: float  # Hannan and Quinn's, for each step
     start: tuple[Array, Array]  # mean (n,) and covariance (n, n) of the states
-    fits: tuple[Array, Array]  # (q,) each, one and `AHEAD` steps ahead, in percent
+    fits: tuple[Array, Array]  # (q,) each, one and `RUN_AHEAD` steps ahead, in percent
     refined: bool = False  # by prediction errors
     idle: tuple[int, ...] = ()  # inputs and disturbances without effect beyond chance
     feedback: tuple[tuple[int, float], ...] = ()  # inputs that follow outputs; what does not
@@ -87,7 +87,7 @@ def fit_structure(
         searches = [Search(fitted, known, tested, lags, tries) for lags in trials]
         rough = [each.rough(order) for each in searches]
         best = int(np.argmin([each.criterion for each in rough]))
-        sure = rough[best].criterion < rough[0].criterion - SURE / sum(map(len, fitted))
+        sure = rough[best].criterion < rough[0].criterion - SURE_DELAY / sum(map(len, fitted))
         if not sure or rough[best].error > rough[0].error * WORSE:
             best = 0
         found = searches[best].best(order)
@@ -123,9 +123,9 @@ def _feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, flo
     now = u[:, -m:]
     own = np.column_stack([np.ones(len(u)), u[:, :-m]])
     alone = np.mean(project_out(own, now) ** 2, axis=0)
-    left = np.mean(project_out(np.hstack([own, y]), now) ** 2, axis=0) / np.maximum(alone, ROUNDING)
-    moves = alone > ROUNDING * np.var(now, axis=0)
-    if tied := [j for j in range(m) if moves[j] and left[j] < ROUNDING]:
+    left = np.mean(project_out(np.hstack([own, y]), now) ** 2, axis=0) / np.maximum(alone, NO_MOVE)
+    moves = alone > NO_MOVE * np.var(now, axis=0)
+    if tied := [j for j in range(m) if moves[j] and left[j] < NO_MOVE]:
         raise ValueError(
             f"u[{tied[0]}] is a function of earlier outputs and inputs: a feedback law alone sets "
             f"it. {NOT_EXCITED}"
@@ -158,7 +158,7 @@ class Search:
         for n in range(1, self.largest + 1) if order is None else [min(order, self.past.limit)]:
             self.tried.append(self.assessed(self.past.model(n)))
             best = int(np.argmin([each.criterion for each in self.tried]))
-            if len(self.tried) - best > PATIENCE:
+            if len(self.tried) - best > ORDER_PATIENCE:
                 break
         return self.tried[best]
 
@@ -222,7 +222,10 @@ class Search:
 
 
 def free_run_errors(
-    model: Innovations, episodes: Sequence[Episode], start: tuple[Array, Array], ahead: int = AHEAD
+    model: Innovations,
+    episodes: Sequence[Episode],
+    start: tuple[Array, Array],
+    ahead: int = RUN_AHEAD,
 ) -> tuple[Array, Array]:
     """Return the root mean square (q,) so many samples ahead, and the fit in percent."""
     longer = [each for each in episodes if len(each) > ahead]
@@ -253,7 +256,7 @@ def predicted(
     return np.asarray(x @ model.C.T + model.y_0)
 
 
-RIDGE = 1e-3
+STAND_IN_RIDGE = 1e-3
 """Of the number of readings: filtered signals depend on each other."""
 
 
@@ -280,7 +283,7 @@ def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Epis
         wanted = np.concatenate([each[:, i] for each in y])
         at = np.isfinite(wanted)
         mean = wanted[at].mean()
-        gram = rows[at].T @ rows[at] + RIDGE * at.sum() * np.eye(rows.shape[1])
+        gram = rows[at].T @ rows[at] + STAND_IN_RIDGE * at.sum() * np.eye(rows.shape[1])
         weights = np.linalg.solve(gram, rows[at].T @ (wanted[at] - mean))
         for part, each in zip(parts, filled, strict=True):
             guess = mean + part @ weights

@@ -13,10 +13,10 @@ from sb3_yann._validation import Array
 from sb3_yann.control.identification.least_squares import WEAK, Regression, neighbors, pole_note
 from sb3_yann.log import Episode
 
-ROWS = 4  # steps for each feature, at least: with fewer the features fit anything
-MOST = 12  # main components, at most: a long log with many states must not take minutes
-SHARE = 0.1
-CHANCE = 1e-3
+STEPS_PER_FEATURE = 4  # steps for each feature, at least: with fewer the features fit anything
+MAX_COMPONENTS = 12  # main components, at most: a long log with many states must not take minutes
+CURVATURE_SHARE = 0.1
+CURVATURE_LEVEL = 1e-3
 """Least share of the residuals' variance, and its significance, from which curvature is named."""
 
 
@@ -28,9 +28,9 @@ def features(regressors: Array) -> Array:
     k, p = regressors.shape
     spread = np.sqrt(np.mean(regressors**2, axis=0))
     z = regressors / np.where(spread > 0, spread, 1.0)
-    room = k // ROWS - p - 1
+    room = k // STEPS_PER_FEATURE - p - 1
     kept = 0
-    while kept < min(p, MOST) and (kept + 1) * (kept + 4) / 2 <= room:
+    while kept < min(p, MAX_COMPONENTS) and (kept + 1) * (kept + 4) / 2 <= room:
         kept += 1
     if not kept:
         return np.zeros((k, 0))
@@ -64,8 +64,8 @@ def curvature_test(found: Regression, episodes: list[Episode]) -> tuple[Array, A
     rest = np.where(real, rest, 1.0)
     share = 1 - (rest / free) / (size / (free + q))
     ratio = ((size - rest) / q) / np.maximum(rest / free, np.finfo(float).tiny)
-    sure = real & (np.asarray(fdtrc(q, free, ratio)) < CHANCE)
-    return np.asarray(np.where(sure & (share > SHARE), share, 0.0)), after
+    sure = real & (np.asarray(fdtrc(q, free, ratio)) < CURVATURE_LEVEL)
+    return np.asarray(np.where(sure & (share > CURVATURE_SHARE), share, 0.0)), after
 
 
 def project_out(basis: Array, values: Array) -> Array:
@@ -76,8 +76,8 @@ def project_out(basis: Array, values: Array) -> Array:
     return np.asarray(values - left @ (left.T @ values))
 
 
-NOISE = 0.4  # share of the errors that is left of them at least where they are sensor noise
-ENOUGH = 2000  # steps in which hidden states are looked for
+NOISE_SHARE = 0.4  # share of the errors that is left of them at least where they are sensor noise
+SEARCHED = 2000  # steps in which hidden states are looked for
 FOLDS = 5  # parts of the log, each of which is held out once
 ORDERS = (1, 2, 4, 6)
 """Numbers of earlier samples, each tried with one more hidden state in mind than the one before."""
@@ -100,13 +100,13 @@ class Leftover(NamedTuple):
     @property
     def bends(self) -> NDArray[np.bool_]:
         """Whether squares and products explain what earlier states and inputs do not."""
-        return np.asarray(self.both < (1 - SHARE) * self.lags)
+        return np.asarray(self.both < (1 - CURVATURE_SHARE) * self.lags)
 
     @property
     def may_bend(self) -> NDArray[np.bool_]:
         """Whether squares and products explain it, or about as much as earlier samples do."""
-        some = self.squares < (1 - SHARE) * self.linear
-        return np.asarray(self.bends | (some & (self.lags >= NOISE * self.squares)))
+        some = self.squares < (1 - CURVATURE_SHARE) * self.linear
+        return np.asarray(self.bends | (some & (self.lags >= NOISE_SHARE * self.squares)))
 
     @property
     def is_hidden(self) -> bool:
@@ -116,7 +116,7 @@ class Leftover(NamedTuple):
         of one step, and more is a state that is not measured. Where squares and products show
         curvature, earlier samples extrapolate what is left of it, and nothing can be said.
         """
-        far_less = np.minimum(self.both, self.lags) < NOISE * self.late
+        far_less = np.minimum(self.both, self.lags) < NOISE_SHARE * self.late
         return bool(np.any(far_less & ~self.bends))
 
 
@@ -125,7 +125,7 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
 
     The rows of a log depend on their neighbors, which an F test does not know: by chance, slow
     inputs square to what a hidden state adds. A part of the log that was held out separates them.
-    The first `ENOUGH` steps count. ``delays`` are the dead times of the inputs.
+    The first `SEARCHED` steps count. ``delays`` are the dead times of the inputs.
     """
     n = episodes[0].states.shape[1]
     lags = max(ORDERS[-1], *delays, 0)
@@ -135,10 +135,12 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     width = episodes[0].regressors.shape[1]
     if steps <= 4 * (2 * width + sum(delays) + 1):
         return Leftover(none, none, none, none, none)
-    now = np.concatenate([each.regressors[lags:] for each in longer])[:ENOUGH]
-    target = np.concatenate([each.states[lags + 1 :] for each in longer])[:ENOUGH]
+    now = np.concatenate([each.regressors[lags:] for each in longer])[:SEARCHED]
+    target = np.concatenate([each.states[lags + 1 :] for each in longer])[:SEARCHED]
     past = [
-        np.concatenate([each.regressors[lags - lag : len(each) - lag] for each in longer])[:ENOUGH]
+        np.concatenate([each.regressors[lags - lag : len(each) - lag] for each in longer])[
+            :SEARCHED
+        ]
         for lag in range(1, lags + 1)
     ]
     steps = len(now)
@@ -179,9 +181,9 @@ def _held_out(basis: Array, values: Array, parts: list[NDArray[np.int64]]) -> Ar
     return np.asarray(squares / len(values))
 
 
-AHEAD = 10  # steps of the longer prediction whose fit is stated
+LONG_PREDICTION = 10  # steps of the longer prediction whose fit is stated
 MUCH = 0.5  # share of the residuals from which on curvature explains their colour too
-POOR = 50.0  # percent of the longer prediction's fit below which a model is called poor
+POOR_FIT = 50.0  # percent of the longer prediction's fit below which a model is called poor
 
 
 def quality_notes(
@@ -245,7 +247,7 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
         colored &= np.abs(neighbors(rest, fitted)[:n]) > 3 / np.sqrt(found.steps)
         # Where it explains much, what it leaves is curvature of higher order.
         colored &= share < MUCH
-    elif np.any(explained > 100 * (1 - NOISE)):
+    elif np.any(explained > 100 * (1 - NOISE_SHARE)):
         return [
             f"Earlier states and inputs explain {listed(explained)} % of the residuals' variance, "
             "more than sensor noise lets them: there is a state that is not measured, or dead "
@@ -265,16 +267,16 @@ def _words_for(fits: tuple[Array, Array], steps: int) -> str:
     """Return a note on the fits to held-out data."""
     words = [
         f"{listed(fit)} % {ahead} ahead"
-        for fit, ahead in zip(fits, ("one step", f"{AHEAD} steps"), strict=True)
+        for fit, ahead in zip(fits, ("one step", f"{LONG_PREDICTION} steps"), strict=True)
         if not np.all(np.isnan(fit))
     ]
     if not words:
         return f"The {steps} steps held out tell no fit: they are too few, or nothing moves."
     text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
     if len(words) < len(fits):
-        text += f" No episode of them is {AHEAD} steps long."
-    if np.any(fits[1] < POOR):
-        text += f" Poor: {AHEAD} steps ahead the model says little of the plant."
+        text += f" No episode of them is {LONG_PREDICTION} steps long."
+    if np.any(fits[1] < POOR_FIT):
+        text += f" Poor: {LONG_PREDICTION} steps ahead the model says little of the plant."
     return text
 
 

@@ -24,7 +24,7 @@ from sb3_yann.control.identification.innovations import (
 )
 from sb3_yann.control.identification.least_squares import WEAK, Regression, pole_note, regress
 from sb3_yann.control.identification.outputs import (
-    AHEAD,
+    RUN_AHEAD,
     Structure,
     fit_structure,
     predicted,
@@ -36,7 +36,7 @@ from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
 from sb3_yann.log import Arrays, Episode, Log
 
-APART = 1e3
+MAX_CONDITION = 1e3
 """Condition number of C up to which outputs serve as states."""
 
 
@@ -107,7 +107,7 @@ class IdentifiedOutputs(ReadOnlyArrays):
         self,
         outputs: ArrayLike,
         inputs: ArrayLike,
-        ahead: int = AHEAD,
+        ahead: int = RUN_AHEAD,
         *,
         disturbances: ArrayLike | None = None,
     ) -> Array:
@@ -317,7 +317,7 @@ def _in_plant_units(
     rest = center[:q] + unit * model.y_0
     sizes = np.linalg.svd(model.C, compute_uv=False)
     T = np.eye(n)
-    if n >= q and sizes[-1] * APART > sizes[0]:
+    if n >= q and sizes[-1] * MAX_CONDITION > sizes[0]:
         T = np.vstack([C, linalg.null_space(model.C).T])
     back = np.linalg.inv(T)
     C = C @ back
@@ -401,7 +401,7 @@ def _notes(
     if not np.all(np.isnan(found.fits[0])):
         notes.append(
             f"Fit over data held out, 100 % is perfect: {listed(found.fits[0])} % one step ahead, "
-            f"{listed(found.fits[1])} % {AHEAD} steps ahead."
+            f"{listed(found.fits[1])} % {RUN_AHEAD} steps ahead."
         )
     if any(found.delays):
         notes.append(

@@ -12,9 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.problem import MPCProblem
-
-ROUNDING = 1e-6
-"""Half-widths beyond a bound that float32 observations and actions make."""
+from sb3_yann.units import FLOAT32_ROUNDING
 
 
 @dataclass(frozen=True)
@@ -199,7 +197,7 @@ def bound_excess(
             parts.append(np.maximum(values - high, low - values) / half)
         parts.append(np.abs(mixed_beyond(problem, thetas[:-1], inputs)))
         over = np.concatenate(parts, axis=-1)
-    counts = ~(over <= ROUNDING) & np.asarray(taken)[..., None]
+    counts = ~(over <= FLOAT32_ROUNDING) & np.asarray(taken)[..., None]
     nothing = np.zeros(thetas.shape[1:-1])
     if not counts.any():  # mostly
         return BoundExcess(nothing, nothing, nothing, nothing, nothing - 1)

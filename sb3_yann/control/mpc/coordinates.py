@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import linalg
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_bounds, to_float
+from sb3_yann._validation import Array, Bounds, Given, ReadOnlyArrays, check_bounds, to_float
 from sb3_yann.control.model.linear_model import LinearModel
 
 
@@ -165,10 +165,6 @@ class ThetaLayout:
 
 def _after(part: slice, size: int) -> slice:
     return slice(part.stop, part.stop + size)
-
-
-Bounds = tuple[Array, Array]
-Given = ArrayLike | None
 
 
 def constant_box(layout: ThetaLayout, r: Bounds, d: Bounds) -> list[Bounds]:

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann import _validation as check
 from sb3_yann._validation import (
     Array,
+    Bounds,
+    Given,
     ReadOnlyArrays,
     check_array,
     check_bounds,
@@ -19,8 +21,6 @@ from sb3_yann._validation import (
     to_float,
 )
 
-Bounds = tuple[Array, Array]
-Given = ArrayLike | None
 Outputs = ArrayLike | Sequence[int]
 HalfSpaces = tuple[ArrayLike, ArrayLike]
 

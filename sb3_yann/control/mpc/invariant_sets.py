@@ -14,11 +14,11 @@ from sb3_yann.control.mpc.groups import Terminal
 from sb3_yann.control.mpc.problem import MPCProblem
 from sb3_yann.control.polyhedra import bounded_region, farthest_points
 
-MARGIN = 0.01
+STEADY_MARGIN = 0.01
 """How far inside the bounds steady states must lie, relative to the bounds."""
-MAX_ROWS = 200
+MAX_FACETS = 200
 MAX_STEPS = 500
-Rows = tuple[Array, Array]  # half-spaces F theta <= g
+Facets = tuple[Array, Array]  # half-spaces F theta <= g
 
 
 def completed(problem: MPCProblem) -> Terminal:
@@ -70,7 +70,7 @@ def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> 
     )
 
 
-def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
+def invariant_set(problem: MPCProblem, cost: Array) -> Facets:
     """Return F (rows, n_theta) and g (rows,): the maximal output admissible set F theta <= g.
 
     The problem comes without previews.
@@ -111,14 +111,14 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     found = _remove_redundant((rows, bounds), granted)
     if parts.constant.start < parts.constant.stop:
         moving = np.any(np.abs(steady) > 1e-12, axis=1)
-        inside = (steady[moving], (1 - MARGIN) * bounds[moving])
+        inside = (steady[moving], (1 - STEADY_MARGIN) * bounds[moving])
         found = np.vstack([found[0], inside[0]]), np.concatenate([found[1], inside[1]])
     found = _until_nothing_new((rows, bounds), closed, found, granted)
     F, g = _remove_redundant(found, granted)
     return F / half, g + F @ (rest / half)
 
 
-def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -> Rows:
+def _until_nothing_new(ahead: Facets, closed: Array, found: Facets, granted: Facets) -> Facets:
     """Add the bounds of later steps until those of one step say nothing new."""
     (F, g) = found
     (later, bounds) = ahead
@@ -131,9 +131,9 @@ def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -
             return F, g
         F = np.vstack([F, later[new]])
         g = np.concatenate([g, bounds[new]])
-        if len(g) > MAX_ROWS:
+        if len(g) > MAX_FACETS:
             raise ValueError(
-                f"The invariant terminal set has more than {MAX_ROWS} half-spaces. Give the "
+                f"The invariant terminal set has more than {MAX_FACETS} half-spaces. Give the "
                 "state more weight, sample more slowly, or pass a terminal set of your own."
             )
     raise ValueError(
@@ -142,7 +142,9 @@ def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -
     )
 
 
-def hard_rows(problem: MPCProblem, kinds: tuple[str, ...] = ("u", "x", "y", "du", "mixed")) -> Rows:
+def hard_rows(
+    problem: MPCProblem, kinds: tuple[str, ...] = ("u", "x", "y", "du", "mixed")
+) -> Facets:
     """Return the hard bounds of these kinds: rows (k, n_theta + m) of [theta; u], and their ends.
 
     They are of one sample. Bounds that change at run time are entries of theta.
@@ -182,7 +184,7 @@ def _steady_projection(problem: MPCProblem, half: Array) -> Array:
     return np.asarray(at_rest / half[:, None] * half)
 
 
-def _granted(problem: MPCProblem, half: Array) -> Rows:
+def _granted(problem: MPCProblem, half: Array) -> Facets:
     """Return the half-spaces that every predicted theta satisfies anyway."""
     first = problem.layout.constant.start
     rows = np.vstack([np.eye(problem.n_theta)[first:], -np.eye(problem.n_theta)[first:]])
@@ -193,7 +195,7 @@ def _granted(problem: MPCProblem, half: Array) -> Rows:
     return rows[bounded], bounds[bounded]
 
 
-def _remove_redundant(found: Rows, granted: Rows) -> Rows:
+def _remove_redundant(found: Facets, granted: Facets) -> Facets:
     """Return the half-spaces that the others and the granted ones do not imply."""
     (rows, bounds) = found
     kept = list(range(len(found[1])))
@@ -220,9 +222,9 @@ def _is_redundant(row: Array, bound: float, A: Array, b: Array) -> bool:
     return bool(best.status == 0 and -best.fun <= bound + 1e-9)
 
 
-FEW = 1e-9
+ZERO_LENGTH = 1e-9
 """A column or a radius, in half-widths, that counts as zero."""
-ROOM = 1e-5
+UNPLANNED_MOVE = 1e-5
 """Half-widths that inputs which the MPC does not plan leave from one step to the next."""
 
 
@@ -266,7 +268,7 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     bounds = _scaled(hard_rows(problem, ("x", "y")), unit)
     bounds = bounds[0][:, :n], bounds[1]
 
-    def before(rows: Rows, room: float = 0.0) -> Rows | None:
+    def before(rows: Facets, room: float = 0.0) -> Facets | None:
         F, g = rows
         return _without_inputs((np.hstack([F @ own, F @ forced]), g - room), inputs, box)
 
@@ -283,7 +285,7 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     most_steps = 0 if nothing else problem.horizon if ends else most_steps
     while steps < most_steps and not settled:
         # What the MPC does not plan itself needs room: an unstable plant leaves an edge at once.
-        earlier = before(found, ROOM if not ends and steps >= problem.horizon else 0.0)
+        earlier = before(found, UNPLANNED_MOVE if not ends and steps >= problem.horizon else 0.0)
         earlier = None if earlier is None else _reduced(_joined(bounds, earlier), box)
         if earlier is None or len(earlier[1]) > most_rows:
             break
@@ -302,7 +304,7 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     return KeptSet(F, g, rows, steps, settled or (ends and steps == problem.horizon))
 
 
-def _around(problem: MPCProblem, half: Array) -> Rows:
+def _around(problem: MPCProblem, half: Array) -> Facets:
     """Return the box of theta, ten times as large in the states, in half-widths."""
     low = problem.theta_min / half
     high = problem.theta_max / half
@@ -316,15 +318,15 @@ def _around(problem: MPCProblem, half: Array) -> Rows:
     return np.vstack([eye, -eye]), np.concatenate([middle + reach, reach - middle])
 
 
-def _scaled(rows: Rows, unit: Array) -> Rows:
+def _scaled(rows: Facets, unit: Array) -> Facets:
     return rows[0] * unit, rows[1]
 
 
-def _joined(*parts: Rows) -> Rows:
+def _joined(*parts: Facets) -> Facets:
     return np.vstack([F for F, _ in parts]), np.concatenate([g for _, g in parts])
 
 
-def _without_inputs(ahead: Rows, inputs: Rows, box: Rows, most: int = 3000) -> Rows | None:
+def _without_inputs(ahead: Facets, inputs: Facets, box: Facets, most: int = 3000) -> Facets | None:
     """Return for which theta some u fulfils the rows of [theta, u]; None where that is too large.
 
     It is the elimination of Fourier and Motzkin.
@@ -333,8 +335,8 @@ def _without_inputs(ahead: Rows, inputs: Rows, box: Rows, most: int = 3000) -> R
     n = box[0].shape[1]
     while F.shape[1] > n:
         last = F[:, -1]
-        above = last > FEW
-        below = last < -FEW
+        above = last > ZERO_LENGTH
+        below = last < -ZERO_LENGTH
         if above.sum() * below.sum() > most:
             return None
         up = F[above] / last[above, None]
@@ -353,14 +355,14 @@ def _without_inputs(ahead: Rows, inputs: Rows, box: Rows, most: int = 3000) -> R
     return F, g
 
 
-def _reduced(rows: Rows, box: Rows) -> Rows | None:
+def _reduced(rows: Facets, box: Facets) -> Facets | None:
     """Return the rows that say something new within a box; None where no theta fulfils them."""
     F, g = rows
     if not len(g):
         return rows
     length = np.linalg.norm(F, axis=1)
-    some = length > FEW
-    if np.any(g[~some] < -FEW):
+    some = length > ZERO_LENGTH
+    if np.any(g[~some] < -ZERO_LENGTH):
         return None
     F = F[some] / length[some, None]
     g = g[some] / length[some]
@@ -370,14 +372,14 @@ def _reduced(rows: Rows, box: Rows) -> Rows | None:
     F = F[kept]
     g = g[kept]
     A, b = _joined((F, g), box)
-    _, radius, facets, _ = bounded_region(A, b, FEW)
-    if radius <= FEW:
+    _, radius, facets, _ = bounded_region(A, b, ZERO_LENGTH)
+    if radius <= ZERO_LENGTH:
         return None
     facets = facets[facets < len(g)]
     return F[facets], g[facets]
 
 
-def _implies(found: Rows, wanted: Rows, box: Rows, room: float = 1e-7) -> bool:
+def _implies(found: Facets, wanted: Facets, box: Facets, room: float = 1e-7) -> bool:
     """Tell whether all theta of one set lie in another, to some room."""
     if not len(wanted[1]):
         return True

@@ -12,12 +12,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, check_array, check_bounds, check_symmetric, to_float, warn
+from sb3_yann._validation import (
+    Array,
+    Bounds,
+    Given,
+    check_array,
+    check_bounds,
+    check_symmetric,
+    to_float,
+    warn,
+)
 from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
-from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine
+from sb3_yann.control.law import INFEASIBLE_OPTIONS, PiecewiseAffine
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.model.identify import Identified
 from sb3_yann.control.model.identify_outputs import IdentifiedOutputs
@@ -25,9 +34,7 @@ from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.coordinates import constant_box, theta_box
 from sb3_yann.control.mpc.groups import (
-    Bounds,
     DisturbanceBounds,
-    Given,
     LinearCost,
     MixedBounds,
     OutputBounds,
@@ -190,7 +197,7 @@ class LinearMPC(MPCProblem):
         m = model.n_inputs
         horizon = _as_horizon(horizon)
         gamma = check.check_discount(gamma)
-        infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE)
+        infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE_OPTIONS)
         Q = check_symmetric("Q", Q, n)
         R = check_symmetric("R", R, m)
         x = check_bounds("x", x_min, x_max, n)

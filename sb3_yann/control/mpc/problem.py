@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_array, half_widths, to_float
+from sb3_yann._validation import Array, Given, ReadOnlyArrays, check_array, half_widths, to_float
 from sb3_yann.control import lqr
 from sb3_yann.control.linear_system import labels_of, with_units
 from sb3_yann.control.model.linear_model import LinearModel
@@ -23,7 +23,6 @@ from sb3_yann.control.mpc.coordinates import (
 )
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
-    Given,
     LinearCost,
     MixedBounds,
     OutputBounds,
@@ -383,7 +382,7 @@ def layout_of(
 
 TOLERANCE = 1e-9
 """How far beyond a bound a steady state still counts as within, relative to the bound."""
-KINDS = "x", "u", "y", "mixed"
+BOUNDED_KINDS = "x", "u", "y", "mixed"
 
 
 def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
@@ -399,7 +398,7 @@ def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
     own = problem.deviations
     mixed = x @ own.mixed.F.T + u @ own.mixed.G.T
     value = np.concatenate([x, u, x @ own.outputs.C.T, mixed], axis=-1)
-    low, high = (np.concatenate([own.limits[kind][k] for kind in KINDS]) for k in (0, 1))
+    low, high = (np.concatenate([own.limits[kind][k] for kind in BOUNDED_KINDS]) for k in (0, 1))
     room = np.concatenate([high - value, value - low], axis=-1)
     bound = np.abs(np.concatenate([high, low]))
     return np.asarray(room + TOLERANCE * np.where(np.isfinite(bound), bound, 0.0))
@@ -416,7 +415,7 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
     x = problem.units.to_plant(problem.steady_states.x @ constant)
     u = problem.units.input_to_plant(problem.steady_states.u @ constant)
     if np.any(room < 0):
-        sizes = {kind: len(problem.limits[kind][0]) for kind in KINDS}
+        sizes = {kind: len(problem.limits[kind][0]) for kind in BOUNDED_KINDS}
         names = [(name, f"[{i}]") for name, size in sizes.items() for i in range(size)]
         sides = [
             f"{a}{i} {side} {a}_{end}{i}"

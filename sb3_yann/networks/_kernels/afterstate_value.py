@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_yann._numba import Single, compiled
-from sb3_yann._validation import Array
+from sb3_yann._numba import compiled
+from sb3_yann._validation import Array, Single
 from sb3_yann.networks._kernels.stack import (
     at_zero,
     first_layers,
@@ -229,11 +229,11 @@ def _forms_backward(
                 by_nodes[0, node, a, j] = by_matrix[j, a]
 
 
-Constants = tuple[Array, Array, Array, Array, Single, float]
+ValueConstants = tuple[Array, Array, Array, Array, Single, float]
 
 
 def value_on_cpu(
-    points: th.Tensor, weights: tuple[th.Tensor, ...], constants: Constants
+    points: th.Tensor, weights: tuple[th.Tensor, ...], constants: ValueConstants
 ) -> th.Tensor:
     """Return an afterstate value (batch, 1), with a gradient by points and weights.
 
@@ -262,7 +262,7 @@ class _Pass:
     """
 
     def __init__(
-        self, constants: Constants, points: th.Tensor, weights: tuple[th.Tensor, ...]
+        self, constants: ValueConstants, points: th.Tensor, weights: tuple[th.Tensor, ...]
     ) -> None:
         self.weights = weights
         entries, nodes, second, last = to_numpy(weights[0], np.float64), *map(to_numpy, weights[1:])
@@ -321,7 +321,7 @@ class _Value(th.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, constants: Constants, points: th.Tensor, *weights: th.Tensor
+        ctx: Any, constants: ValueConstants, points: th.Tensor, *weights: th.Tensor
     ) -> th.Tensor:
         # torch notices weights that change before the backward pass
         ctx.save_for_backward(*weights)

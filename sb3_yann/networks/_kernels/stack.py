@@ -11,9 +11,10 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann._numba import Integers, Single, compiled
+from sb3_yann._numba import Integers, compiled
+from sb3_yann._validation import Single
 
-WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
+WEIGHT_TYPES = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
 """Types of nodes, second, last and pinned, see :func:`network`."""
 
 

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_yann._numba import Integers, Single, compiled
-from sb3_yann._validation import Array
+from sb3_yann._numba import Integers, compiled
+from sb3_yann._validation import Array, Single
 from sb3_yann.control._kernels.law import input_at
 from sb3_yann.networks._kernels.stack import (
-    WEIGHTS,
+    WEIGHT_TYPES,
     network,
     network_backward,
     prepared,
     to_numpy,
 )
 
-KEPT = (
+KEPT_TYPES = (
     "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1], float32[:, :, ::1]"
 )
 """Types of what a forward pass keeps: x, used, slot, two hidden layers, outputs, see `forward`."""
@@ -105,7 +105,7 @@ def _worst(theta: Array, row: int, law: Any, actions: Any, kept: Array) -> tuple
 
 @compiled(
     f"int64(float64[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[::1], "
-    f"float64[:, ::1], float64[:, ::1], float64, {WEIGHTS}, float32[:, ::1], {KEPT})"
+    f"float64[:, ::1], float64[:, ::1], float64, {WEIGHT_TYPES}, float32[:, ::1], {KEPT_TYPES})"
 )
 def forward(
     floats: Array,
@@ -225,7 +225,7 @@ def forward(
 
 
 @compiled(
-    f"void(float32[:, ::1], boolean, float64[:, ::1], float64, {WEIGHTS}, {KEPT}, "
+    f"void(float32[:, ::1], boolean, float64[:, ::1], float64, {WEIGHT_TYPES}, {KEPT_TYPES}, "
     "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1])"
 )
 def backward(

@@ -113,7 +113,10 @@ def test_why_there_is_no_set_is_said(make: object, message: str) -> None:
 
 @pytest.mark.parametrize(
     ("limit", "message"),
-    [("MAX_ROWS", "more than 1 half-spaces. Give"), ("MAX_STEPS", "not determined after 1 steps")],
+    [
+        ("MAX_FACETS", "more than 1 half-spaces. Give"),
+        ("MAX_STEPS", "not determined after 1 steps"),
+    ],
 )
 def test_a_set_that_grows_too_large_is_said_so(
     limit: str, message: str, monkeypatch: pytest.MonkeyPatch

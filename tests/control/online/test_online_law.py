@@ -125,7 +125,7 @@ def test_daqp_is_asked_where_there_is_no_certificate(monkeypatch) -> None:
     def unsure(self: DualProgram, rows: np.ndarray, soft: bool = False) -> object:
         found = solve(self, rows, soft)
         if not soft:
-            found.status[:] = _kernels.UNKNOWN
+            found.status[:] = _kernels.UNCERTIFIED
             found.sizes[:] = 0
         return found
 
