@@ -22,7 +22,8 @@ BOUNDS = {"plant": ([299, -5], [302, 3]), "normalized": ([-1, -1], [1, 1])}
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_bounds_tell_what_an_env_takes(kind: str, dtype: type) -> None:
     low, high = (np.array(side, dtype) for side in BOUNDS[kind])
-    units, own = ActionUnits.of(MPC, low, high), MPC.deviations
+    units = ActionUnits.of(MPC, low, high)
+    own = MPC.deviations
     assert units is not None and units.kind == kind
     np.testing.assert_allclose(units.input([low, high]), [own.u_min, own.u_max], atol=1e-12)
     u = np.random.default_rng(0).uniform(own.u_min, own.u_max, (9, 2))

@@ -41,7 +41,8 @@ def test_arrays_come_back_to_the_bit(path: Path) -> None:
 
 
 def test_every_flipped_bit_is_refused_or_changes_nothing(path: Path) -> None:
-    content, refused = path.read_bytes(), 0
+    content = path.read_bytes()
+    refused = 0
     for at in range(len(content)):
         broken = bytearray(content)
         broken[at] ^= 1 << at % 8
@@ -74,7 +75,8 @@ def overlapping() -> bytes:
     """Return an archive whose thousand entries are one and the same megabyte."""
     whole = archive([("a.npy", entry(claim("<f8", "(131072,)"), bytes(2**20)))])
     start = whole.index(b"PK\x01\x02")
-    listed, end = whole[start : whole.index(b"PK\x05\x06")], whole.index(b"PK\x05\x06")
+    listed = whole[start : whole.index(b"PK\x05\x06")]
+    end = whole.index(b"PK\x05\x06")
     tail = struct.pack("<4sHHHHIIH", b"PK\x05\x06", 0, 0, 999, 999, 999 * len(listed), start, 0)
     assert end > start
     return whole[:start] + 999 * listed + tail

@@ -77,7 +77,9 @@ def test_evaluate_plays_the_mpc_beside_the_model(model, capsys) -> None:
 
 def episode_cost(act, seed: int) -> float:
     env = Cart()
-    x, over, cost = env.reset(seed=seed)[0], False, 0.0
+    x = env.reset(seed=seed)[0]
+    over = False
+    cost = 0.0
     while not over:
         x, reward, _, over, _ = env.step(act(x))
         cost -= reward

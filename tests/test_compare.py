@@ -23,7 +23,8 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control.mpc.bound_excess import BoundExcess
 
-NAN, INF = np.nan, np.inf
+NAN = np.nan
+INF = np.inf
 STRICT = Tolerance(1.0)
 
 
@@ -113,7 +114,8 @@ def test_a_worse_mean_or_one_start_beyond_the_margin_is_refused(costs, why) -> N
 def test_without_a_margin_no_start_may_cost_more_than_rounding() -> None:
     assert refusal([10, 20, 20], margin=0.0) == refusal([10 + 1e-9, 20, 20], margin=0.0) == ""
     assert "start 0" in refusal([10 + 1e-4, 20, 20], margin=0.0)
-    mpc, costs = np.full(4, 10.0), np.array([10.0, 9.0, 11.0, NAN])
+    mpc = np.full(4, 10.0)
+    costs = np.array([10.0, 9.0, 11.0, NAN])
     assert Tolerance(2.0).excess(mpc, costs).tolist() == [0.0, -0.5, 0.5, INF]
     assert Tolerance(0.0).excess(mpc, costs).tolist() == pytest.approx([0.0, -1e5, 1e5, INF])
 
@@ -149,7 +151,8 @@ def test_whoever_is_less_safe_is_refused_whatever_it_costs(now, before, why) -> 
 
 
 def test_with_a_cvar_the_worst_starts_count_on_average() -> None:
-    mpc, rule = np.full(100, 20.0), Tolerance(margin=0.2, cvar_alpha=0.05, typical=20.0)
+    mpc = np.full(100, 20.0)
+    rule = Tolerance(margin=0.2, cvar_alpha=0.05, typical=20.0)
 
     def reason(worst: list[float], tolerance: Tolerance = rule) -> str:
         costs = mpc - 0.5
@@ -164,7 +167,8 @@ def test_with_a_cvar_the_worst_starts_count_on_average() -> None:
 
 
 def test_what_a_start_may_cost_more_grows_with_its_cost() -> None:
-    mpc, rule = np.array([10.0, -60.0, 20.0]), Tolerance(2.0, 0.1, 20.0)
+    mpc = np.array([10.0, -60.0, 20.0])
+    rule = Tolerance(2.0, 0.1, 20.0)
     assert rule.allowed(mpc).tolist() == [2.0, 6.0, 2.0]
     assert Tolerance(2.0, 0.0, 20.0).allowed(mpc).tolist() == [2.0, 2.0, 2.0]
     lost = starts(mpc, rule).lost(scores(mpc + np.array([2.1, 5.9, 1.9])))
@@ -184,7 +188,8 @@ def test_a_policy_that_saves_a_few_dear_starts_may_lose_in_proportion_on_the_oth
 
 
 def test_a_single_start_ten_times_beyond_what_is_allowed_is_too_much_alone() -> None:
-    rule, rest = Tolerance(1.0, 0.5), np.full(99, -50.0)
+    rule = Tolerance(1.0, 0.5)
+    rest = np.full(99, -50.0)
     assert rule.objection(np.append(rest, 10.0)) == rule.objection(np.append(rest, 1.0)) == ""
     assert rule.objection(np.append(rest, 10.1)) == "start 99"
 

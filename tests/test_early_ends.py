@@ -27,7 +27,8 @@ class Dock(gym.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         """Begin at two."""
         super().reset(seed=seed)
-        self.x, self.k = np.array([2.0]), 0
+        self.x = np.array([2.0])
+        self.k = 0
         return self.x.copy(), {}
 
     def step(self, action: Any) -> Any:

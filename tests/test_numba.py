@@ -22,7 +22,8 @@ def test_the_stamp_covers_every_file_that_imports_the_decorator_and_the_decorato
 
 def test_a_file_that_moves_or_is_new_is_found(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
-    moved, plain = tmp_path / "deep" / "moved.py", tmp_path / "plain.py"
+    moved = tmp_path / "deep" / "moved.py"
+    plain = tmp_path / "plain.py"
     moved.write_text('"""Doc."""\n@compiled("void()")\ndef f(): ...\n')
     plain.write_text("def compiled(): ...\n")
     assert compiled_sources(tmp_path)[1:] == [moved]

@@ -38,7 +38,8 @@ class Exact:
 
 def cart(**changes) -> LinearMPC:
     bounds = {"u_min": -1, "u_max": 1, "x_min": [-4, -0.5], "x_max": [4, 0.5]}
-    model, weights = LinearModel([[1, 1], [0, 1]], [[0.5], [1]], 1.0), {"R": [[0.1]], "horizon": 12}
+    model = LinearModel([[1, 1], [0, 1]], [[0.5], [1]], 1.0)
+    weights = {"R": [[0.1]], "horizon": 12}
     return LinearMPC(model, Q=np.diag([1, 0.01]), **{**weights, **bounds, **changes})
 
 
@@ -72,7 +73,9 @@ def test_a_plan_costs_what_a_long_horizon_costs_and_keeps_bounds(rate) -> None:
 
 
 def simulated(mpc: LinearMPC, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    law, thetas, inputs = mpc.online(), [start], []
+    law = mpc.online()
+    thetas = [start]
+    inputs = []
     for _ in range(STEPS):
         inputs.append(law(thetas[-1]))
         thetas.append(mpc.predict(thetas[-1], inputs[-1]))
@@ -112,7 +115,8 @@ def test_bounds_of_combinations_are_kept_at_no_more_than_the_cost_of_a_long_hori
 def test_a_price_is_planned_with() -> None:
     mpc = cart(price=LinearCost(x=[0.2, 0.1], u=0.05), horizon=3)
     start = np.array([0.3, 0.1])
-    found, end = plan(mpc, start[None]), value_at_end(mpc)
+    found = plan(mpc, start[None])
+    end = value_at_end(mpc)
 
     def cost(inputs: np.ndarray) -> float:
         thetas = [start]

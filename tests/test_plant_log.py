@@ -133,7 +133,9 @@ def test_set_points_and_loads_of_a_csv_file_reach_the_twin(tmp_path) -> None:
     )  # fmt: skip
     rng = np.random.default_rng(0)
     lines = ["run,h [cm],q,load,h_sp [cm]"]
-    states, inputs, held = [], [], []
+    states = []
+    inputs = []
+    held = []
     for run in range(6):
         x = [rng.uniform(5, 15)]
         u = rng.uniform(2, 4, 8)

@@ -65,7 +65,8 @@ def write_log() -> None:
     """Write the log that the README reads: a tank under a valve at random, with gaps in time."""
     rng = np.random.default_rng(0)
     plant = LinearModel([[0.9, 0], [0.1, 0.8]], [[0.5], [1.0]], 10)
-    x, rows = np.zeros(2), ["time,level,T,valve"]
+    x = np.zeros(2)
+    rows = ["time,level,T,valve"]
     for k in range(300):
         valve = rng.uniform(-0.5, 0.5)
         rows.append(f"{10 * k + 500 * (k // 60)},{x[0] + 2.5},{x[1] + 35},{valve + 0.5}")
@@ -80,7 +81,8 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, quick_fits) -> None:
     names = run_code("README.md", train + simulate)
     assert (tmp_path / "guard.csv").exists() and (tmp_path / "cstr.zip").exists()
     state = np.zeros(2, np.float32)
-    trained, mpc = names["model"], names["mpc"]
+    trained = names["model"]
+    mpc = names["mpc"]
     np.testing.assert_allclose(trained.predict(state)[0], mpc.explicit()(state), atol=1e-5)
     write_log()
     run_code("README.md", from_log)
@@ -122,7 +124,8 @@ def test_an_environment_of_gymnasium_takes_twelve_lines() -> None:
     code = blocks(page("docs/tutorial.md"))[-1]
     assert len(code.splitlines()) <= 14
     names = run_code("docs/tutorial.md", code)
-    trained, mpc = names["model"], names["mpc"]
+    trained = names["model"]
+    mpc = names["mpc"]
     theta = 0.02 * mpc.theta_max  # type: ignore[attr-defined]
     action = trained.policy.actor_target.mu(torch.as_tensor(theta)[None])  # type: ignore[attr-defined]
     wanted = mpc.law()(theta) / mpc.u_half  # type: ignore[attr-defined]
@@ -134,7 +137,8 @@ def test_a_log_and_equations_of_ones_own_make_an_mpc_and_an_env() -> None:
     from_log, equations, _ = blocks(own)
     np.testing.assert_allclose(run_code("docs/tutorial.md", from_log)["plant"].A, 0.9, atol=0.01)
     names = run_code("docs/tutorial.md", equations)
-    trained, mpc = names["model"], names["mpc"]
+    trained = names["model"]
+    mpc = names["mpc"]
     action = trained.predict(np.array([20.0]))[0]  # type: ignore[attr-defined]
     wanted = mpc.law().plant_input([20.0])  # type: ignore[attr-defined]
     np.testing.assert_allclose(action, wanted, atol=1e-4)
@@ -155,7 +159,9 @@ def test_the_tracking_problem_of_the_page_ends_at_its_reference(tmp_path, monkey
     names = run("docs/mpc.md")
     plant = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
     assert names["plant"] == plant and (tmp_path / "law.npz").exists()
-    law, x, u = names["tracking"].explicit(), np.zeros(2), np.zeros(1)
+    law = names["tracking"].explicit()
+    x = np.zeros(2)
+    u = np.zeros(1)
     for _ in range(300):
         u = law(np.concatenate([x, [0.5], u]))
         x = plant.step(x, u)

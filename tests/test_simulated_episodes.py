@@ -44,7 +44,8 @@ def rows(model) -> slice:
 def test_the_plant_meets_the_policy_alone_and_the_buffer_holds_both_in_whole_episodes() -> None:
     model = build(learning_rate=0.0)
     learnt(model, 2 * STEPS + 1, SimulatedEpisodes(Slide, **FEW))
-    buffer, whole = model.replay_buffer, 3 * STEPS
+    buffer = model.replay_buffer
+    whole = 3 * STEPS
     expected = [True] * whole + [False] * STEPS + [True] * whole + [False] * STEPS + [True] * whole
     marks = np.array([*expected, False])
     law = MPC.explicit()(buffer.observations[rows(model), 0].astype(float))
@@ -60,10 +61,12 @@ def test_the_plant_meets_the_policy_alone_and_the_buffer_holds_both_in_whole_epi
 def test_what_is_stored_is_what_the_simulator_did() -> None:
     model = build(learning_rate=0.0)
     learnt(model, 1, SimulatedEpisodes(Ends, per_episode=8, seed=5))
-    buffer, at = model.replay_buffer, 0
+    buffer = model.replay_buffer
+    at = 0
     for seed in range(5, 13):
         env = Ends()
-        observation, over = env.reset(seed=seed)[0], False
+        observation = env.reset(seed=seed)[0]
+        over = False
         while not over:
             np.testing.assert_array_equal(buffer.observations[at, 0], observation)
             action = buffer.actions[at, 0]
@@ -105,7 +108,8 @@ def test_with_several_envs_each_column_holds_whole_episodes_but_for_its_last(n_e
 
 def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> None:
     venv = VecNormalize(make_vec_env(Slide, 1), training=False, norm_reward=False)
-    venv.obs_rms.mean, venv.obs_rms.var = np.array([1.0]), np.array([4.0])
+    venv.obs_rms.mean = np.array([1.0])
+    venv.obs_rms.var = np.array([4.0])
     venv.clip_obs = np.inf
     seen = AffineObservation.from_vec_normalize(venv)
     model = build(env=venv, actor={"observation": seen}, learning_rate=0.0)

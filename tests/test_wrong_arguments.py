@@ -259,7 +259,9 @@ def test_a_twins_env_says_how_it_is_used() -> None:
 )
 def test_a_log_names_what_does_not_fit(beside, message) -> None:
     problem = general_problems.solved("servo with all of it")
-    n, m, d = problem.model.n_states, problem.model.n_inputs, problem.model.n_disturbances
+    n = problem.model.n_states
+    m = problem.model.n_inputs
+    d = problem.model.n_disturbances
     given = {"references": [np.zeros((11, 1))], "disturbances": [np.zeros((11, d))]} | beside
     with pytest.raises(ValueError, match=message):
         PlantTwin.fit(problem, [(np.zeros((11, n)), np.zeros((10, m)))], **given)

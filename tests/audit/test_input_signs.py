@@ -28,11 +28,14 @@ class Plant(gym.Env[Any, Any]):
     action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
 
     def __init__(self, gains: Any, late: bool = False) -> None:
-        self.gains, self.late = np.array(gains), late
+        self.gains = np.array(gains)
+        self.late = late
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
-        self.x, self.t, self.u = self.np_random.uniform(-3, 3, 2), 0, np.zeros(2)
+        self.x = self.np_random.uniform(-3, 3, 2)
+        self.t = 0
+        self.u = np.zeros(2)
         return self.x.copy(), {}
 
     def step(self, action: Any) -> Any:

@@ -46,7 +46,8 @@ def test_points_on_facets_and_vertices_are_among_those_that_are_tried() -> None:
 
 def test_the_peers_compute_the_law() -> None:
     mpc = double_integrator()
-    law, program = mpc.explicit(), mpc.condensed()
+    law = mpc.explicit()
+    program = mpc.condensed()
     solve = peers.daqp_online(program, 1)
     solution = peers.ppopt_solution(program, law, overlap=False)
     for theta in ([0.3, -0.2], [4.0, -1.0], [-2.0, 1.9]):

@@ -49,7 +49,9 @@ class Faulty(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: Cart, episode: int, fault: str, step: int = 5) -> None:
         super().__init__(env)
-        self.at, self.fault, self.numbers = (episode, step), fault, [-1, 0]
+        self.at = (episode, step)
+        self.fault = fault
+        self.numbers = [-1, 0]
         self.applied: list[float] = []
 
     def reset(self, **kwargs):
@@ -75,7 +77,8 @@ def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound
     assert (first.acted, first.verdict) == ("MPC", "accepted")
     assert second.acted == "batch 1" and second.max_correction == 0.2
     assert [first.episodes, second.episodes] == [5, 10]
-    law, m = problem().explicit(), problem()
+    law = problem().explicit()
+    m = problem()
     for k, each in enumerate(run.episodes):
         apart = np.abs(each.actions - law(each.thetas[:-1])) / (m.u_max - m.u_min)
         assert apart.max() <= (1e-6 if k < 5 else 0.2 + 1e-6)
@@ -93,7 +96,8 @@ def test_only_accepted_policies_act(tmp_path) -> None:
     run = commission(path)
     run.run(2)
     events = [json.loads(line) for line in path.read_text().splitlines()]
-    accepted, holds = {"MPC": None}, "MPC"
+    accepted = {"MPC": None}
+    holds = "MPC"
     for event in events[1:]:
         if event["event"] == "batch":
             holds, saved = event["from_here"]["acting"][:2]
@@ -114,11 +118,13 @@ def test_only_accepted_policies_act(tmp_path) -> None:
 def test_a_kill_at_any_moment_changes_nothing(tmp_path, monkeypatch) -> None:
     whole = commission(tmp_path / "whole.jsonl")
     whole.run(2)
-    path, played = tmp_path / "cut.jsonl", 0
+    path = tmp_path / "cut.jsonl"
+    played = 0
     while True:
         run = commission(path)
         assert len(run.episodes) == played
-        env, count = Cart(), 0
+        env = Cart()
+        count = 0
 
         def step(action, env=env, own=Cart.step):
             nonlocal count
@@ -171,7 +177,8 @@ def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once() -> Non
     turn = policys_turn(commission())
     run = commission(env=Faulty(Cart(), turn, "nan", step=1))
     run.run(2)
-    episode, law = run.episodes[turn], problem().explicit()
+    episode = run.episodes[turn]
+    law = problem().explicit()
     assert episode.alarm is not None and episode.alarm.kind == "not a number"
     assert episode.alarm.message == "It reads x[0] = nan, x[1] = nan." and episode.step == 0
     u = np.clip(law(episode.thetas[1:-1]), -1, 1)  # on what the model predicts
@@ -280,7 +287,8 @@ def test_a_strangers_file_is_left_alone(tmp_path) -> None:
 
 
 def test_two_runs_on_one_record_are_noticed(tmp_path) -> None:
-    one, other = commission(tmp_path), commission(tmp_path)
+    one = commission(tmp_path)
+    other = commission(tmp_path)
     one.run(1)
     with pytest.raises(RuntimeError, match="somebody else"):
         other.run(1)
@@ -328,7 +336,7 @@ def test_pairs_of_all_batches_of_a_trial_decide_together() -> None:
     run = commission(max_correction=0.1)
     run.run(3)
     journal = run.journal
-    (second, third) = run.batches[1:]
+    second, third = run.batches[1:]
     assert second.acted == third.acted == "batch 1"
     assert second.verdict == "stays" and (second.pairs, third.pairs) == (5, 15)
     assert sum(journal.by_policy) == 15

@@ -27,12 +27,14 @@ def model() -> DDPG:
 
 
 def test_the_twin_predicts_what_episodes_cost_that_it_has_not_seen() -> None:
-    found, law = observed(), law_of(offset_free_problem()[0])
+    found = observed()
+    law = law_of(offset_free_problem()[0])
     played = evaluate(offset_free_problem()[0].explicit(), plant, range(700, 705))
 
     class Episode:
         def __init__(self, thetas: np.ndarray, actions: np.ndarray) -> None:
-            self.thetas, self.actions = thetas.astype(float), actions
+            self.thetas = thetas.astype(float)
+            self.actions = actions
 
     episodes = [Episode(*each) for each in zip(played.observations, played.actions, strict=True)]
     np.testing.assert_allclose(predicted_costs(found, episodes, law), played.costs, rtol=2e-3)
@@ -52,16 +54,20 @@ def test_fifteen_episodes_show_a_gain_that_the_plant_keeps() -> None:
 
 
 def test_the_watchdog_is_quiet_and_sees_what_the_observer_smooths() -> None:
-    found, law = observed(), law_of(offset_free_problem()[0])
-    dog, env = Watchdog.of(found), plant()
+    found = observed()
+    law = law_of(offset_free_problem()[0])
+    dog = Watchdog.of(found)
+    env = plant()
     for fault, quiet in ((0.0, True), (0.3, False)):
-        theta, over = env.reset(seed=901)[0].astype(float), False
+        theta = env.reset(seed=901)[0].astype(float)
+        over = False
         dog.start(theta)
         for k in range(60):
             if k == 20:
                 env.unwrapped.x = env.unwrapped.x + np.array([0.0, fault])
             u = law(theta[None])[0].astype(np.float32)
-            before, (theta, _, _, over, _) = theta, env.step(u)
+            before = theta
+            theta, _, _, over, _ = env.step(u)
             theta = theta.astype(float)
             dog.watch(before, u.astype(float), theta)
         assert over and dog.quiet == quiet

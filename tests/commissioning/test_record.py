@@ -70,14 +70,16 @@ def test_an_event_without_its_parts_is_refused(event, path: Path) -> None:
 
 
 def test_a_cut_at_any_place_leaves_whole_lines(path: Path) -> None:
-    content, events = path.read_bytes(), Record(path).events
+    content = path.read_bytes()
+    events = Record(path).events
     for end in range(len(content)):
         path.write_bytes(content[:end])
         assert Record(path).events == events[: content[:end].count(b"\n")]
 
 
 def test_a_model_that_changed_since_is_refused(path: Path) -> None:
-    record, saved = Record(path), path.with_name("plant-batch-1.zip")
+    record = Record(path)
+    saved = path.with_name("plant-batch-1.zip")
     saved.write_bytes(b"weights")
     digest = record.digest_of(saved.name)
     saved.write_bytes(b"Weights")

@@ -45,7 +45,8 @@ def model(n_envs: int = 1, **options: Any) -> DDPG:
 
 def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
     again = pickle.loads(pickle.dumps(twin(10)))
-    theta, u = np.array([[0.3, -0.2], [1.0, 0.4]]), np.array([[0.5], [-0.1]])
+    theta = np.array([[0.3, -0.2], [1.0, 0.4]])
+    u = np.array([[0.5], [-0.1]])
     members = len(again.dynamics.members)
     now, before = (
         each.dynamics.step(np.array([theta] * members), np.array([u] * members))

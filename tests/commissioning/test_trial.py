@@ -16,7 +16,8 @@ def trial() -> Trial:
 
 
 def test_every_other_start_goes_on_with_the_set_points_of_a_logged_episode() -> None:
-    found, part = trial(), observed().dynamics.row.given
+    found = trial()
+    part = observed().dynamics.row.given
     assert (found.follow >= 0).tolist() == [False, True] * 6 + [False] * 12
     assert set(found.follow[found.follow >= 0]) == set(range(5))  # all of them
     for given, number, start in zip(
@@ -33,8 +34,10 @@ def test_every_other_start_goes_on_with_the_set_points_of_a_logged_episode() -> 
 
 def test_what_loses_on_episodes_like_the_logs_is_refused() -> None:
     found = trial()
-    (costs, unsafe), follow = found.mpc, np.tile(found.follow, len(found.starts))
-    room, held = 4e-4 * found.mean, found.known & (follow < 0)
+    costs, unsafe = found.mpc
+    follow = np.tile(found.follow, len(found.starts))
+    room = 4e-4 * found.mean
+    held = found.known & (follow < 0)
     loses = costs + np.where(held, -2 * room, room * found.known)
     assert loses[found.known].mean() < costs[found.known].mean()
     said = found.check(1, (loses, unsafe))

@@ -31,8 +31,11 @@ def drive(
     stuck: bool = False,
 ) -> list[Transition]:
     """Return an episode of the cart, with a fault from a step on."""
-    rng, law = np.random.default_rng(seed), problem().explicit()
-    x, seen, found = rng.uniform([-1.5, -0.5], [1.5, 0.5]), None, []
+    rng = np.random.default_rng(seed)
+    law = problem().explicit()
+    x = rng.uniform([-1.5, -0.5], [1.5, 0.5])
+    seen = None
+    found = []
     u = held = np.zeros(1)
     for k in range(61):
         y = x + noise * rng.standard_normal(2)
@@ -43,8 +46,10 @@ def drive(
         u = law(y)
         if k <= ONSET:
             held = u
-        seen, applied = y, held if stuck else u
-        pull, gain = 0.3 * x[0] ** 2 - 0.8 * x[0], force if k >= ONSET else 2.0
+        seen = y
+        applied = held if stuck else u
+        pull = 0.3 * x[0] ** 2 - 0.8 * x[0]
+        gain = force if k >= ONSET else 2.0
         x = np.array([x[0] + DT * x[1], 0.9 * x[1] + DT * (gain * applied[0] - pull)])
     return found
 
@@ -87,7 +92,8 @@ def test_a_stuck_actuator_is_found(noise) -> None:
 
 
 def test_a_noisy_sensor_that_repeats_itself_is_frozen_also_at_rest() -> None:
-    rng, u = np.random.default_rng(0), np.zeros(1)
+    rng = np.random.default_rng(0)
+    u = np.zeros(1)
     x = 1e-3 * rng.standard_normal((12, 2))
     quiet = [(x[k], u, x[k + 1]) for k in range(11)]
     assert barks(watchdog(0.002), quiet) is None
@@ -151,7 +157,8 @@ def test_an_alarm_calls_sensors_by_their_names_and_shows_what_they_read() -> Non
     box = {"theta_min": plain.theta_min + x_ss, "theta_max": plain.theta_max + x_ss}
     mpc = replace(plain, model=model, **box)
     twin = PlantTwin.fit(mpc, [(x + x_ss, u) for x, u in log(6, 0.002)])
-    rng, u = np.random.default_rng(0), np.zeros(1)
+    rng = np.random.default_rng(0)
+    u = np.zeros(1)
     x = 1e-3 * rng.standard_normal((12, 2))
     x[6:, 0] = x[5, 0]
     alarm = barks(Watchdog.of(twin), [(x[k], u, x[k + 1]) for k in range(11)])[1]

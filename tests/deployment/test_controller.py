@@ -95,11 +95,14 @@ def test_a_law_alone_is_in_plant_units(tmp_path):
 def test_a_problem_is_its_law_within_its_rates(tmp_path):
     problem = general_problems.solved("servo with all of it")
     controller = controller_of(problem, tmp_path)
-    low, high = problem.theta_min, problem.theta_max
+    low = problem.theta_min
+    high = problem.theta_max
     theta = np.random.default_rng(0).uniform(1.5 * low, 1.5 * high, (2000, problem.n_theta))
-    u, previous = controller.evaluate(theta), theta[:, -problem.model.n_inputs :]
+    u = controller.evaluate(theta)
+    previous = theta[:, -problem.model.n_inputs :]
     assert np.allclose(u, problem.explicit()(theta), atol=1e-9)
-    du_min, du_max = problem.rate.du_min, problem.rate.du_max
+    du_min = problem.rate.du_min
+    du_max = problem.rate.du_max
     assert np.all(u <= np.maximum(previous + du_max, problem.u_min) + 1e-9)
     assert np.all(u >= np.minimum(previous + du_min, problem.u_max) - 1e-9)
     regulator = solved("reactor")
@@ -148,7 +151,9 @@ def readings(count: int = 200) -> np.ndarray:
 def test_a_lost_sensor_is_bridged_then_the_output_held_and_all_comes_back(tmp_path):
     checks = Checks(hold=5, recover=10, transfer=5)
     controller = controller_of(policy_of("reactor"), tmp_path, checks=checks)
-    obs, modes, outputs = readings(), [], []
+    obs = readings()
+    modes = []
+    outputs = []
     for k, row in enumerate(obs):
         seen = row.copy()
         if 50 <= k < 70:
@@ -163,7 +168,8 @@ def test_a_lost_sensor_is_bridged_then_the_output_held_and_all_comes_back(tmp_pa
     assert np.all(found[55:70] == found[54])  # held
     # A change of who acts would be a jump; it fades within five steps instead.
     by_policy, by_law = (controller.evaluate(obs, networks=each)[:, 0] for each in (True, False))
-    own, jump = np.abs(np.diff(by_policy)).max(), np.abs(by_policy - by_law).max()
+    own = np.abs(np.diff(by_policy)).max()
+    jump = np.abs(by_policy - by_law).max()
     assert jump > 50 * own
     assert np.abs(np.diff(found)).max() < 1.3 * jump / 5
     assert found[85:] == pytest.approx(by_policy[85:])
@@ -221,7 +227,8 @@ def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
 def test_rates_hold_whatever_happens(tmp_path):
     mpc = policy_of("references and rates").problem
     controller = controller_of(policy_of("references and rates"), tmp_path)
-    generator, previous = np.random.default_rng(0), 0.0
+    generator = np.random.default_rng(0)
+    previous = 0.0
     for k in range(300):
         obs = generator.uniform(-1, 1, mpc.n_theta)
         obs[-1] = previous
@@ -413,7 +420,8 @@ class Silent(gym.Env):
     """Spaces, and nothing else."""
 
     def __init__(self, observation_space: Any, action_space: Any) -> None:
-        self.observation_space, self.action_space = observation_space, action_space
+        self.observation_space = observation_space
+        self.action_space = action_space
 
 
 def test_a_disturbance_that_may_be_measured_or_not_comes_from_the_caller(tmp_path) -> None:

@@ -36,7 +36,8 @@ def observations() -> np.ndarray:
 
 def require_inside(actions: np.ndarray, space: spaces.Box) -> None:
     wide = np.asarray(actions, np.float64)
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    low = space.low.astype(np.float64)
+    high = space.high.astype(np.float64)
     assert np.ptp(wide) > 0.999 * (high - low)[0]
     assert np.all((wide >= low) & (wide <= high))
     assert all(space.contains(each.astype(np.float32)) for each in wide)
@@ -76,12 +77,10 @@ def test_a_law_stays_within_the_bounds_of_its_problem(tmp_path) -> None:
 
 def largest_excess(mpc, act: Callable[[np.ndarray], np.ndarray], steps: int = 50) -> float:
     """Return the largest excess, in half-widths, of plants that are the model."""
-    rng, kept, bounds, (A, B) = (
-        np.random.default_rng(0),
-        mpc.kept_set,
-        Bounds.of(mpc),
-        mpc.prediction,
-    )
+    rng = np.random.default_rng(0)
+    kept = mpc.kept_set
+    bounds = Bounds.of(mpc)
+    A, B = mpc.prediction
     theta = rng.uniform(mpc.theta_min, mpc.theta_max, (400, mpc.n_theta))
     theta = theta[(theta @ kept.F.T <= kept.g).all(axis=1)][:8]
     found = 0.0

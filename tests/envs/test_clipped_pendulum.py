@@ -36,7 +36,8 @@ def side_it_falls_to(starts: NDArray[np.float64], torque: float) -> NDArray[np.f
 
     `starts` has shape (batch, 2). A pendulum that has not fallen after 400 steps counts as 0.
     """
-    theta, speed = starts[:, 0], starts[:, 1]
+    theta = starts[:, 0]
+    speed = starts[:, 1]
     side: NDArray[np.float64] = np.zeros(len(starts))
     for _ in range(400):
         speed = np.clip(speed + 0.05 * (15.0 * np.sin(theta) + 3.0 * torque), -8.0, 8.0)
@@ -53,7 +54,8 @@ def test_a_trajectory_is_gymnasiums_bit_for_bit(seed: int) -> None:
     # Actions in float64: Gymnasium multiplies a float32 torque in float32, which rounds.
     rng = np.random.default_rng(seed)
     start = rng.uniform([-np.pi, -8.0], [np.pi, 8.0])
-    ours, theirs = started(start), gymnasium_pendulum(start)
+    ours = started(start)
+    theirs = gymnasium_pendulum(start)
     for torque in rng.uniform(-3.0, 3.0, 200):
         action = np.array([torque])
         _, our_reward, *_, info = ours.step(action)
@@ -68,7 +70,8 @@ def test_the_cost_is_that_of_the_state_before_the_step_and_the_clipped_torque() 
     env = ClippedPendulumEnv()
     _, info = env.reset(seed=3)
     for torque in (0.5, -1.3, 10.0, -np.inf):
-        before, applied = info["state"], np.clip([torque], -2.0, 2.0)
+        before = info["state"]
+        applied = np.clip([torque], -2.0, 2.0)
         _, reward, terminated, truncated, info = env.step(act(torque))
         expected = before @ clipped_pendulum.Q @ before + applied @ clipped_pendulum.R @ applied
         assert info["cost"] == pytest.approx(expected, rel=1e-6)

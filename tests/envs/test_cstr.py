@@ -89,7 +89,8 @@ def test_the_temperature_is_exact_to_1e_6_from_the_farthest_starts_on_the_way_to
     rng = np.random.default_rng(seed)
     start = np.where(rng.random(4) < 0.5, cstr.STATE_HIGH, [0.1, 0.5, 0.0, 3.0])
     env = started(start)
-    exact, terminated = cstr.X_SS + start, False
+    exact = cstr.X_SS + start
+    terminated = False
     while not terminated:
         *_, terminated, _, info = env.step(act(-55.0))
         exact = solve_ivp(
@@ -128,7 +129,8 @@ def test_the_cost_is_that_of_the_state_before_the_step_and_the_clipped_action() 
     env = CSTREnv()
     _, info = env.reset(seed=3)
     for u in (-20.0, 33.0, 500.0, -np.inf):
-        before, applied = info["state"], np.clip([u], -55.0, 55.0)
+        before = info["state"]
+        applied = np.clip([u], -55.0, 55.0)
         _, reward, _, _, info = env.step(act(u))
         expected = before @ cstr.Q @ before + applied @ cstr.R @ applied
         assert info["cost"] == pytest.approx(expected, rel=1e-12)
@@ -238,7 +240,8 @@ def test_a_bad_start_is_refused_with_its_reason(options: dict[str, Any], message
     [(act(np.nan), "got array.*nan"), (np.zeros(2), r"shape \(1,\)"), (0.0, r"shape \(1,\)")],
 )
 def test_a_bad_action_is_refused_and_leaves_the_state_alone(action: Any, message: str) -> None:
-    env, twin = started([0.0, 0.1, 0.0, 1.0]), started([0.0, 0.1, 0.0, 1.0])
+    env = started([0.0, 0.1, 0.0, 1.0])
+    twin = started([0.0, 0.1, 0.0, 1.0])
     with pytest.raises(ValueError, match=message):
         env.step(action)
     np.testing.assert_array_equal(env.step(act(1.0))[0], twin.step(act(1.0))[0])

@@ -55,7 +55,9 @@ def test_it_steps_and_rewards_as_pcgym_does(name: str) -> None:
     env = PCGymEnv(name, draw=False)
     theirs = pcgym._make_env()({**CASES[name](), "normalise_a": False, "normalise_o": False})
     theirs.reset()
-    rng, n, ranges = np.random.default_rng(0), len(env.x0), env.x_max - env.x_min
+    rng = np.random.default_rng(0)
+    n = len(env.x0)
+    ranges = env.x_max - env.x_min
     env.reset(seed=0)
     for _ in range(theirs.N - 1):
         u = rng.uniform(env.u_min, env.u_max).astype(np.float32)
@@ -96,7 +98,8 @@ def test_set_points_are_drawn_where_the_schedule_changes() -> None:
 def test_what_is_shown_is_the_set_point_that_the_next_cost_refers_to_until_it_changes() -> None:
     env = PCGymEnv("cstr", draw=False)
     observation, _ = env.reset(seed=0)
-    x, r = env.advance(env.x0, [300.0])[0], observation[-1]
+    x = env.advance(env.x0, [300.0])[0]
+    r = observation[-1]
     _, reward, *_ = env.step(np.float32([300]))
     assert reward == pytest.approx(-1e3 * (x - r) ** 2, rel=1e-5)
 
@@ -117,7 +120,8 @@ def test_constraints_and_a_reward_of_the_user_are_pcgyms_own() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_linear_model_of_the_equations_is_that_of_the_simulator(name: str) -> None:
     env = PCGymEnv(name)
-    model, seen = env.linear_model(), LinearModel.from_env(env, *env.steady_state())
+    model = env.linear_model()
+    seen = LinearModel.from_env(env, *env.steady_state())
     np.testing.assert_allclose(seen.A, model.A, atol=1e-5 * max(np.max(np.abs(model.A)), 1e-3))
     np.testing.assert_allclose(seen.B, model.B, atol=1e-5 * np.max(np.abs(model.B)))
     assert (model.dt, model.state_names) == (env.plant.dt, env.state_names)
@@ -131,7 +135,8 @@ def test_the_linear_model_of_the_equations_is_that_of_the_simulator(name: str) -
 @needs_pcgym
 @pytest.mark.parametrize("name", NAMES)
 def test_an_observer_rests_an_mpc_of_the_plant_at_its_set_points(name: str) -> None:
-    plant, offsets = PCGymEnv(name), []
+    plant = PCGymEnv(name)
+    offsets = []
     for offset_free in (False, True):
         model = plant.linear_model(offset_free=offset_free)
         weights = {"Q": np.diag(np.isin(range(len(plant.x0)), plant.outputs) * 1e3), "horizon": 1}
@@ -146,7 +151,8 @@ def test_an_observer_rests_an_mpc_of_the_plant_at_its_set_points(name: str) -> N
             noise = {"state_noise": w, "measurement_noise": 0.01 * w, "disturbance_noise": 10}
             d = mpc.disturbances
             env = ObserveDisturbance(env, DisturbanceObserver(model, **noise), d.d_min, d.d_max)
-        law, (theta, _) = mpc.explicit(), env.reset(seed=4)
+        law = mpc.explicit()
+        theta, _ = env.reset(seed=4)
         for _ in range(19):  # the set-point stays
             theta, *_ = env.step(law.plant_input(theta))
         n = len(plant.x0)
@@ -163,7 +169,8 @@ def test_a_set_point_without_a_steady_state_is_named() -> None:
 @needs_pcgym
 @pytest.mark.parametrize("name", NAMES)
 def test_where_no_runge_kutta_is_accurate_the_adaptive_integrator_steps(name, monkeypatch) -> None:
-    env, x = PCGymEnv(name), []
+    env = PCGymEnv(name)
+    x = []
     for steps in (pcgym_flow.STEPS, ()):
         monkeypatch.setattr(pcgym_flow, "STEPS", steps)
         pcgym_flow._chosen.cache_clear()
@@ -202,7 +209,8 @@ def test_gymnasiums_checker_has_no_complaint() -> None:
 def test_a_model_that_pcgym_cannot_make_by_its_name_is_played() -> None:
     from pcgym.model_classes import cstr_series_recycle
 
-    x0, hot = np.array([80.0, 320.0, 60.0, 325.0]), {"T2": [321.0] * 20}
+    x0 = np.array([80.0, 320.0, 60.0, 325.0])
+    hot = {"T2": [321.0] * 20}
     box = {"low": np.array([0, 290, 0, 290.0]), "high": np.array([100, 360, 100, 360.0])}
     inputs = {"low": np.array([0, 0, 270, 270.0]), "high": np.array([2e-5, 2e-5, 360, 360])}
     case = {"N": 20, "tsim": 20.0, "SP": hot, "x0": x0, "o_space": box, "a_space": inputs}

@@ -42,7 +42,8 @@ def plot_loop(mpc, runs, quantity, **options):
 
 
 def test_the_table_shows_losses_as_well_as_gains() -> None:
-    before, after = episodes(2), episodes(2)
+    before = episodes(2)
+    after = episodes(2)
     before.costs[:] = 10.0, 20.0
     after.costs[:] = 9.0, 27.0
     text = comparison_table("costs", before, after)
@@ -68,7 +69,8 @@ def test_of_many_episodes_the_median_and_a_band_are_drawn() -> None:
 
 
 def test_episodes_that_have_ended_count_no_more() -> None:
-    long, short = episodes(8), episodes(8, steps=2)
+    long = episodes(8)
+    short = episodes(8, steps=2)
     both = Trajectories(
         np.ones(16), np.zeros(16, int), (*long.observations, *short.observations),
         (*long.actions, *short.actions), np.zeros(16, bool),
@@ -97,7 +99,8 @@ def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
     mpc = tank(tracking=Tracking([0], 10, 14))
     played = episodes(2, size=2)
     for x in played.observations:
-        x[:, 1], x[-1, 1] = 13.0, 21.0
+        x[:, 1] = 13.0
+        x[-1, 1] = 21.0
     axes = plot_loop(mpc, {"MPC": played}, "level")
     (line,) = (each for each in axes.lines if each.get_label() == "set-point")
     assert set(line.get_ydata()) == {13.0}
@@ -108,7 +111,8 @@ def test_where_set_points_differ_the_distance_from_them_is_drawn() -> None:
     assert axes.get_ylabel() == "level (m)\nless its set-point"
     played = episodes(9, size=2)
     for k, x in enumerate(played.observations):
-        x[:, 1], x[-1, 1] = x[0, 0] + 0.5 + k / 100, 21.0
+        x[:, 1] = x[0, 0] + 0.5 + k / 100
+        x[-1, 1] = 21.0
     axes = plot_loop(tank(tracking=Tracking([0], 10, 14)), {"MPC": played}, "level")
     (median,) = (line for line in axes.lines if len(line.get_ydata()) == 5)
     np.testing.assert_allclose(median.get_ydata(), -0.54)
@@ -116,7 +120,8 @@ def test_where_set_points_differ_the_distance_from_them_is_drawn() -> None:
 
 
 def test_below_many_pairs_lie_their_differences() -> None:
-    before, after = episodes(9), episodes(9)
+    before = episodes(9)
+    after = episodes(9)
     for x in after.observations:
         x += 0.25
     figure = loops_figure(tank(), {"before": before, "after": after})
@@ -129,7 +134,8 @@ def test_below_many_pairs_lie_their_differences() -> None:
 
 
 def test_gains_are_sorted_and_in_percent_of_the_first_one_s_mean() -> None:
-    before, after = episodes(3), episodes(3)
+    before = episodes(3)
+    after = episodes(3)
     after.costs[:] = 0.5, 1.5, 0.25
     axes = plot_gains({"MPC": before, "policy": after})
     assert [bar.get_height() for bar in axes.patches] == [-75, -50, 50]
@@ -188,7 +194,8 @@ def test_a_surface_needs_two_coordinates_and_an_input(options) -> None:
 
 def test_use_counts_steps_and_distances_by_region() -> None:
     mpc = problems.cstr()
-    law, played = mpc.explicit(), evaluate(mpc.explicit(), "CSTR-v0", range(2))
+    law = mpc.explicit()
+    played = evaluate(mpc.explicit(), "CSTR-v0", range(2))
     moved = lambda theta: np.clip(law(theta) + 5.5, -55, 55)  # noqa: E731
     use = region_use(mpc, moved, played)
     theta = np.concatenate([x[:-1] for x in played.observations])

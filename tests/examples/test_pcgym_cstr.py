@@ -28,7 +28,8 @@ def test_it_takes_twenty_lines() -> None:
 def test_the_policy_starts_as_the_offset_free_mpc() -> None:
     import pcgym_cstr
 
-    env, law = pcgym_cstr.make_env(), pcgym_cstr.mpc.explicit()
+    env = pcgym_cstr.make_env()
+    law = pcgym_cstr.mpc.explicit()
     model = DDPG("YannPolicy", env, policy_kwargs={"problem": pcgym_cstr.mpc}, gamma=0.95)
     theta, _ = env.reset(seed=0)
     for _ in range(5):

@@ -21,7 +21,9 @@ def test_it_rests_where_the_thrusts_carry_it_at_any_place_and_yaw() -> None:
 
 def test_without_thrust_energy_goes_into_the_drag_and_angular_momentum_stays() -> None:
     x = np.array([0, 0, 0, 0.3, -0.2, 0.5, 1.0, -2.0, 0.5, 0.4, -0.3, 0.6])
-    rate, v, w = derivative(x, np.zeros(4)), x[6:9], x[9:]
+    rate = derivative(x, np.zeros(4))
+    v = x[6:9]
+    w = x[9:]
     power = MASS * v @ rate[6:9] + MASS * GRAVITY * v[2]
     np.testing.assert_allclose(power, -DRAG * np.linalg.norm(v) ** 3)
     np.testing.assert_allclose(w @ (INERTIA * rate[9:]), 0, atol=1e-15)  # rotational energy
@@ -40,7 +42,8 @@ def test_it_falls_when_it_tilts_too_far_and_is_a_gymnasium_env() -> None:
 def test_its_mpc_hovers_with_the_thrusts_that_carry_it() -> None:
     mpc = hover()
     np.testing.assert_allclose(mpc.model.u_ss, HOVER)
-    law, env = mpc.online(), Quadrotor()
+    law = mpc.online()
+    env = Quadrotor()
     assert isinstance(env, gymnasium.Env)
     x, _ = env.reset(seed=0)
     for _ in range(100):

@@ -98,7 +98,9 @@ def test_the_log_is_the_same_each_time_and_gives_the_model(tmp_path) -> None:
         write_log(tmp_path / name)
     assert (tmp_path / "one.csv").read_text() == (tmp_path / "two.csv").read_text()
     log = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
-    x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
+    x = log[:, 1:5]
+    u = log[:-1, 5:7]
+    d = log[:-1, 7:]
     found = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=VOLTAGES_SS, d_ss=[0])
     true = LinearModel.from_env(QuadrupleTank, rest(), VOLTAGES_SS)
     assert np.max(np.abs(found.A - true.A)) < 0.06

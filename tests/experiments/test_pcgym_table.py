@@ -17,7 +17,8 @@ needs_pcgym = pytest.mark.skipif(
 
 
 def outcome(*costs: list[float], steps: tuple[int, ...] = (0,)) -> Outcome:
-    none, tests = np.zeros(0), np.array(costs)
+    none = np.zeros(0)
+    tests = np.array(costs)
     extra = {"stage_costs": 2 * tests, "ms": np.full(len(tests), 0.5)}
     return Outcome(np.array(steps), tests, np.zeros_like(tests), none, none, none, extra)
 
@@ -53,8 +54,10 @@ def test_every_seed_of_every_controller_is_run_once():
 @needs_pcgym
 @pytest.mark.parametrize("name", pcgym.HORIZONS)
 def test_controllers_are_played_on_the_plant_they_know(name):
-    case, other = pcgym.Case(name), pcgym.Case(name, offset_free=True)
-    env, size = other.env(), case.plant.observation_space.shape[0]
+    case = pcgym.Case(name)
+    other = pcgym.Case(name, offset_free=True)
+    env = other.env()
+    size = case.plant.observation_space.shape[0]
     theta, _ = env.reset(seed=5)
     assert theta.shape == (other.mpc.n_theta,)
     law = case.mpc.explicit().plant_input
@@ -70,8 +73,10 @@ def test_the_polynomials_of_the_nmpc_end_where_the_plant_does(name):
     import casadi
 
     plant = pcgym.PCGymEnv(name)
-    n, (low, width) = len(plant.x0), plant._box()
-    s, v = (plant.x0 - low[:n]) / width[:n], np.full(len(plant.u_min), 0.7)
+    n = len(plant.x0)
+    low, width = plant._box()
+    s = (plant.x0 - low[:n]) / width[:n]
+    v = np.full(len(plant.u_min), 0.7)
     sample = pcgym_nmpc.collocated(plant)
     z = casadi.MX.sym("z", sample.size1_in(2))
     missed = casadi.Function("missed", [z], [sample(s, v, z)[1]])

@@ -22,7 +22,8 @@ def results(tmp_path: Path) -> Path:
 
 def outcome(run: Run, starts: int = 4) -> Outcome:
     """Return numbers that depend on the run alone."""
-    rng, tested = np.random.default_rng(run.seed), np.arange(0, run.episodes + 1, 5)
+    rng = np.random.default_rng(run.seed)
+    tested = np.arange(0, run.episodes + 1, 5)
     shape = len(tested), starts
     return Outcome(
         checkpoints=tested,

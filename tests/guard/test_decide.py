@@ -47,7 +47,8 @@ class OftenRight(Slide):
 
     def __init__(self, left_of: int = 3, after: int = FIRST + 10, **kwargs) -> None:
         super().__init__(**kwargs)
-        self.left_of, self.after = left_of, after
+        self.left_of = left_of
+        self.after = after
 
     def reset(self, *, seed=None, options=None):
         self.indifferent = seed == FIRST
@@ -76,14 +77,16 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     weights = last_layer(model)[:, :, -1]
     assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()
     starts = guard.state.evidence.starts
-    hard, known = starts.seeds[: starts.n_hard], starts.seeds[starts.n_hard :]
+    hard = starts.seeds[: starts.n_hard]
+    known = starts.seeds[starts.n_hard :]
     assert sorted(known) == [*range(FIRST, FIRST + 10)]
     assert hard and all(seed % 3 == 0 for seed in hard)
 
 
 def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> None:
     simulator = partial(OftenRight, after=FIRST + 10)
-    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
+    model = build(gradient_steps=0)
+    guard = make_guard(simulator, n_new_starts=20, rule=WHOLE)
     again = At([2 * STEPS], spoil_left)
     train(model, 2 * STEPS, At([STEPS], spoil_left), again, guard)
     first, second = guard.decisions[:2]
@@ -95,7 +98,8 @@ def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> No
 def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
     # The first five new starts show the right only: all of it is accepted.
     simulator = partial(OftenRight, after=FIRST + 15)
-    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
+    model = build(gradient_steps=0)
+    guard = make_guard(simulator, n_new_starts=20, rule=WHOLE)
 
     def a_little_better(policy) -> None:
         correct(policy, RIGHT, 0.4)
@@ -123,7 +127,7 @@ def test_of_a_step_too_far_half_is_accepted() -> None:
     model = build(gradient_steps=0, actor=SHARED_NETWORK)
     guard = make_guard(n_new_starts=0, rule=GENTLE)
     train(model, STEPS, At([STEPS], lambda policy: push(policy, 1.2)), guard)
-    (decision, *_) = guard.decisions
+    decision, *_ = guard.decisions
     assert (decision.verdict, decision.share) == ("accepted in part", 0.5)
     assert decision.candidate_cost > decision.accepted_cost < decision.mpc_cost
     assert not is_mpc(model)
@@ -190,7 +194,8 @@ def rows(checkpoint: ActorCheckpoint, region: int) -> list[object]:
 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorithm) -> None:
-    model, guard = build(algorithm), make_guard(rule={"margin": 0.03})
+    model = build(algorithm)
+    guard = make_guard(rule={"margin": 0.03})
     checkpoints: dict[str, ActorCheckpoint] = {}
 
     def change(policy) -> None:
@@ -238,7 +243,8 @@ def test_a_candidate_in_another_box_is_accepted_with_it_or_leaves_the_old() -> N
         policy.confine_correction(-box, box)
 
     for change, verdict, kept in ((half_good, "rejected", False), (good, "accepted", True)):
-        model, guard = build(gradient_steps=0), make_guard()
+        model = build(gradient_steps=0)
+        guard = make_guard()
         before = ActorCheckpoint.of(model.policy)
         train(model, STEPS + 1, At([STEPS], partial(confined, change)), guard)
         assert guard.decisions[0].verdict == verdict
@@ -261,7 +267,8 @@ class LateLosses(Slide):
 
     def reset(self, *, seed=None, options=None):
         late = seed is not None and seed >= self.late
-        self.left, self.touchy = late and seed % 5 < 2, late and seed % 5 == 2
+        self.left = late and seed % 5 < 2
+        self.touchy = late and seed % 5 == 2
         self.indifferent = seed == FIRST  # a known start on the left, where all inputs cost alike
         self.low, self.high = (-4.0, -2.0) if self.left or self.indifferent else (2.0, 4.0)
         return super().reset(seed=seed, options=options)
@@ -277,7 +284,8 @@ def test_what_is_put_back_at_the_end_is_tried_on_all_of_the_new_starts() -> None
     def left_as_well(policy) -> None:
         correct(policy, LEFT, -3.0)
 
-    model, guard = build(gradient_steps=0), make_guard(LateLosses, n_new_starts=20)
+    model = build(gradient_steps=0)
+    guard = make_guard(LateLosses, n_new_starts=20)
     first = At([1], partial(correct, region=RIGHT, value=0.4))
     train(model, 2 * STEPS, first, At([STEPS + 1], left_as_well), guard)
     assert guard.decisions[-1].reason.startswith("at the end, on ")
@@ -302,7 +310,8 @@ def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path
         correct(policy, LEFT, -2.0)
 
     good = partial(correct, region=RIGHT, value=0.4)
-    model, options = build(gradient_steps=0), {"n_new_starts": 20, "rule": {"by_region": False}}
+    model = build(gradient_steps=0)
+    options = {"n_new_starts": 20, "rule": {"by_region": False}}
     if how == "one learn":
         moves = At([1], good), At([STEPS + 1], spoiled)
         train(model, 2 * STEPS, *moves, guard := make_guard(LaterLeft, **options))
@@ -324,7 +333,8 @@ def test_a_trial_that_is_cut_off_accepts_nothing_and_leaves_the_candidate(error,
         raise error("stopped")
 
     simulator = partial(CutOff, at, stop)
-    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=5)
+    model = build(gradient_steps=0)
+    guard = make_guard(simulator, n_new_starts=5)
     with pytest.raises(error):
         train(model, 2 * STEPS, At([1], better), guard)
     assert weights(model)[REGION[RIGHT]] == 0.5
@@ -343,7 +353,8 @@ def test_a_region_that_no_start_comes_through_stays_as_it_was(alone, when) -> No
         if not alone:
             correct(policy, RIGHT, 0.4)
 
-    model, guard = build(gradient_steps=0), make_guard(partial(Slide, low=2.0), n_new_starts=5)
+    model = build(gradient_steps=0)
+    guard = make_guard(partial(Slide, low=2.0), n_new_starts=5)
     if when == "before training":
         sabotage(model.policy)
     train(model, STEPS, At([1], sabotage), guard)
@@ -354,7 +365,8 @@ def test_a_region_that_no_start_comes_through_stays_as_it_was(alone, when) -> No
 
 def test_what_no_start_can_tell_apart_is_not_played() -> None:
     simulator = Slide(low=2.0)
-    model, guard = build(gradient_steps=0), make_guard(simulator)
+    model = build(gradient_steps=0)
+    guard = make_guard(simulator)
     count: list[int] = []
     before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
     train(
@@ -370,7 +382,8 @@ def test_an_error_of_the_simulator_under_a_candidate_alone_is_a_refusal() -> Non
                 raise FloatingPointError("integrator failed")
             return super().step(action)
 
-    model, guard = build(gradient_steps=0), make_guard(partial(Brittle, low=2.0))
+    model = build(gradient_steps=0)
+    guard = make_guard(partial(Brittle, low=2.0))
     train(model, 2 * STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     (decision,) = guard.decisions
     assert decision.reason == "the simulator failed: FloatingPointError: integrator failed"
@@ -386,12 +399,14 @@ def push(policy: YannPolicy, size: float) -> None:
     """Add ``size tanh(x / 5)`` to the law, against its own sign."""
     first_layer(policy).zero_()
     last_layer(policy).zero_()
-    first_layer(policy)[0, 0, 0, 0], last_layer(policy)[0, 0, 0] = 1.0, size
+    first_layer(policy)[0, 0, 0, 0] = 1.0
+    last_layer(policy)[0, 0, 0] = size
 
 
 @SHARED
 def test_a_better_network_is_accepted_and_a_worse_one_is_not(actor) -> None:
-    model, guard = build(gradient_steps=0, actor=actor), make_guard(n_new_starts=0)
+    model = build(gradient_steps=0, actor=actor)
+    guard = make_guard(n_new_starts=0)
     good = At([STEPS], lambda policy: push(policy, 0.4))
     bad = At([2 * STEPS], lambda policy: push(policy, -0.4))
     train(model, 2 * STEPS, good, bad, guard)

@@ -53,16 +53,19 @@ def interrupted(model, steps: int, *callbacks: BaseCallback) -> None:
 
 
 def test_between_two_steps_the_candidate_gives_way_to_what_was_accepted() -> None:
-    model, guard = build(learning_rate=0.0), make_guard(eval_freq=100)
+    model = build(learning_rate=0.0)
+    guard = make_guard(eval_freq=100)
     interrupted(model, 40, At([5], better), guard, At([17], ctrl_c))
     assert is_mpc(model)  # no trial has been
 
 
 @pytest.mark.parametrize("part", ["actor", "critic"])
 def test_in_the_midst_of_a_gradient_step_as_well(monkeypatch, part) -> None:
-    model, guard = build(), make_guard(eval_freq=100)
+    model = build()
+    guard = make_guard(eval_freq=100)
     optimizer = getattr(model, part).optimizer
-    step, taken = optimizer.step, []
+    step = optimizer.step
+    taken = []
 
     def cut_off(*args, **kwargs):
         step(*args, **kwargs)
@@ -77,7 +80,8 @@ def test_in_the_midst_of_a_gradient_step_as_well(monkeypatch, part) -> None:
 @pytest.mark.parametrize("at", [FIRST + 12, FIRST + 10 + 5 + 7], ids=["a trial", "the end"])
 def test_in_a_trial_what_stood_before_it_is_left(at) -> None:
     simulator = partial(CutOff, at, ctrl_c)
-    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=5)
+    model = build(gradient_steps=0)
+    guard = make_guard(simulator, n_new_starts=5)
     interrupted(model, 2 * STEPS, At([1], better), guard)
     assert is_mpc(model) == (at == FIRST + 12)
 
@@ -92,7 +96,8 @@ def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_polic
         plays.append(1)
 
     plays: list[int] = []
-    model, guard = build(gradient_steps=0), make_guard(partial(CutOff, FIRST, act))
+    model = build(gradient_steps=0)
+    guard = make_guard(partial(CutOff, FIRST, act))
     interrupted(model, 4 * STEPS, At([1], better), guard)
 
 
@@ -104,7 +109,8 @@ def test_a_simulator_that_swallows_it_ends_the_training_all_the_same() -> None:
                 ctrl_c()
 
     plays: list[int] = []
-    model, guard = build(gradient_steps=0), make_guard(partial(CutOff, FIRST, act))
+    model = build(gradient_steps=0)
+    guard = make_guard(partial(CutOff, FIRST, act))
     interrupted(model, 4 * STEPS, At([1], better), guard)
     assert is_mpc(model) and len(plays) == 4
 
@@ -114,7 +120,8 @@ def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch
         raise OSError("the simulator is gone")
 
     before = signal.getsignal(signal.SIGINT)
-    model, guard = build(gradient_steps=0), make_guard(eval_freq=100)
+    model = build(gradient_steps=0)
+    guard = make_guard(eval_freq=100)
     monkeypatch.setattr(guard, "_end", fail)
     with pytest.raises(OSError, match="gone"):
         train(model, 8, At([5], better), guard)
@@ -127,7 +134,8 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
         raise OSError("the plant is gone")
 
     before = signal.getsignal(signal.SIGINT)
-    model, guard = build(learning_rate=0.0), make_guard(eval_freq=100)
+    model = build(learning_rate=0.0)
+    guard = make_guard(eval_freq=100)
     with pytest.raises(OSError, match="gone"):
         train(model, 20, guard, At([5], better), At([6], fail))
     candidate = bits(model.policy.actor.state_dict())
@@ -139,7 +147,8 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
 
 @pytest.mark.parametrize("where", ["require_like_training", "first_evidence"])
 def test_before_anything_is_accepted_the_end_of_training_is_none(monkeypatch, where) -> None:
-    model, guard = build(), make_guard()
+    model = build()
+    guard = make_guard()
     monkeypatch.setattr(callback, where, ctrl_c)
     with pytest.raises(KeyboardInterrupt):
         train(model, 8, guard)

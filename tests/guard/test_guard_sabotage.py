@@ -56,9 +56,11 @@ STATES = np.linspace(-5, 5, 101, dtype=np.float32)[:, None]
 )
 def test_a_sabotaged_actor_is_rejected_and_restored_bit_for_bit(algorithm, sabotage, place) -> None:
     # Without learning: what is not the accepted policy's is the sabotage's.
-    model, guard = build(algorithm, gradient_steps=0), make_guard()
+    model = build(algorithm, gradient_steps=0)
+    guard = make_guard()
     step = 3 * STEPS if place == "before the guard" else 4 * STEPS  # the last one of all
-    good, bad = At([STEPS], better), At([step], sabotage)
+    good = At([STEPS], better)
+    bad = At([step], sabotage)
     callbacks = [good, bad, guard] if place == "before the guard" else [good, guard, bad]
     seen: list[object] = []
     train(
@@ -77,7 +79,8 @@ def test_a_sabotaged_actor_is_rejected_and_restored_bit_for_bit(algorithm, sabot
 def test_amid_learning_actor_target_and_moments_return_to_those_last_accepted(
     algorithm, sabotage
 ) -> None:
-    model, guard = build(algorithm), make_guard(rule={"by_region": False})
+    model = build(algorithm)
+    guard = make_guard(rule={"by_region": False})
     kept: dict[int, object] = {}
     compared: list[bool] = []
 
@@ -90,13 +93,15 @@ def test_amid_learning_actor_target_and_moments_return_to_those_last_accepted(
     def compare(policy) -> None:
         compared.append(actor_bits(policy) == kept[0] == accepted_bits(guard))
 
-    sabotages, steps = At([STEPS, 5 * STEPS], spoil), [STEPS, 5 * STEPS]
+    sabotages = At([STEPS, 5 * STEPS], spoil)
+    steps = [STEPS, 5 * STEPS]
     train(model, 6 * STEPS, At([1], better), sabotages, guard, At(steps, compare))
     assert compared == [True, True]
 
 
 def test_a_policy_that_is_worse_before_training_gives_way_to_the_mpc() -> None:
-    model, guard = build(gradient_steps=0), make_guard()
+    model = build(gradient_steps=0)
+    guard = make_guard()
     worse(model.policy)
     train(model, STEPS, guard)
     assert guard.decisions[0].reason.startswith("before training, ")
@@ -107,7 +112,8 @@ def test_a_policy_that_is_worse_before_training_gives_way_to_the_mpc() -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
 def test_a_policy_that_diverged_before_training_gives_way_to_the_mpc(value) -> None:
-    model, guard = build(), make_guard()
+    model = build()
+    guard = make_guard()
     overwrite(model.policy, value)
     overwrite(model.policy, value)
     before = At([1], lambda policy: seen.append(is_mpc(policy)))
@@ -126,7 +132,8 @@ def test_equal_costs_neither_refuse_a_policy_before_training_nor_a_candidate(mar
             return observation, -abs(float(self.x[0])) / 3, *rest
 
     for before in (True, False):
-        model, guard = build(gradient_steps=0), make_guard(Indifferent, rule={"margin": margin})
+        model = build(gradient_steps=0)
+        guard = make_guard(Indifferent, rule={"margin": margin})
         change = partial(correct, region=LEFT, value=-0.5)
         if before:
             change(model.policy)
@@ -137,7 +144,8 @@ def test_equal_costs_neither_refuse_a_policy_before_training_nor_a_candidate(mar
 
 @pytest.mark.slow
 def test_the_accepted_cost_never_rises_and_is_never_above_the_mpc_s() -> None:
-    model, guard = build(learning_rate=0.1), make_guard()
+    model = build(learning_rate=0.1)
+    guard = make_guard()
     train(model, 40 * STEPS, guard, At(range(0, 200, 7 * STEPS), randomize))
     costs = [guard.decisions[0].mpc_cost, *(each.accepted_cost for each in guard.decisions)]
     assert np.all(np.diff(costs) <= 1e-6)
@@ -170,7 +178,8 @@ def test_a_violation_is_rejected_at_once_though_the_cost_falls_and_patience_is_l
 def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections(
     keep_if_worse, values, restored
 ) -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=3, keep_if_worse=keep_if_worse)
+    model = build(gradient_steps=0)
+    guard = make_guard(patience=3, keep_if_worse=keep_if_worse)
     left = iter([0.3, *values])
     move = At(range(STEPS, 5 * STEPS, STEPS), lambda p: correct(p, RIGHT, next(left)))
     train(model, 4 * STEPS + 1, move, guard)
@@ -206,7 +215,8 @@ def test_a_candidate_with_what_is_not_finite_in_its_episodes_violates_and_return
                 reward = np.nan
             return observation * (np.nan if broken and what != "cost" else 1), reward, *rest
 
-    model, guard = build(gradient_steps=0), make_guard(Faulty, patience=5)
+    model = build(gradient_steps=0)
+    guard = make_guard(Faulty, patience=5)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NonFiniteWarning)
         train(model, STEPS, At([1], better), guard)
@@ -215,7 +225,8 @@ def test_a_candidate_with_what_is_not_finite_in_its_episodes_violates_and_return
 
 
 def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=5, keep_if_worse=True)
+    model = build(gradient_steps=0)
+    guard = make_guard(patience=5, keep_if_worse=True)
     train(model, 2 * STEPS, At([1], worse), guard)
     assert guard.decisions[-1].restored
     assert is_mpc(model)

@@ -85,7 +85,8 @@ def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
 
 
 def test_a_check_moves_no_random_state_and_not_the_training_env(monkeypatch) -> None:
-    model, guard = build(), make_guard()
+    model = build()
+    guard = make_guard()
     checks: list[bool] = []
 
     def unchanged(method, *args) -> None:
@@ -122,7 +123,8 @@ def whole_and_resumed(
 ) -> list[Any]:
     """Return what is left of a training that went through, and of one that stopped halfway."""
     whole = build(algorithm, env=envs(n))
-    steps, at = episodes * STEPS, episodes // 2 * STEPS
+    steps = episodes * STEPS
+    at = episodes // 2 * STEPS
     train(whole, steps, guard(log_path=folder / "whole.csv"), Checkpoint(at, folder))
     model = loaded(folder, envs(n), algorithm)
     go_on(model, steps - at, guard(log_path=folder / "cut.csv"))
@@ -143,11 +145,13 @@ def test_with_a_simulator_nothing_is_lost(n_envs, algorithm, options, tmp_path) 
 
 
 def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -> None:
-    model, guard = build(gradient_steps=0), guard_in_simulator()
+    model = build(gradient_steps=0)
+    guard = guard_in_simulator()
     train(model, STEPS, At([1], better), guard)
     assert not model.policy.actor.mu.network.is_zero()
     model.save(tmp_path / "model")
-    again, other = DDPG.load(tmp_path / "model", env=envs(1), device="cpu"), guard_in_simulator()
+    again = DDPG.load(tmp_path / "model", env=envs(1), device="cpu")
+    other = guard_in_simulator()
     train(again, 1, other, reset_num_timesteps=False)
     assert all_bits(other.player.mpc) == all_bits(guard.player.mpc)
 
@@ -160,7 +164,8 @@ def test_a_guard_that_rejects_everything_leaves_the_mpc_while_the_critic_learns(
     fresh = build(algorithm)
     seen: list[bool] = []
     look = At(range(STEPS, 9 * STEPS, STEPS), lambda p: seen.append(is_mpc(p)))
-    model, guard = build(algorithm), make_guard()
+    model = build(algorithm)
+    guard = make_guard()
     train(model, 8 * STEPS, guard, look)
     assert seen == [True] * 8
     assert len(guard.decisions) >= 7

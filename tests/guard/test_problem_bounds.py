@@ -154,7 +154,10 @@ def test_the_page_to_sign_fails_and_names_the_bound_its_excess_and_the_unit(
     assert any(re.search(says[kind], row) for row in failed)
 
 
-OHM, BACK, HENRY, DT = 1.0, 0.1, 0.25, 0.05
+OHM = 1.0
+BACK = 0.1
+HENRY = 0.25
+DT = 0.05
 
 
 def drive_matrices(ohm: float) -> tuple[Any, Any]:
@@ -199,7 +202,8 @@ def test_an_mpc_that_rides_its_bound_is_no_veto_and_no_excuse() -> None:
     # Without a weight of the current it stays at its limit for one more step, and costs less.
     own, cheaper, beyond = map(scores, (drive_mpc(weight=0.01), mpc, drive_mpc(1.02)))
     assert beyond.costs.mean() < cheaper.costs.mean() < own.costs.mean()
-    steps, largest = own.unsafe[:, 0], own.unsafe[:, 4]
+    steps = own.unsafe[:, 0]
+    largest = own.unsafe[:, 4]
     np.testing.assert_array_equal(cheaper.unsafe[:, 0] - steps, [1, 1, 0, 1])
     np.testing.assert_allclose(cheaper.unsafe[:, 4], largest, rtol=1e-3)
     assert 0.005 < largest.min() <= largest.max() < 0.02

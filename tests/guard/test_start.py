@@ -113,7 +113,8 @@ def test_a_policy_without_an_mpc_is_refused() -> None:
 
 
 def test_a_simulator_may_be_named_by_its_module_as_in_a_yaml_file() -> None:
-    model, guard = build(learning_rate=0.0), make_guard("guard_samples:Slide", n_new_starts=4)
+    model = build(learning_rate=0.0)
+    guard = make_guard("guard_samples:Slide", n_new_starts=4)
     train(model, 8, At([2], better), guard)
     assert verdicts(guard)[0] == "accepted"
     assert guard.state.settings["env"] == "guard_samples:Slide"
@@ -131,7 +132,8 @@ class Wobbly(Slide):
 
     def __init__(self, size: float = 0.0, lost: int | None = None) -> None:
         super().__init__()
-        self.size, self.lost = size, lost
+        self.size = size
+        self.lost = lost
 
     def reset(self, *, seed=None, options=None):
         self.bad = self.lost is not None and seed is not None and seed >= self.lost
@@ -261,7 +263,8 @@ def test_with_other_settings_the_accepted_policy_the_hard_starts_and_the_count_a
             return observation, reward - (1.0 if strong else 0.0), *rest
 
     seen: list[int] = []
-    model, values = build(gradient_steps=0), iter([0.3, 0.5])
+    model = build(gradient_steps=0)
+    values = iter([0.3, 0.5])
     moves = At([1, STEPS + 1], lambda policy: correct(policy, RIGHT, next(values)))
     train(model, 2 * STEPS, moves, first := make_guard(LostLater, n_new_starts=10))
     hard = set(first.state.evidence.starts.seeds) - set(range(FIRST, FIRST + 10))
@@ -307,13 +310,15 @@ class Door(gym.Env):
     """x runs away; the env ends the episode beyond 3, whatever the MPC does there."""
 
     def __init__(self, success: bool = False, cuts: bool = False) -> None:
-        self.success, self.cuts = success, cuts
+        self.success = success
+        self.cuts = cuts
         self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float32)
         self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.t = self.np_random.uniform(1.7, 1.8, 1), 0
+        self.x = self.np_random.uniform(1.7, 1.8, 1)
+        self.t = 0
         return self.x.astype(np.float32), {}
 
     def step(self, action):
@@ -398,7 +403,8 @@ def test_a_training_env_that_never_ends_is_reported(n_envs, monkeypatch) -> None
 
 
 def test_the_accepted_policy_can_be_had_from_a_checkpoint(tmp_path) -> None:
-    model, guard = build(learning_rate=0.0), make_guard(eval_freq=100)
+    model = build(learning_rate=0.0)
+    guard = make_guard(eval_freq=100)
     train(model, 6, At([5], better), guard, CheckpointCallback(5, str(tmp_path), "run"))
     loaded = DDPG.load(tmp_path / "run_5_steps", device="cpu")
     assert not is_mpc(loaded)

@@ -89,7 +89,9 @@ def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
 def test_a_full_disk_ends_no_training_and_the_record_is_completed_later(
     tmp_path, monkeypatch
 ) -> None:
-    path, own, calls = tmp_path / "guard.csv", record.as_csv, []
+    path = tmp_path / "guard.csv"
+    own = record.as_csv
+    calls = []
 
     def at_times(decisions):
         calls.append(len(decisions))
@@ -141,7 +143,8 @@ def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:
 def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(
     algorithm, place, tmp_path, monkeypatch
 ) -> None:
-    model, guard = build(algorithm), make_guard(log_path=tmp_path / "guard.csv")
+    model = build(algorithm)
+    guard = make_guard(log_path=tmp_path / "guard.csv")
     stop = 4 * STEPS
     save = CheckpointCallback(stop, str(tmp_path), "model")
     kept: list[object] = []
@@ -191,7 +194,8 @@ def evaluates(folder: Path) -> EvalCallback:
 
 def test_the_file_holds_what_is_accepted_from_the_first_step_on(tmp_path) -> None:
     folder = tmp_path / "new" / "folder"
-    model, guard = build(gradient_steps=0), make_guard(save_path=folder)
+    model = build(gradient_steps=0)
+    guard = make_guard(save_path=folder)
     seen: list[Any] = []
     look = At([1, STEPS + 1, 2 * STEPS], lambda _: seen.append(saved(folder)))
     worse = At([STEPS + 2], partial(correct, region=RIGHT, value=2.0))
@@ -209,7 +213,8 @@ def test_a_best_model_that_nobody_accepted_is_told_and_the_accepted_one_lies_bes
 ) -> None:
     best = evaluates(tmp_path)
     other = EveryNTimesteps(1, best) if nested else best
-    model, guard = build(gradient_steps=0), make_guard(n_new_starts=5)
+    model = build(gradient_steps=0)
+    guard = make_guard(n_new_starts=5)
     with pytest.warns(
         UserWarning, match="best_model.zip that EvalCallback.*accepted_model.zip"
     ) as told:
@@ -220,7 +225,8 @@ def test_a_best_model_that_nobody_accepted_is_told_and_the_accepted_one_lies_bes
 
 
 def test_a_disk_that_is_full_stops_no_training(tmp_path, monkeypatch) -> None:
-    model, guard = build(gradient_steps=0), make_guard(save_path=tmp_path)
+    model = build(gradient_steps=0)
+    guard = make_guard(save_path=tmp_path)
 
     def full(*_: Any) -> None:
         raise OSError("No space left on device")
@@ -289,13 +295,15 @@ def test_nothing_was_tried_and_why() -> None:
 
 def test_a_changed_policy_is_never_called_the_mpc() -> None:
     """What a policy learnt before training is not the MPC, nor is what changed it since."""
-    model, guard = build(gradient_steps=0, actor={"critic_warmup": 99}), make_guard(Slide)
+    model = build(gradient_steps=0, actor={"critic_warmup": 99})
+    guard = make_guard(Slide)
     better(model.policy)
     train(model, 2, guard)
     said = guard.summary()
     assert "is better than the MPC" in said
     assert "none was tried yet" in said and "critic_warmup = 99" in said
-    other, guard = build(gradient_steps=0), make_guard(Slide)
+    other = build(gradient_steps=0)
+    guard = make_guard(Slide)
     train(other, 2, At([], better), guard)
     assert "accepted last is the MPC" in guard.summary()
     better(other.policy)

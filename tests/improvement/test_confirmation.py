@@ -31,16 +31,22 @@ class Fake:
     """
 
     def __init__(self, change: Any, lost: Any = None, beyond: Any = None, seed: int = 0) -> None:
-        self.problem, self.change, self.next_seed = problem(), change, 0
-        self.lost, self.beyond = lost, beyond
-        self.rng, self.turn, self.played = np.random.default_rng(seed), 0, []
+        self.problem = problem()
+        self.change = change
+        self.next_seed = 0
+        self.lost = lost
+        self.beyond = beyond
+        self.rng = np.random.default_rng(seed)
+        self.turn = 0
+        self.played = []
 
     def new_seeds(self, count: int) -> range:
         self.next_seed += count
         return range(self.next_seed - count, self.next_seed)
 
     def play(self, controller: Any, seeds: Any) -> Any:
-        seeds, mpc = np.array(seeds), self.turn % 2 == 0
+        seeds = np.array(seeds)
+        mpc = self.turn % 2 == 0
         self.turn += 1
         if mpc:
             self.played.append(len(seeds))
@@ -182,7 +188,8 @@ def test_one_dear_start_that_gains_does_not_hide_that_all_others_lose() -> None:
 
 @pytest.mark.parametrize("spread", [0.02, 0.3])
 def test_of_a_thousand_policies_that_are_no_better_at_most_a_twentieth_is_accepted(spread) -> None:
-    accepted, least = 0, LOOKS[-1]
+    accepted = 0
+    least = LOOKS[-1]
     for seed in range(1000):
         simulator = Fake(gains(0.0, spread), seed=seed)
         simulator.next_seed = 100 * seed

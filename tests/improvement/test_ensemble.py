@@ -16,7 +16,8 @@ from twin_samples import log, observed, problem
 
 def episodes(count: int, noise: float = 0.0, first: int = 0) -> list[Episode]:
     """Return the cart's episodes, with inputs that are random by half."""
-    rng, law = np.random.default_rng(first), problem().explicit()
+    rng = np.random.default_rng(first)
+    law = problem().explicit()
 
     def act(x: np.ndarray) -> np.ndarray:
         return np.clip(law(x) + rng.uniform(-0.5, 0.5, 1), -1, 1)
@@ -64,8 +65,10 @@ def test_a_seed_repeats_it_and_no_global_random_state_moves() -> None:
 
 
 def test_windows_do_not_take_noise_of_the_sensors_for_dynamics() -> None:
-    noise, unseen = 0.05, episodes(5, first=50)
-    seen, box = episodes(8, noise), coordinates(noise)
+    noise = 0.05
+    unseen = episodes(5, first=50)
+    seen = episodes(8, noise)
+    box = coordinates(noise)
     errors = []
     for ahead in (1, 20):
         members = fit_ensemble(box, [seen], seed=0, ahead=ahead, updates=1000)

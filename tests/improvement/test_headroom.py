@@ -49,14 +49,18 @@ class Heater(gym.Env):
     def __init__(
         self, load: float = 0.0, bend: float = 0.0, steps: int = 60, noise: float = 0.0
     ) -> None:
-        self.mpc, self.load, self.bend, self.steps = heater(), load, bend, steps
+        self.mpc = heater()
+        self.load = load
+        self.bend = bend
+        self.steps = steps
         self.noise = noise
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = gym.spaces.Box(-2, 2, (1,), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.theta, self.later = self.np_random.uniform(-1, 1, 2), self.np_random.uniform(-1, 1)
+        self.theta = self.np_random.uniform(-1, 1, 2)
+        self.later = self.np_random.uniform(-1, 1)
         self.t = 0
         return self.theta.astype(np.float32), {}
 
@@ -126,7 +130,8 @@ def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
     assert found.verdict == "add ObserveDisturbance first"
     assert found.offset > 0.9 * found.total > 0.05
     mpc, observer = offset_free(heater())
-    low, high = mpc.disturbances.d_min, mpc.disturbances.d_max
+    low = mpc.disturbances.d_min
+    high = mpc.disturbances.d_max
     env = ObserveDisturbance(Heater(load=0.2), observer, low, high)
     episode = evaluate(mpc.online(), env, [0])
     measured, wanted = episode.observations[0][:, :2].T
@@ -220,7 +225,8 @@ def test_a_twin_s_members_share_the_starts() -> None:
 
 
 def test_in_a_twin() -> None:
-    mpc, twin = problems.cstr(), reactor_s_twin()
+    mpc = problems.cstr()
+    twin = reactor_s_twin()
     found = headroom(mpc, twin, n_starts=3)
     assert found.total > 0.005 and "the twin" in found.report()
     with pytest.raises(ValueError, match="another MPC's plant"):

@@ -75,7 +75,8 @@ def test_a_policy_gains_on_starts_that_it_has_not_seen(kind, tmp_path) -> None:
     assert found.accepted and found.where == "the simulator" and found.model is model
     assert found.change < -0.01 and found.checks[-1].final
     assert relative(model).mean() < 0.99 and relative(model).max() < 1.005
-    target, own = model.policy.actor_target.state_dict(), model.policy.actor.state_dict()
+    target = model.policy.actor_target.state_dict()
+    own = model.policy.actor.state_dict()
     assert all(th.equal(target[name], each) for name, each in own.items())
     model.save(tmp_path / "model")
     again = kind.load(tmp_path / "model", env=Spring(), device="cpu")
@@ -106,7 +107,8 @@ def test_it_takes_no_step_more_than_it_may(share) -> None:
     most = max(int(share * whole), 1)
     Counted.forget()
     model = model_of(Counted)
-    before, made = bits(model), Counted.made
+    before = bits(model)
+    made = Counted.made
     found = improve(model, Counted, max_steps=most, **FEW)
     assert found.steps == Counted.steps <= most
     assert Counted.closed == Counted.made - made
@@ -229,7 +231,8 @@ def test_what_is_cut_off_leaves_the_model_as_it_was(monkeypatch, where, error) -
     monkeypatch.setattr(module, where, cut)
     Counted.forget()
     model = model_of(Counted)
-    before, made = bits(model), Counted.made
+    before = bits(model)
+    made = Counted.made
     with pytest.raises(error):
         improve(model, Counted, **FEW)
     assert bits(model) == before and is_mpc(model)
@@ -275,7 +278,11 @@ def test_set_points_are_followed_for_less() -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sb3_yann.CostMismatchWarning")
 def test_an_observer_is_a_part_of_the_model() -> None:
-    mpc, make = offset_free_problem()[0], lambda: observed_env(Calm(20))
+    mpc = offset_free_problem()[0]
+
+    def make():
+        return observed_env(Calm(20))
+
     model = DDPG(YannPolicy, make(), device="cpu", policy_kwargs={"problem": mpc})
     before = bits(model)
     found = improve(model, make, n_starts=4, rounds=1, updates=100)
@@ -499,7 +506,8 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
 
     for name, value in {"RETURNS": 1000, "RETURN_STEPS": 60, "CRITIC_UPDATES": 1000}.items():
         monkeypatch.setattr(imitation, name, value)
-    model, rng = model_of(), np.random.default_rng(5)
+    model = model_of()
+    rng = np.random.default_rng(5)
     at = twin_of().starts.draw_logged(500, rng)
     u = np.clip(problem().explicit()(at) + 0.1 * rng.standard_normal((500, 1)), -1, 1)
     returns = -imitation._discounted(model.policy, twin_of(), model.actor.mu, at, u)

@@ -52,7 +52,8 @@ def test_workers_take_no_step_more_than_is_left() -> None:
 def test_a_vec_env_is_a_simulator(kind) -> None:
     envs = kind([Spring] * 3)
     problem = model_of().policy.problem
-    alone, shared = Simulator(problem, Spring, 0), Simulator(problem, envs, 0)
+    alone = Simulator(problem, Spring, 0)
+    shared = Simulator(problem, envs, 0)
     for controller in (of_law(problem), Excited(problem, 0, 0.5, 0.7)):
         assert same(alone.play(controller, SEEDS), shared.play(controller, SEEDS))
     assert shared.steps == alone.steps

@@ -49,11 +49,16 @@ def scenarios(found: LearntModel, each: bool = False) -> Scenarios:
 
 def by_hand(found: Scenarios) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (T + 1, k, size) and inputs of the law, step by step and one by one."""
-    dynamics, law = found.model.dynamics, found.model.problem.law()
+    dynamics = found.model.dynamics
+    law = found.model.problem.law()
     bounds = found.model.problem.deviations.u_min, found.model.problem.deviations.u_max
-    row, rows, inputs = dynamics.row, [], []
+    row = dynamics.row
+    rows = []
+    inputs = []
     for i, start in enumerate(found.starts):
-        at, one, us = start.copy(), [], []
+        at = start.copy()
+        one = []
+        us = []
         for given in found.given[:, i]:
             at[row.given] = given
             us.append(np.clip(law(row.shown(at)), *bounds))
@@ -70,8 +75,10 @@ def by_hand(found: Scenarios) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("make", [learnt, rated, observed])
 def test_an_episode_is_a_loop_of_the_members_steps(make, each) -> None:
     found = scenarios(make(), each)
-    mpc, row = found.model.problem, found.model.dynamics.row
-    played, (rows, inputs) = found.play(of_law(mpc)), by_hand(found)
+    mpc = found.model.problem
+    row = found.model.dynamics.row
+    played = found.play(of_law(mpc))
+    rows, inputs = by_hand(found)
     thetas = row.shown(rows)
     np.testing.assert_allclose(played.thetas, thetas, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(played.inputs, inputs, rtol=1e-9, atol=1e-12)
@@ -92,8 +99,11 @@ def test_what_is_not_finite_is_lost_and_has_no_cost() -> None:
 @pytest.mark.parametrize("members", [None, [0, 1, 0]])
 @pytest.mark.parametrize("make", [learnt, rated, observed])
 def test_slopes_of_a_plant_are_those_of_its_steps(make, members) -> None:
-    found, rng = make(), np.random.default_rng(2)
-    mpc, numbers, size = found.problem, np.arange(3), 1e-6
+    found = make()
+    rng = np.random.default_rng(2)
+    mpc = found.problem
+    numbers = np.arange(3)
+    size = 1e-6
     plant = TwinPlant(found.dynamics, members)
     half = 0.2 * mpc.theta_half
     theta = half * rng.uniform(-1, 1, (4, 3, mpc.n_theta))
@@ -109,9 +119,12 @@ def test_slopes_of_a_plant_are_those_of_its_steps(make, members) -> None:
 
 @pytest.mark.parametrize("make", [learnt, rated])
 def test_the_price_of_doubt_is_that_of_what_sets_members_apart(make) -> None:
-    dynamics, rng = make().dynamics, np.random.default_rng(3)
-    doubt, n = Disagreement(dynamics, weight=2.5), dynamics.problem.n_theta
-    thetas, u = rng.uniform(-0.8, 0.8, (5, 3, n)), rng.uniform(-0.9, 0.9, (5, 3, 1))
+    dynamics = make().dynamics
+    rng = np.random.default_rng(3)
+    doubt = Disagreement(dynamics, weight=2.5)
+    n = dynamics.problem.n_theta
+    thetas = rng.uniform(-0.8, 0.8, (5, 3, n))
+    u = rng.uniform(-0.9, 0.9, (5, 3, 1))
     state = dynamics.row.state
     every = [np.tile(v.reshape(1, 15, -1), (len(dynamics.members), 1, 1)) for v in (thetas, u)]
     after = dynamics.step(*every)[..., state] / dynamics.coordinates.units
@@ -133,10 +146,12 @@ def test_the_price_of_doubt_is_that_of_what_sets_members_apart(make) -> None:
     [(0.0, 0.0, (False, False)), (0.1, 0.0, (True, False)), (0.0, 0.3, (True, True))],
 )
 def test_what_a_model_lacks_is_told_from_noise(noise, bend, wanted) -> None:
-    mpc, rng = problem(), np.random.default_rng(0)
+    mpc = problem()
+    rng = np.random.default_rng(0)
     episodes = []
     for _ in range(20):
-        theta, u = rng.uniform(-1, 1, (41, mpc.n_theta)), rng.uniform(-1, 1, (40, 1))
+        theta = rng.uniform(-1, 1, (41, mpc.n_theta))
+        u = rng.uniform(-1, 1, (40, 1))
         rows = [theta[0]]
         for each in u:
             after = mpc.deviations.predict(rows[-1], each)
@@ -157,7 +172,8 @@ def bounded() -> PlantTwin:
 def test_the_error_is_what_ninety_five_per_cent_of_the_steps_keep() -> None:
     twin = bounded()
     steps = [(x[:-1], u, x[1:]) for x, u in log(4)]
-    model, half = twin.problem.model, np.array([3.0, 3.0])
+    model = twin.problem.model
+    half = np.array([3.0, 3.0])
     errors = [np.abs(after - x @ model.A.T - u @ model.B.T) / half for x, u, after in steps]
     expected = np.quantile(np.concatenate(errors).max(axis=1), 0.95)
     assert one_step_error(twin.dynamics.row, twin.episodes) == pytest.approx(expected)

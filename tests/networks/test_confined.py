@@ -32,9 +32,11 @@ def drawn(mpc, reach: float, count: int = 300) -> th.Tensor:
 @pytest.mark.parametrize("kind", ["per_region", "shared"])
 def test_within_the_box_nothing_changes_and_far_beyond_it_the_law_acts(kind) -> None:
     mpc, layer = layer_of(kind)
-    free, half = copy.deepcopy(layer), 0.3 * mpc.theta_half
+    free = copy.deepcopy(layer)
+    half = 0.3 * mpc.theta_half
     layer.confine(-half, half)
-    inside, everywhere = drawn(mpc, 0.3), drawn(mpc, 1.0)
+    inside = drawn(mpc, 0.3)
+    everywhere = drawn(mpc, 1.0)
     assert th.equal(layer(inside), free(inside))
     beyond = (everywhere.abs() / th.as_tensor(half)).amax(1) >= 1.25
     assert 0.1 < beyond.float().mean() < 1

@@ -69,15 +69,19 @@ def largest_excess(mpc: LinearMPC, act, steps: int = 80) -> float:
 
     The reference leaps every seven steps. The plant is its model.
     """
-    rng, parts = np.random.default_rng(1), mpc.layout
-    kept, bounds, (A, B) = mpc.kept_set, Bounds.of(mpc), mpc.prediction
+    rng = np.random.default_rng(1)
+    parts = mpc.layout
+    kept = mpc.kept_set
+    bounds = Bounds.of(mpc)
+    A, B = mpc.prediction
     theta = drawn(mpc, count=4000)
     theta = theta[(theta @ kept.F.T <= kept.g).all(axis=1)][:100]
     assert len(theta) == 100
     found = 0.0
     for t in range(steps):
         if t % 7 == 0 and parts.reference.stop > parts.reference.start:
-            low, high = mpc.theta_min[parts.reference], mpc.theta_max[parts.reference]
+            low = mpc.theta_min[parts.reference]
+            high = mpc.theta_max[parts.reference]
             theta[:, parts.reference] = rng.uniform(low, high, (len(theta), len(low)))
         theta = theta @ A.T + act(theta) @ B.T
         beyond = np.abs(bounds.beyond(theta))[:, bounds.softness <= 0]
@@ -86,7 +90,8 @@ def largest_excess(mpc: LinearMPC, act, steps: int = 80) -> float:
 
 
 def inputs_of(mpc: LinearMPC, layer):
-    middle, half = (mpc.u_max + mpc.u_min) / 2, (mpc.u_max - mpc.u_min) / 2
+    middle = (mpc.u_max + mpc.u_min) / 2
+    half = (mpc.u_max - mpc.u_min) / 2
     act = layer.frozen()
     return lambda theta: middle + half * act(theta)
 
@@ -94,8 +99,10 @@ def inputs_of(mpc: LinearMPC, layer):
 @pytest.mark.parametrize("name", CASES)
 def test_any_weights_keep_the_bounds_of_a_plant_that_is_its_model(name):
     mpc = CASES[name]()
-    layer, free = layer_of(mpc), layer_of(mpc, kept=None)
-    broken, m = 0.0, mpc.model.n_inputs
+    layer = layer_of(mpc)
+    free = layer_of(mpc, kept=None)
+    broken = 0.0
+    m = mpc.model.n_inputs
     for seed in range(3):
         generator = th.Generator().manual_seed(seed)
         with th.no_grad():
@@ -114,7 +121,8 @@ def test_any_weights_keep_the_bounds_of_a_plant_that_is_its_model(name):
 @pytest.mark.parametrize("name", ["spring", "references, loads and rates", "two tanks"])
 def test_at_first_it_is_the_law_and_loops_agree_with_operations_of_torch(name, kind):
     mpc = CASES[name]()
-    layer, theta = layer_of(mpc, kind), th.as_tensor(drawn(mpc, 1.3))
+    layer = layer_of(mpc, kind)
+    theta = th.as_tensor(drawn(mpc, 1.3))
     assert th.equal(layer(theta), layer.law(theta))
     scrambled(layer)
     free = layer_of(mpc, kind, kept=None)
@@ -126,15 +134,19 @@ def test_at_first_it_is_the_law_and_loops_agree_with_operations_of_torch(name, k
 @pytest.mark.parametrize("margin", [0.0, 0.03])
 def test_no_bound_is_nearer_than_the_margin_unless_it_is_to_the_law(margin):
     mpc = CASES["two tanks"]()
-    layer, (A, B) = scrambled(layer_of(mpc)), mpc.prediction
+    layer = scrambled(layer_of(mpc))
+    A, B = mpc.prediction
     layer.keep(margin)
     theta = drawn(mpc, 2.0, 2000)
     theta[:, mpc.layout.previous] = drawn(mpc, 1.0, 2000)[:, mpc.layout.previous]
-    middle, half = (mpc.u_max + mpc.u_min) / 2, (mpc.u_max - mpc.u_min) / 2
-    F, g = mpc.kept_set.F, mpc.kept_set.g
+    middle = (mpc.u_max + mpc.u_min) / 2
+    half = (mpc.u_max - mpc.u_min) / 2
+    F = mpc.kept_set.F
+    g = mpc.kept_set.g
     with th.no_grad():
         points = th.as_tensor(theta)
-        law, actions = layer.law(points).double().numpy(), layer(points).double().numpy()
+        law = layer.law(points).double().numpy()
+        actions = layer(points).double().numpy()
     slack = [g - (theta @ A.T + (middle + half * a) @ B.T) @ F.T for a in (law, actions)]
     assert np.mean(slack[0] < 0) > 0.05 and not np.array_equal(law, actions)
     assert np.all(slack[1] >= np.minimum(slack[0], 0) - 1e-6)

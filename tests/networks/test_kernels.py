@@ -66,7 +66,8 @@ def test_the_layer_is_that_of_torch_inside_and_outside_the_domain(
     shaken(layer, size)
     plain = by_torch(layer)
     theta = box_points(law, 400, stretch=1.5)
-    ours, theirs = layer(theta), plain(theta)
+    ours = layer(theta)
+    theirs = plain(theta)
     assert_close(ours, theirs)
     assert th.any(theirs.abs() == 1)
     for one, other in zip(gradients(ours, layer), gradients(theirs, plain), strict=True):
@@ -127,7 +128,8 @@ def test_tanh_is_exact_to_two_units_in_the_last_place_odd_and_bounded() -> None:
 def value(pinned: bool, hidden=(64, 64), gamma: float = 0.99) -> AfterstateValue:
     mpc = problems.cstr()
     ranges = Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
-    matrices, model = (mpc.stage_matrix, mpc.value_matrix(gamma)), LinearPrediction(*mpc.prediction)
+    matrices = (mpc.stage_matrix, mpc.value_matrix(gamma))
+    model = LinearPrediction(*mpc.prediction)
     return AfterstateValue(*matrices, model, gamma, ranges, hidden, pinned=pinned)
 
 
@@ -191,7 +193,8 @@ def test_what_torch_traces_still_depends_on_the_state() -> None:
 
 
 def test_a_value_notices_a_change_of_its_model() -> None:
-    ours, points = value(True), th.rand(20, 5)
+    ours = value(True)
+    points = th.rand(20, 5)
     ours(points)
     ours.model.A.mul_(1.1)
     ours.gamma = 0.5
@@ -210,7 +213,8 @@ def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None
     th.nn.utils.parametrize.register_parametrization(later_layers(module)[-1], "weight", Double())
     theta = box_points(law_of("reactor"), 50)
     points = th.cat([theta, th.linspace(-1, 1, 50)[:, None]], 1)[:, :n]
-    ours, theirs = module(points), (plain := by_torch(module))(points)
+    ours = module(points)
+    theirs = (plain := by_torch(module))(points)
     assert_close(ours, theirs)
     for one, other in zip(gradients(ours, module), gradients(theirs, plain), strict=True):
         assert_close(one, other, 1e-4)

@@ -54,7 +54,8 @@ def far_and_near(mpc: LinearMPC, seed: int) -> th.Tensor:
 def test_layer_is_its_law_at_first_and_no_more_jumps_than_it(
     mpc: LinearMPC, seed: int, kind: str, hidden: tuple[int, ...]
 ) -> None:
-    layer, theta = layer_of(mpc, kind, hidden), th.as_tensor(mixture(mpc, seed))
+    layer = layer_of(mpc, kind, hidden)
+    theta = th.as_tensor(mixture(mpc, seed))
     law = mpc.online() if kind == "shared, online" else mpc.explicit()
     with th.no_grad():
         actions = layer(theta)
@@ -75,7 +76,8 @@ def test_shared_network_leaves_no_jump_whatever_its_weights(
     for kind in ("shared", "shared, online"):
         layer = shaken(layer_of(mpc, kind, (4, 3)), size, seed)
         law: Any = layer.base_law  # type: ignore[attr-defined]
-        one, other = at - step * ways, at + step * ways
+        one = at - step * ways
+        other = at + step * ways
         kept = law.in_domain(one) & law.in_domain(other)
         with th.no_grad():
             change = layer(th.as_tensor(other[kept])) - layer(th.as_tensor(one[kept]))
@@ -112,7 +114,8 @@ def bounds_hold(layer: LawLayer, theta: th.Tensor, bound: float | None) -> None:
     """Assert what a layer promises for any weights."""
     for graph in (False, True):
         with th.set_grad_enabled(graph):
-            actions, law = layer(theta).detach().double(), layer.law(theta).double()
+            actions = layer(theta).detach().double()
+            law = layer.law(theta).double()
         sure = actions.isfinite().all(1)
         assert bool(sure.all()) or bound is None  # else the actor takes the law
         assert not actions.isinf().any()

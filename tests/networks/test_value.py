@@ -93,17 +93,20 @@ def test_value_is_the_quadratic_form_to_the_rounding_of_float32(
 @BOTH
 def test_bellmans_equation_holds_along_the_law(name: str, gamma: float, kind: Any) -> None:
     # On the linear plant, from states from which the law stays in the unconstrained region.
-    mpc, law = solved(name), law_of(name)
+    mpc = solved(name)
+    law = law_of(name)
     origin = law.locate(np.zeros(law.n_theta))
     points = box_points(law, 4000).numpy() * np.geomspace(1e-3, 1, 4000)[:, None]
-    theta, visits = points.astype(np.float64), np.ones(len(points), dtype=bool)
+    theta = points.astype(np.float64)
+    visits = np.ones(len(points), dtype=bool)
     for _ in range(2):
         visits &= (law.locate(theta) == origin) & law.in_domain(theta)
         theta = theta @ mpc.model.A.T + law(theta) @ mpc.model.B.T
     start = th.as_tensor(points[visits], dtype=th.float32)
     assert len(start) > 300
 
-    value, actor = kind(name, gamma), YannLayer(law)
+    value = kind(name, gamma)
+    actor = YannLayer(law)
     with th.no_grad():
         action = actor(start)
         x, u = in_physical_units(name, th.cat([start, action], 1))
@@ -139,7 +142,8 @@ def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str, gamma: 
 def test_cost_to_go_of_the_origin_is_learnt_only_where_it_is_not_pinned(
     name: str, pinned: bool
 ) -> None:
-    value, rows = critic(name, pinned=pinned), random_rows(name, 256)
+    value = critic(name, pinned=pinned)
+    rows = random_rows(name, 256)
     origin = th.zeros(1, law_of(name).n_theta, dtype=th.float64)
     assert value.value(origin).item() == 0
     train(value, rows, value(rows).detach() - 20, steps=50)
@@ -167,7 +171,8 @@ def test_value_at_rest_is_zero_and_stays_so(name: str, kind: Any) -> None:
 
 
 def test_training_fits_a_cost_to_go_that_is_not_quadratic() -> None:
-    value, rows = critic("pendulum"), random_rows("pendulum", 512)
+    value = critic("pendulum")
+    rows = random_rows("pendulum", 512)
     law = law_of("pendulum")
     theta = box_points(law, 256).double() / 2
     with th.no_grad():
@@ -182,7 +187,8 @@ def test_training_fits_a_cost_to_go_that_is_not_quadratic() -> None:
 
 
 def test_all_parameters_learn_and_the_model_has_none() -> None:
-    value, rows = critic("reactor"), random_rows("reactor", 256)
+    value = critic("reactor")
+    rows = random_rows("reactor", 256)
     assert {name.split(".")[0] for name, _ in value.named_parameters()} == {"quadratic", "network"}
     before = copy.deepcopy(value)
     train(value, rows, 0.7 * value(rows).detach() - 3, steps=2)
@@ -240,7 +246,8 @@ class Halving(th.nn.Module):
 def test_model_that_is_given_says_where_the_value_is_taken() -> None:
     rows = random_rows("pendulum", 100)
     theta, u = in_physical_units("pendulum", rows)
-    P, mpc = solved("pendulum").value_matrix(0.99), solved("pendulum")
+    P = solved("pendulum").value_matrix(0.99)
+    mpc = solved("pendulum")
     expected = mpc.stage_cost(theta, u) + 0.99 * np.einsum("bi,ij,bj->b", theta, P, theta) / 4
     for model in (Halving(), lambda theta, u: theta / 2 + 0 * u):
         q = critic("pendulum", model=model)(rows).detach().numpy()[:, 0]

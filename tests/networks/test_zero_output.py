@@ -123,7 +123,8 @@ def test_stack_computes_what_its_networks_compute_alone() -> None:
     stack = ZeroOutputNetwork(2, 1, (8, 8), pinned=pins(True, False, True)).double()
     for parameter in stack.parameters():
         th.nn.init.normal_(parameter)
-    x, index = square(dtype=th.float64), th.randint(3, (256,))
+    x = square(dtype=th.float64)
+    index = th.randint(3, (256,))
     for i in range(3):
         alone = ZeroOutputNetwork(2, 1, (8, 8), pinned=stack.pinned[i].bool()).double()
         with th.no_grad():
@@ -145,7 +146,8 @@ def test_pinned_output_at_zero_stays_exactly_zero(activation: str, hidden: tuple
     net = ZeroOutputNetwork(
         2, 1, hidden, activation=ACTIVATIONS[activation], pinned=pins(True, True)
     )
-    x, index = square(), th.randint(2, (256,))
+    x = square()
+    index = th.randint(2, (256,))
     train(net, th.optim.Adam(net.parameters(), 1e-2), 100, x, curved(x) + 1, index)
     for count in (1, 2, 7, 33, 256):
         x = square(count)
@@ -200,7 +202,8 @@ def test_a_stack_too_large_to_be_multiplied_as_a_whole_does_the_same(hidden, mon
     with th.no_grad():
         for parameter in net.parameters():
             parameter += th.randn_like(parameter)
-    x, index = th.randn(64, 3), th.randint(stack, (64,))
+    x = th.randn(64, 3)
+    index = th.randint(stack, (64,))
     x[:8] = 0
     outcomes = []
     for few in (stack, stack - 1):
@@ -255,7 +258,9 @@ def test_each_row_is_trained_as_if_it_had_an_adam_of_its_own(dense: bool) -> Non
 
 @pytest.mark.parametrize("dense", [False, True])
 def test_rows_without_a_gradient_do_not_move_not_even_by_momentum(dense: bool) -> None:
-    before, after = trained(dense, 10), trained(dense, 11)  # the eleventh step has rows 0 and 1
+    # the eleventh step has rows 0 and 1
+    before = trained(dense, 10)
+    after = trained(dense, 11)
     moved = (before != after).flatten(1).any(1)
     assert moved.tolist() == [True, True, False, False, False]
     assert th.equal(after[2], th.ones(2, 3))

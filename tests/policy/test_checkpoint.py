@@ -176,7 +176,8 @@ def explores(algorithm: Any) -> dict[str, Any]:
 
 def correction(model: Any, theta: Any) -> Any:
     """What the policy adds to its law, in units of the input."""
-    u, law = model.predict(theta, deterministic=True)[0], model.policy.problem.online()(theta)
+    u = model.predict(theta, deterministic=True)[0]
+    law = model.policy.problem.online()(theta)
     inside = np.abs(u) < model.policy.problem.u_max - 1e-3
     return u - law, inside & (np.abs(law) < model.policy.problem.u_max - 1e-3)
 
@@ -194,7 +195,8 @@ def test_a_shared_correction_stays_under_other_weights_and_bounds(algorithm: Any
     assert type(other) is type(model) and (other.gamma, other.batch_size) == (0.98, 32)
     theta = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 4)) * old.theta_max
     theta = theta.astype(np.float32)
-    (one, inside), (two, also) = correction(model, theta), correction(other, theta)
+    one, inside = correction(model, theta)
+    two, also = correction(other, theta)
     both = (inside & also).all(axis=1)
     assert both.sum() > 20 and np.abs(one[both]).max() > 1e-3
     assert np.abs(one - two)[both].max() < 1e-4

@@ -20,7 +20,8 @@ def test_two_trainings_with_one_seed_are_the_same(n_envs, tmp_path) -> None:
     found = []
     for name in ("first.csv", "second.csv"):
         th.manual_seed(len(found))  # what came before does not matter
-        model, guard = build(env=envs(n_envs)), guard_in_simulator(log_path=tmp_path / name)
+        model = build(env=envs(n_envs))
+        guard = guard_in_simulator(log_path=tmp_path / name)
         train(model, 8 * STEPS, guard)
         assert guard.decisions
         found.append([model_bits(model), (tmp_path / name).read_bytes()])

@@ -35,7 +35,8 @@ SMALL = {PPO: {"n_steps": 32, "batch_size": 16}}
 
 def build(algorithm, env=None, **policy_kwargs):
     if env is None:
-        env, policy_kwargs["problem"] = LinearPlant(scalar_mpc()), scalar_mpc()
+        env = LinearPlant(scalar_mpc())
+        policy_kwargs["problem"] = scalar_mpc()
     given = {"simulator": True, **policy_kwargs}
     small = SMALL.get(algorithm, {"learning_starts": 10})
     return algorithm("YannPolicy", env, policy_kwargs=given, seed=0, device="cpu", **small)
@@ -78,7 +79,8 @@ def test_a_truncated_normal_is_scipy_s() -> None:
     center = th.tensor([[-1.0, -0.9], [0.2, 0.99], [1.0, 0.0]])
     log_std = th.tensor([-3.0, -0.5])
     ours = TruncatedNormal(center, log_std)
-    m, s = center.numpy().astype(float), np.exp(log_std.numpy().astype(float))
+    m = center.numpy().astype(float)
+    s = np.exp(log_std.numpy().astype(float))
     theirs = stats.truncnorm((-1 - m) / s, (1 - m) / s, loc=m, scale=s)
     assert np.allclose(ours.entropy(), theirs.entropy().sum(1), atol=1e-5)
     for at in (center, th.full_like(center, -1.0), th.full_like(center, 1.0), -center):
@@ -112,7 +114,8 @@ def test_log_probabilities_are_finite_where_the_law_rides_its_bounds(algorithm) 
 def test_critics_start_as_the_value_of_the_law() -> None:
     models = {algorithm: build(algorithm) for algorithm in (SAC, TQC, PPO)}
     plain = DDPG(YannPolicy, LinearPlant(scalar_mpc()), policy_kwargs={"problem": scalar_mpc()})
-    obs, actions = th.linspace(-3, 3, 7)[:, None], th.linspace(-1, 1, 7)[:, None]
+    obs = th.linspace(-3, 3, 7)[:, None]
+    actions = th.linspace(-1, 1, 7)[:, None]
     with th.no_grad():
         (expected,) = plain.critic(obs, actions)
         for q in models[SAC].critic(obs, actions):
@@ -227,7 +230,8 @@ def test_entropy_starts_in_balance_and_what_the_user_gives_stays() -> None:
     model = build(SAC, initial_std=0.05)
     entropy = model.policy.actor.distribution(th.zeros(1, 1)).entropy()
     assert model.target_entropy == pytest.approx(entropy.item(), abs=1e-3)
-    mpc, std = model.policy.problem, 0.1
+    mpc = model.policy.problem
+    std = 0.1
     curvature = mpc.state_action_matrix(model.gamma)[1, 1]
     assert model.log_ent_coef.exp().item() == pytest.approx(2 * curvature * std**2, rel=1e-4)
     own = {"policy_kwargs": {"problem": mpc}, "ent_coef": 0.3, "target_entropy": -2.0}
@@ -238,7 +242,8 @@ def test_entropy_starts_in_balance_and_what_the_user_gives_stays() -> None:
 
 @EXPLORING
 def test_the_policy_of_td3_and_state_dependent_noise_are_refused(algorithm) -> None:
-    env, kwargs = LinearPlant(scalar_mpc()), {"problem": scalar_mpc()}
+    env = LinearPlant(scalar_mpc())
+    kwargs = {"problem": scalar_mpc()}
     with pytest.raises(TypeError, match=f'{algorithm.__name__}\\("YannPolicy", env\\)'):
         algorithm(YannPolicy, env, policy_kwargs=kwargs)
     with pytest.raises(ValueError, match="use_sde = True"):
@@ -256,7 +261,8 @@ def test_rl_zoo_s_entries_build_a_model(algorithm, env_id) -> None:
     name = f"{algorithm.__name__.lower()}.yml"
     text = (files("sb3_yann") / "hyperparams" / name).read_text(encoding="utf-8")
     entry = yaml.safe_load(text)[env_id]
-    steps, callbacks = entry.pop("n_timesteps"), entry.pop("callback")
+    steps = entry.pop("n_timesteps")
+    callbacks = entry.pop("callback")
     model = algorithm(env=env_id, device="cpu", **entry)
     assert steps == 50 * model.env.get_attr("spec")[0].max_episode_steps
     names = [next(iter(each)) if isinstance(each, dict) else each for each in callbacks]

@@ -131,13 +131,15 @@ def test_the_law_ignores_extra_signals_wherever_they_are() -> None:
 @pytest.mark.parametrize("kind", [DDPG, TD3, SAC, PPO])
 def test_a_policy_with_extra_signals_starts_as_the_law(kind: Any) -> None:
     """Its critic starts as the value of the law, too; both are those without the signals."""
-    model, seen = build(kind), observations()
+    model = build(kind)
+    seen = observations()
     law = tank().explicit()
     u = model.predict(seen, deterministic=True)[0]
     np.testing.assert_allclose(u, law.plant_input(seen[:, :1]), atol=6e-5)
     if kind is PPO:
         return
-    points, actions = th.as_tensor(seen), th.linspace(-1, 1, len(seen))[:, None]
+    points = th.as_tensor(seen)
+    actions = th.linspace(-1, 1, len(seen))[:, None]
     theta = model.policy.theta(seen)
     terms = tank().state_action_terms(model.gamma)
     v = 3.0 * actions.double().numpy()
@@ -241,7 +243,8 @@ def test_a_signal_that_is_lost_leaves_the_law() -> None:
 @pytest.mark.parametrize("suffix", [".npz", ".onnx"])
 def test_exports_take_the_signals_after_theta(suffix: str, tmp_path: Any) -> None:
     """They are the policy, to rounding."""
-    model, path = perturbed(build()), tmp_path / f"controller{suffix}"
+    model = perturbed(build())
+    path = tmp_path / f"controller{suffix}"
     export(model, path)
     seen = observations(50)
     seen[:, 1] = np.clip(seen[:, 1], *FEED)
@@ -292,19 +295,22 @@ def test_improve_learns_what_a_signal_does(tmp_path: Any) -> None:
         total = 0.0
         for seed in range(40):
             env = Tank()
-            shown, over = env.reset(seed=seed)[0], False
+            shown = env.reset(seed=seed)[0]
+            over = False
             while not over:
                 u = act(shown)
                 total += (shown[0] - 10) ** 2 + 0.1 * (u[0] - 3) ** 2
                 shown, _, _, over, _ = env.step(u)
         return total
 
-    law, best = mpc.law(), oracle.law()
+    law = mpc.law()
+    best = oracle.law()
     log = []
     for seed in range(100, 115):
         env = Tank()
         rng = np.random.default_rng(seed)
-        rows, inputs = [env.reset(seed=seed)[0]], []
+        rows = [env.reset(seed=seed)[0]]
+        inputs = []
         while len(inputs) < 25:
             u = np.clip(law.plant_input(rows[-1]) + rng.uniform(-1, 1), 0, 6)
             inputs.append(u)
@@ -313,7 +319,8 @@ def test_improve_learns_what_a_signal_does(tmp_path: Any) -> None:
     twin = PlantTwin.fit(mpc, log, residuals=["linear"])
     learnt = improve(mpc, twin, rounds=2, n_starts=20, updates=1500)
     assert learnt.accepted
-    base, least = cost(law.plant_input), cost(best.plant_input)
+    base = cost(law.plant_input)
+    least = cost(best.plant_input)
     for each in (found, learnt):
         costs.append(cost(lambda shown, model=each.model: model.predict(shown)[0]))
     assert least < 0.8 * base

@@ -27,7 +27,10 @@ class Faulty(gym.Wrapper):
 
     def __init__(self, env: gym.Env, at, what: str = "reward", value: float = np.nan) -> None:
         super().__init__(env)
-        self.at, self.what, self.value, self.steps = at, what, value, 0
+        self.at = at
+        self.what = what
+        self.value = value
+        self.steps = 0
 
     def shown(self, observation):
         observation = np.array(observation)

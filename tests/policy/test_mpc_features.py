@@ -49,13 +49,15 @@ def test_a_policy_starts_as_the_law_and_its_critic_keeps_bellmans_equation(
     options = {"problem": mpc, "law": "online"}
     env = Shown(mpc)
     model = DDPG(YannPolicy, env, gamma=0.95, policy_kwargs=options, device="cpu")
-    law, rng = mpc.online(), np.random.default_rng(0)
+    law = mpc.online()
+    rng = np.random.default_rng(0)
     theta = rng.uniform(mpc.theta_min, mpc.theta_max, (60, mpc.n_theta)).astype(np.float32)
     theta = theta[law.in_domain(mpc.units.to_deviations(theta))]
     played = model.predict(theta, deterministic=True)[0]
     assert np.abs((played - law.plant_input(theta)) / mpc.u_half).max() < 2e-6  # float32's room
 
-    own, (A, B) = mpc.deviations, mpc.prediction
+    own = mpc.deviations
+    A, B = mpc.prediction
     rest = np.array(mpc.theta_rest)
     for _ in range(500):
         rest = A @ rest + B @ law(rest)
@@ -195,7 +197,8 @@ def test_networks_per_region_need_regions() -> None:
 
 
 def test_observations_that_are_sampled_again_are_not_solved_again() -> None:
-    model, solved = with_full_buffer(law="online", critic_warmup=0), []
+    model = with_full_buffer(law="online", critic_warmup=0)
+    solved = []
     known = model.policy.problem.online().known
     answers = known.function
     updates(model, 50)  # of 100 transitions

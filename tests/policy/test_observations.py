@@ -114,7 +114,8 @@ def test_sb3_s_own_critic_loss_is_zero_at_the_start(critic, reward) -> None:
     model = build(Seen(show, size), observation, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger
     model.replay_buffer.reset()
-    origin, rng = law().locate(np.zeros(3)), np.random.default_rng(0)
+    origin = law().locate(np.zeros(3))
+    rng = np.random.default_rng(0)
     while model.replay_buffer.size() < 500:
         x = rng.uniform(LOW, HIGH) / 10
         obs = show(x).astype(np.float32)

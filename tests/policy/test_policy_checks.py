@@ -282,17 +282,20 @@ def require_refused(model, load: Callable[[], Any], what: str = "") -> None:
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_of_another_problem_change_nothing(kind, other, exact_match) -> None:
-    model, foreign = model_of(kind), model_of(kind, **OTHERS[other]).get_parameters()
+    model = model_of(kind)
+    foreign = model_of(kind, **OTHERS[other]).get_parameters()
     require_refused(model, lambda: model.set_parameters(foreign, exact_match), r"actor\.mu\.")
 
 
 def test_a_guards_checkpoint_of_another_problem_changes_nothing() -> None:
-    model, foreign = build(), ActorCheckpoint.of(build(mpc=scalar_mpc(R=[[2]])).policy)
+    model = build()
+    foreign = ActorCheckpoint.of(build(mpc=scalar_mpc(R=[[2]])).policy)
     require_refused(model, lambda: foreign.restore(model.policy))
 
 
 def test_a_critic_of_other_weights_is_told_where_the_law_is_the_same() -> None:
-    model, foreign = build(), build(mpc=scalar_mpc(Q=[[2]], R=[[2]]))
+    model = build()
+    foreign = build(mpc=scalar_mpc(Q=[[2]], R=[[2]]))
     require_refused(
         model, lambda: model.set_parameters(foreign.get_parameters()), r"critic\.qf0\.W"
     )
@@ -301,14 +304,16 @@ def test_a_critic_of_other_weights_is_told_where_the_law_is_the_same() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_parameters_of_the_same_problem_are_loaded_exactly(kind, algorithm) -> None:
-    learnt, model = model_of(kind, algorithm), build(algorithm, scalar_mpc(), KINDS[kind])
+    learnt = model_of(kind, algorithm)
+    model = build(algorithm, scalar_mpc(), KINDS[kind])
     model.set_parameters(learnt.get_parameters())
     assert same(state_of(model), state_of(learnt))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_another_machine_has_solved_is_loaded(kind) -> None:
-    model, state = model_of(kind), state_of(model_of(kind))
+    model = model_of(kind)
+    state = state_of(model_of(kind))
     generator = th.Generator().manual_seed(0)
     for name, each in state.items():
         if each.dtype == th.float64 and ".network." not in name:
@@ -330,5 +335,6 @@ def test_a_load_with_another_problem_names_it(tmp_path) -> None:
 
 @pytest.mark.parametrize("changes", [{"x_max": 4.9}, {"u_min": -0.99}, {"R": [[1.001]]}])
 def test_online_laws_of_problems_alike_are_told_apart(changes) -> None:
-    model, other = model_of("an online law"), model_of("an online law", **changes)
+    model = model_of("an online law")
+    other = model_of("an online law", **changes)
     require_refused(model, lambda: model.set_parameters(other.get_parameters()))

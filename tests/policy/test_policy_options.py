@@ -59,8 +59,10 @@ def test_the_bound_holds_after_training(algorithm) -> None:
 def test_a_bound_that_is_set_later_survives_saving_as_well(
     algorithm, first, then, tmp_path
 ) -> None:
-    mpc, given = scalar_mpc(), {"max_correction": first, "pin_equilibrium": False}
-    model, states = build(algorithm, mpc, given), starts(mpc)
+    mpc = scalar_mpc()
+    given = {"max_correction": first, "pin_equilibrium": False}
+    model = build(algorithm, mpc, given)
+    states = starts(mpc)
     scramble(model)
     model.policy.limit_correction(then)
     for _ in range(2):  # saved again, it is still there
@@ -125,7 +127,8 @@ class LinearModule(th.nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.A, self.B = th.nn.Parameter(A.clone()), th.nn.Parameter(B.clone())
+        self.A = th.nn.Parameter(A.clone())
+        self.B = th.nn.Parameter(B.clone())
 
     def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
         return theta @ self.A + u @ self.B
@@ -145,7 +148,8 @@ def test_the_linear_model_given_as_prediction_model_changes_no_more_than_roundin
     default = with_full_buffer(algorithm, two_inputs(), critic_warmup=3)
     updates(default, 10)
     mine.critic.load_state_dict(default.critic.state_dict(), strict=False)
-    found, data = [], default.replay_buffer.sample(64)
+    found = []
+    data = default.replay_buffer.sample(64)
     for model in (mine, default):
         (q,) = model.critic(data.observations, data.actions)[:1]
         model.critic.optimizer.zero_grad()
@@ -164,7 +168,8 @@ def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) ->
         kwargs = {"critic": options}
     mpc = two_inputs()
     model = build(mpc=mpc, policy_kwargs=kwargs)
-    theta, u = starts(mpc), mpc.explicit()(starts(mpc))
+    theta = starts(mpc)
+    u = mpc.explicit()(starts(mpc))
     action = th.as_tensor(model.policy.scale_action(u.astype(np.float32)))
     with th.no_grad():
         q = model.critic.q1_forward(th.as_tensor(theta), action).numpy()[:, 0]
@@ -186,7 +191,8 @@ def pushing(model, towards: float = 9.0):
 
 def largest(model, start: float = 0.0) -> float:
     """Return the largest state of a plant that is the model."""
-    x, found = np.array([start]), -np.inf
+    x = np.array([start])
+    found = -np.inf
     for _ in range(60):
         x = 1.1 * x + model.predict(x.astype(np.float32))[0]
         found = max(found, float(x[0]))
@@ -203,7 +209,8 @@ def test_it_is_on_where_there_are_hard_bounds_and_networks_do_not_take_over_beyo
 
 
 def test_predictions_keep_the_bounds_that_others_break():
-    kept, free = pushing(build()), pushing(build(policy_kwargs={"keep_bounds": False}))
+    kept = pushing(build())
+    free = pushing(build(policy_kwargs={"keep_bounds": False}))
     assert 4.999 < largest(kept) < 5 + 5e-6
     assert largest(free) > 100
 

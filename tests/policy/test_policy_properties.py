@@ -24,7 +24,8 @@ LARGEST = float(np.finfo(np.float32).max)
 
 def policy_of(mpc: LinearMPC, dtype: Any = np.float32, **kwargs: Any) -> YannPolicy:
     seen = spaces.Box(-np.inf, np.inf, (mpc.n_theta,), dtype)
-    low, high = mpc.u_min.astype(dtype), mpc.u_max.astype(dtype)
+    low = mpc.u_min.astype(dtype)
+    high = mpc.u_max.astype(dtype)
     return make_policy(seen, spaces.Box(low, high, dtype=dtype), problem=mpc, **kwargs)
 
 
@@ -96,7 +97,8 @@ def test_critic_is_the_value_of_the_problem_at_first(
     theta = in_box(mpc, 50, 2.0, seed).astype(np.float32)
     action = np.random.default_rng(seed).uniform(-1, 1, (50, mpc.model.n_inputs))
     action = action.astype(np.float32)
-    middle, half = (mpc.u_max + mpc.u_min) / 2, (mpc.u_max - mpc.u_min) / 2
+    middle = (mpc.u_max + mpc.u_min) / 2
+    half = (mpc.u_max - mpc.u_min) / 2
     z = np.hstack([theta, middle + half * action])
     terms = z[:, :, None] * M * z[:, None]
     with th.no_grad():

@@ -75,7 +75,8 @@ def test_statistics_that_change_after_the_model_was_made_are_refused(tmp_path) -
 
 
 def test_a_loaded_model_whose_statistics_are_lost_is_named(tmp_path) -> None:
-    env, plain = normalize(), Seen(lambda x: x + STEADY, 3)
+    env = normalize()
+    plain = Seen(lambda x: x + STEADY, 3)
     build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env)).save(tmp_path / "model")
     env.save(tmp_path / "statistics")
     with pytest.warns(UserWarning, match=r"its env has none.*VecNormalize\.load"):
@@ -98,7 +99,8 @@ def mpc_costs(seeds) -> list[float]:
     """Return the cost of the explicit law itself, in float64."""
     costs = []
     for seed in seeds:
-        plant, cost = LinearPlant(MPC), 0.0
+        plant = LinearPlant(MPC)
+        cost = 0.0
         plant.reset(seed=seed)
         for _ in range(20):
             cost -= plant.step(law()(plant.x))[1]

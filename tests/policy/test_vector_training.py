@@ -69,7 +69,8 @@ def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
         noise = NormalActionNoise(np.zeros(2), np.ones(2))
         model = build(env, gradient_steps=0, action_noise=noise)
         guard = ImprovementGuard(plant, n_eval_episodes=3)
-        audit, diagnostics = CostAudit(steps=40, strict=True), ControlDiagnostics()
+        audit = CostAudit(steps=40, strict=True)
+        diagnostics = ControlDiagnostics()
         model.learn(60, callback=[NoActionNoise(), guard, diagnostics, audit])
         assert_every_action_is_the_law_s(model)
         assert model.replay_buffer.pos == 30
@@ -101,10 +102,8 @@ def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm) -> None:
     model = build(DummyVecEnv([plant] * 3), algorithm, gradient_steps=-1)
-    before, guard = (
-        copy.deepcopy(model.actor),
-        ImprovementGuard(plant, n_eval_episodes=3, n_final_starts=0, eval_freq=6),
-    )
+    before = copy.deepcopy(model.actor)
+    guard = ImprovementGuard(plant, n_eval_episodes=3, n_final_starts=0, eval_freq=6)
     tried: list[int] = []
     learnt: list[dict[str, th.Tensor]] = []
     attempt = guard._try_candidate
@@ -136,7 +135,8 @@ def normalized(n: int):
     env = VecNormalize(
         DummyVecEnv([lambda: plant(0.05)] * n), norm_reward=False, clip_obs=np.inf, training=False
     )
-    env.obs_rms.mean, env.obs_rms.var = np.array([0.1, 0, -0.2]), np.array([4, 1, 0.04])
+    env.obs_rms.mean = np.array([0.1, 0, -0.2])
+    env.obs_rms.var = np.array([4, 1, 0.04])
     return env
 
 
@@ -145,9 +145,11 @@ def normalized(n: int):
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_a_time_limit_is_no_end_to_the_critic(algorithm, kind, n_envs) -> None:
     if kind == "plain":
-        env, observation = DummyVecEnv([lambda: plant(0.05)] * n_envs), None
+        env = DummyVecEnv([lambda: plant(0.05)] * n_envs)
+        observation = None
     elif kind == "stacked":
-        env, observation = stacked(n_envs), AffineObservation.newest_frame(3, 3)
+        env = stacked(n_envs)
+        observation = AffineObservation.newest_frame(3, 3)
     else:
         env = normalized(n_envs)
         observation = AffineObservation.from_vec_normalize(env)
@@ -210,7 +212,8 @@ class Continuous(gym.Env):
 
 
 def test_a_model_of_k_times_the_sampling_time_is_right_for_k_repetitions() -> None:
-    k, dt = 5, Continuous.model.dt
+    k = 5
+    dt = Continuous.model.dt
     model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], k * dt)
     mpc = LinearMPC(
         model,

@@ -73,7 +73,8 @@ class Outline(HTMLParser):
 @cache
 def guarded():
     """Return a small model that has learnt under a guard, and the guard: not to be changed."""
-    model, guard = guard_samples.build(), make_guard(n_new_starts=3, n_final_starts=5)
+    model = guard_samples.build()
+    guard = make_guard(n_new_starts=3, n_final_starts=5)
     model.learn(80, callback=[NoActionNoise(), guard])
     return model, guard
 
@@ -110,7 +111,8 @@ def whole(tmp_path_factory) -> tuple[Path, DDPG]:
 
 
 def test_it_is_one_small_file_that_loads_nothing_and_has_every_part(whole) -> None:
-    path, source = whole[0], whole[0].read_text(encoding="utf-8")
+    path = whole[0]
+    source = whole[0].read_text(encoding="utf-8")
     assert path.stat().st_size < 3_000_000 and [*path.parent.iterdir()] == [path]
     assert not re.search(
         r"https?://|url\(|@import|<(script|link|iframe|object)|javascript:", source
@@ -226,7 +228,8 @@ def test_how_far_the_policy_leaves_the_mpc_is_in_the_inputs_units(tmp_path) -> N
 
 
 def test_violations_of_the_policy_alone_fail(tmp_path) -> None:
-    model, env = moved(-0.5), partial(Slide, limits=(-0.2, 1.1), low=3.0, high=4.0)
+    model = moved(-0.5)
+    env = partial(Slide, limits=(-0.2, 1.1), low=3.0, high=4.0)
     assert guard_samples.LAW([3.5])[0] == -1.0
     opposite = partial(Slide, limits=(-1.1, -0.6), low=3.0, high=4.0)
     worse = Outline(report(moved(0.6), tmp_path / "a.html", env=opposite, seeds=SEEDS)).text
@@ -253,7 +256,9 @@ def test_inputs_beyond_a_bound_at_run_time_fail() -> None:
         assert (text in [each.text for each in part.findings]) is not keeps
         beyond = re.findall(r"<td[^>]*>(\d+)</td>", str(register.content).split("</tr>")[1])
         assert (beyond[-1] == "0") is keeps  # of the input, in closed loops
-        layer.moving, layer.rated = None, False  # a layer without them, and with another law
+        # a layer without them, and with another law
+        layer.moving = None
+        layer.rated = False
         layer.constants = (layer.constants[0], np.empty((0, 1)), *layer.constants[2:])
         with th.no_grad():
             last_layer(model)[..., -1] = 0.5
@@ -264,7 +269,8 @@ def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
 
     model = moved(0.1)
     text = Outline(report(model, tmp_path / "r.html", env=Slide, seeds=SEEDS)).text
-    before, after = evaluate(guard_samples.LAW, Slide, SEEDS), evaluate(model, Slide, SEEDS)
+    before = evaluate(guard_samples.LAW, Slide, SEEDS)
+    after = evaluate(model, Slide, SEEDS)
     change = after.costs - before.costs
     low, high = stats.ttest_1samp(change, 0).confidence_interval(0.95)
     scale = 100 / before.costs.mean()
@@ -275,7 +281,8 @@ def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
 
 @pytest.mark.parametrize("shows", ["plant", "normalized"])
 def test_the_mpc_is_played_through_the_policy_s_own_maps(shows, tmp_path) -> None:
-    mpc, env = unit_samples.plant_mpc(), partial(unit_samples.plant, shows, "normalized")
+    mpc = unit_samples.plant_mpc()
+    env = partial(unit_samples.plant, shows, "normalized")
     kwargs = {"problem": mpc, "observation": unit_samples.SAYS[shows]}
     model = DDPG("YannPolicy", env(), policy_kwargs=kwargs, device="cpu")
     text = Outline(report(model, tmp_path / "r.html", env=env, seeds=range(3))).text
@@ -291,7 +298,8 @@ def test_observations_are_normalized_as_in_training(tmp_path) -> None:
 
     mpc = guard_samples.MPC
     venv = VecNormalize(DummyVecEnv([Slide]), norm_reward=False, training=False)
-    venv.obs_rms.mean[:], venv.obs_rms.var[:] = 0.5, 4.0
+    venv.obs_rms.mean[:] = 0.5
+    venv.obs_rms.var[:] = 4.0
     kwargs = {"problem": mpc, "observation": AffineObservation.from_vec_normalize(venv)}
     model = DDPG("YannPolicy", venv, policy_kwargs=kwargs, device="cpu")
     text = Outline(report(model, tmp_path / "r.html", env=Slide, seeds=range(3))).text
@@ -337,7 +345,8 @@ def improved(tmp_path_factory):
 
 def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) -> None:
     model, page = improved
-    text, (found,) = Outline(page).text, model.improvements
+    text = Outline(page).text
+    (found,) = model.improvements
     for said in (
         "The policy is the one that improve accepted last, in the twin (5 episodes",
         *(line.split()[0] for line in found.report().splitlines()), found.source,
@@ -438,7 +447,8 @@ def test_of_a_twin_alone_its_episodes_are_played_and_said_to_be_no_plant_s(tmp_p
 
 
 def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
-    model, path = guard_samples.build(), tmp_path / "r.html"
+    model = guard_samples.build()
+    path = tmp_path / "r.html"
     with pytest.raises(TypeError, match="needs a YannPolicy"):
         report(PPO("MlpPolicy", Slide(), device="cpu"), path)
     with pytest.raises(TypeError, match="needs a YannPolicy"):

@@ -90,7 +90,8 @@ def _plant() -> LinearMPC:
 
 
 def _law_file(kind: str, folder: Path) -> tuple[Callable[[Path], Any], Path]:
-    path, mpc = folder / "law.npz", _plant()
+    path = folder / "law.npz"
+    mpc = _plant()
     if kind == "controller":
         export(mpc.explicit(), path)
         return Controller.load, path
@@ -104,7 +105,9 @@ def _bytes(kind: str) -> Callable[[Path], Target]:
 
     def target(folder: Path) -> Target:
         load, path = _law_file(kind, folder)
-        content, digest, known = path.read_bytes(), digest_of(read_arrays(path)), load(path)
+        content = path.read_bytes()
+        digest = digest_of(read_arrays(path))
+        known = load(path)
 
         def attempt(rng: np.random.Generator) -> str:
             path.write_bytes(damaged(content, rng))
@@ -167,13 +170,15 @@ def _changed(array: Any, rng: np.random.Generator) -> Any:
 
 def _record(folder: Path) -> Target:
     """Return a target of damaged records of a commissioning."""
-    path, settings = folder / "plant.jsonl", {"batch": 2}
+    path = folder / "plant.jsonl"
+    settings = {"batch": 2}
     journal = Journal(Record(path), settings, CommissioningState(0.1))
     for _ in range(3):
         journal.begin(False)
         rows = np.ones((3, 2)), np.ones((2, 1))
         journal.add(PlantEpisode(*rows, -1.0, 0, None, 0.1, 0.0), False)
-    content, events = path.read_bytes(), Record(path).events
+    content = path.read_bytes()
+    events = Record(path).events
 
     def attempt(rng: np.random.Generator) -> str:
         path.write_bytes(damaged(content, rng))

@@ -80,7 +80,8 @@ def show_shifted(env: gym.Env) -> gym.Env:
 
 
 OTHER = dataclasses.replace(MPC, Q=np.diag([1, 2, 3]), R=MPC.R / 2, terminal=None)
-LOW, HIGH = MPC.u_min.astype(np.float32), MPC.u_max.astype(np.float32)
+LOW = MPC.u_min.astype(np.float32)
+HIGH = MPC.u_max.astype(np.float32)
 
 # What is done to the env, what it is taken for, what else is said.
 WRONG = {

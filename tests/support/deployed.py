@@ -33,7 +33,8 @@ def disturbed(mpc: LinearMPC, size: float = 0.4, seed: int = 1, **kwargs: Any) -
     """Return a policy whose networks have learnt something: noise."""
     if "observation_space" not in kwargs:
         kwargs["observation_space"] = box(mpc.n_theta, np.float64)
-    low, high = mpc.u_min.astype(np.float32), mpc.u_max.astype(np.float32)
+    low = mpc.u_min.astype(np.float32)
+    high = mpc.u_max.astype(np.float32)
     inputs = spaces.Box(low, high, dtype=np.float32)
     policy = make_policy(kwargs.pop("observation_space"), inputs, problem=mpc, **kwargs)
     generator = th.Generator().manual_seed(seed)
@@ -94,7 +95,8 @@ CASES: dict[str, Callable[[], YannPolicy]] = {
 
 
 def confined(policy: YannPolicy) -> YannPolicy:
-    low, high = policy.problem.theta_min, policy.problem.theta_max
+    low = policy.problem.theta_min
+    high = policy.problem.theta_max
     policy.confine_correction(0.5 * low, 0.6 * high)
     return policy
 
@@ -117,9 +119,11 @@ def observations(policy: YannPolicy, count: int, seed: int = 0) -> np.ndarray:
 
     There are fewer for a law of many regions, which numpy must all ask.
     """
-    law, rng = policy.problem.explicit(), np.random.default_rng(seed)
+    law = policy.problem.explicit()
+    rng = np.random.default_rng(seed)
     count = count if law.n_regions < 100 else min(count, 2_000)
-    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
+    middle = (law.theta_max + law.theta_min) / 2
+    half = (law.theta_max - law.theta_min) / 2
     reach = np.where(np.arange(count) % 3, 1.0, 2.5)[:, None]
     theta = middle + reach * half * rng.uniform(-1, 1, (count, law.n_theta))
     on_facets = sample_laws.facet_points(law, count).numpy()[: count // 4]
@@ -137,9 +141,11 @@ def with_faults(policy: YannPolicy, steps: int) -> tuple[Checks, list[tuple[Any,
 
     Readings are lost, beyond their limits or frozen, steps late; the operator takes over.
     """
-    obs, generator = observations(policy, steps), np.random.default_rng(3)
+    obs = observations(policy, steps)
+    generator = np.random.default_rng(3)
     low, high = np.percentile(obs, [5, 95], axis=0)
-    calm, m = np.clip(obs, low, high), policy.problem.model.n_inputs
+    calm = np.clip(obs, low, high)
+    m = policy.problem.model.n_inputs
     found = []
     for k in range(steps):
         seen = calm[k // 2 % len(calm)].copy()
@@ -208,7 +214,8 @@ class Compiled:
         """Return actions (batch, m) and what was found (batch,)."""
         call = self.code.plant_law if law else self.code.plant_policy
         rows = np.ascontiguousarray(obs, self.real)
-        actions, found = np.empty((len(rows), self.m), self.real), np.empty(len(rows), int)
+        actions = np.empty((len(rows), self.m), self.real)
+        found = np.empty(len(rows), int)
         for i, row in enumerate(rows):
             found[i] = call(self.pointer(row), self.pointer(actions[i]))
         return actions, found

@@ -59,14 +59,17 @@ class Slide(gym.Env):
     def __init__(
         self, limits: tuple[float, float] = (-1.1, 1.1), low: float = -4.0, high: float = 4.0
     ) -> None:
-        self.limits, self.low, self.high = limits, low, high
+        self.limits = limits
+        self.low = low
+        self.high = high
         self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float32)
         self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
         self.played = 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.t = self.np_random.uniform(self.low, self.high, 1), 0
+        self.x = self.np_random.uniform(self.low, self.high, 1)
+        self.t = 0
         return self.x.astype(np.float32), {}
 
     def step(self, action):
@@ -76,7 +79,9 @@ class Slide(gym.Env):
         best = float(LAW(self.x)[0])
         cost = 1 + (u - (best / 2 if abs(best) > 0.999 else best)) ** 2
         info = {"violation": not self.limits[0] <= u <= self.limits[1]}
-        self.x, self.t, self.played = self.x / 2, self.t + 1, self.played + 1
+        self.x = self.x / 2
+        self.t += 1
+        self.played += 1
         return self.x.astype(np.float32), -cost, False, self.t == STEPS, info
 
 
@@ -85,7 +90,8 @@ class CutOff(Slide):
 
     def __init__(self, at: int, act: Callable[[], Any]) -> None:
         super().__init__()
-        self.at, self.act = at, act
+        self.at = at
+        self.act = act
 
     def reset(self, *, seed=None, options=None):
         if seed == self.at:
@@ -122,7 +128,8 @@ def make_guard(env: Any = Slide, *, rule: Any = {}, **kwargs) -> ImprovementGuar
 
 def tried(*acts: Callable[[YannPolicy], Any], env: Any = Slide, actor: Any = None, **options):
     """Return a model and its guard, after an episode for each act, which makes a candidate."""
-    model, guard = build(gradient_steps=0, actor=actor), make_guard(env, **options)
+    model = build(gradient_steps=0, actor=actor)
+    guard = make_guard(env, **options)
     moves = [At([(i + 1) * STEPS], act) for i, act in enumerate(acts)]
     train(model, len(acts) * STEPS, *moves, guard)
     return model, guard
@@ -170,7 +177,8 @@ class At(BaseCallback):
 
     def __init__(self, steps: Any, act: Callable[[YannPolicy], Any]) -> None:
         super().__init__()
-        self.steps, self.act = steps, act
+        self.steps = steps
+        self.act = act
 
     def _on_step(self) -> bool:
         if self.n_calls in self.steps:

@@ -62,7 +62,8 @@ class Plain(Spring):
         return place + DT * speed, 0.95 * speed + DT * u
 
 
-POINT, PUSH = np.array([5.0, 0.3]), np.array([2.0])
+POINT = np.array([5.0, 0.3])
+PUSH = np.array([2.0])
 """Where the cart rests elsewhere, in plant units: its state and its input."""
 
 
@@ -82,7 +83,8 @@ class Elsewhere(Spring):
 
     def __init__(self) -> None:
         super().__init__()
-        low, high = np.float32(POINT - 3), np.float32(POINT + 3)
+        low = np.float32(POINT - 3)
+        high = np.float32(POINT + 3)
         self.observation_space = ProblemBox(low, high, problem=moved())
         self.action_space = gym.spaces.Box(np.float32(PUSH - 1), np.float32(PUSH + 1))
 

@@ -17,7 +17,8 @@ from sb3_yann import (
 )
 
 MPC = two_input_mpc()
-LOW, HIGH = np.array([-5.0, -5, -5]), np.array([5.0, 6, 7])
+LOW = np.array([-5.0, -5, -5])
+HIGH = np.array([5.0, 6, 7])
 STEADY = np.array([20.0, 0, -7])
 FAR = np.array([1e5, 0, 0])
 RANDOM = AffineObservation(np.random.default_rng(0).normal(size=(3, 5)), [1, 2, 3])
@@ -33,7 +34,8 @@ class Seen(gym.ObservationWrapper):
 
     def __init__(self, show, size: int, start: float = 1.0, dtype: type = np.float32) -> None:
         super().__init__(TimeLimit(LinearPlant(MPC, start), 20))
-        self.show, self.dtype = show, dtype
+        self.show = show
+        self.dtype = dtype
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype)
 
     def observation(self, _):

@@ -25,7 +25,9 @@ class OnlineMPC:
     """Solves one theta at a time; variables are (u_0 ... u_{N-1}, x_1 ... x_N, slacks), scaled."""
 
     def __init__(self, mpc: LinearMPC) -> None:
-        self.mpc, model, N = mpc, mpc.model, mpc.horizon
+        self.mpc = mpc
+        model = mpc.model
+        N = mpc.horizon
         n, m = model.B.shape
         self.sizes = [n, len(mpc.tracking.C), model.E.shape[1]]  # then u_prev, where there is one
         self.n_previous = len(mpc.theta_min) - sum(self.sizes)
@@ -57,7 +59,8 @@ class OnlineMPC:
 
     def _set_cost(self) -> None:
         """Half the cost: ``1/2 (z - target)'W(z - target)``, changes of u, and slacks."""
-        mpc, N = self.mpc, self.mpc.horizon
+        mpc = self.mpc
+        N = self.mpc.horizon
         n, m = mpc.model.B.shape
         discounts = mpc.gamma ** np.arange(N)
         weights = [discount * mpc.R for discount in discounts]
@@ -65,7 +68,8 @@ class OnlineMPC:
         weights += [mpc.gamma**N * mpc.terminal.cost[:n, :n]]
         cost = block_diag(*weights, *(np.zeros((1, 1)) for _ in self.soft))
         if len(mpc.terminal.cost) > n:  # the terminal cost of u_{N-1} - u_s as well
-            last, final = slice((N - 1) * m, N * m), slice(self.n_moves - n, self.n_moves)
+            last = slice((N - 1) * m, N * m)
+            final = slice(self.n_moves - n, self.n_moves)
             P = mpc.gamma**N * mpc.terminal.cost
             cost[last, last] += P[n:, n:]
             cost[last, final] += P[n:, :n]
@@ -87,7 +91,8 @@ class OnlineMPC:
 
     def _set_rows(self) -> None:
         """Rows besides the steps, as (A, A_theta, upper, lower): A z + A_theta theta is bounded."""
-        mpc, N = self.mpc, self.mpc.horizon
+        mpc = self.mpc
+        N = self.mpc.horizon
         n, m = mpc.model.B.shape
         n_theta = len(mpc.theta_min)
         states = [np.zeros((n, len(self.unit))) for _ in range(N)]
@@ -121,14 +126,13 @@ class OnlineMPC:
         self.rows_length = length
         self.rows = np.ascontiguousarray(np.vstack([self.steps, A / length[:, None]]))
         free_x = self.mpc.soft.x > 0
-        x_max, x_min = np.where(free_x, np.inf, mpc.x_max), np.where(free_x, -np.inf, mpc.x_min)
+        x_max = np.where(free_x, np.inf, mpc.x_max)
+        x_min = np.where(free_x, -np.inf, mpc.x_min)
         slacks = np.ones(len(self.soft))
         upper = [np.tile(mpc.u_max, N), np.tile(x_max, N), np.inf * slacks]
         lower = [np.tile(mpc.u_min, N), np.tile(x_min, N), 0 * slacks]
-        self.upper, self.lower = (
-            np.concatenate(upper) / self.unit,
-            np.concatenate(lower) / self.unit,
-        )
+        self.upper = np.concatenate(upper) / self.unit
+        self.lower = np.concatenate(lower) / self.unit
         self.sense = np.zeros(len(self.upper) + len(self.rows), dtype=np.intc)
         self.sense[len(self.upper) : len(self.upper) + N * n] = EQUALITY
 
@@ -137,17 +141,20 @@ class OnlineMPC:
         slack = np.zeros_like(row)
         if kind in self.soft:
             slack[:, self.n_moves + list(self.soft).index(kind)] = units
-        free, none = np.zeros((len(row), len(self.mpc.theta_min))), np.full(len(row), np.inf)
+        free = np.zeros((len(row), len(self.mpc.theta_min)))
+        none = np.full(len(row), np.inf)
         return [(row - slack, free, high, -none), (row + slack, free, none, low)]
 
     def steady_state(self, theta: Array) -> Array:
         """Return [u_s; x_s]: the cheapest steady state that holds the reference."""
-        mpc, model = self.mpc, self.mpc.model
+        mpc = self.mpc
+        model = self.mpc.model
         n, m = model.B.shape
         _, r, d, _ = np.split(theta, np.cumsum(self.sizes))
         holds = np.hstack([model.B, model.A - np.eye(n)])
         shows = np.hstack([np.zeros((len(r), m)), mpc.tracking.C])
-        M, right = np.vstack([holds, shows]), np.concatenate([-model.E @ d, r])
+        M = np.vstack([holds, shows])
+        right = np.concatenate([-model.E @ d, r])
         weight = block_diag(mpc.R, mpc.Q)
         kkt = np.block([[weight, M.T], [M, np.zeros((len(M), len(M)))]])
         right = np.concatenate([np.zeros(n + m), right])
@@ -155,7 +162,8 @@ class OnlineMPC:
 
     def start(self, theta: Array) -> Array:
         """Return the right-hand side of the steps of the model, scaled."""
-        model, N = self.mpc.model, self.mpc.horizon
+        model = self.mpc.model
+        N = self.mpc.horizon
         x, _, d, _ = np.split(theta, np.cumsum(self.sizes))
         start = np.tile(model.E @ d, N)
         start[: len(x)] += model.A @ x
@@ -163,7 +171,8 @@ class OnlineMPC:
 
     def limits(self, theta: Array) -> tuple[Array, Array]:
         """Return lower and upper limits of the variables, and of the rows, all scaled."""
-        shift, start = self.rows_theta @ theta, self.start(theta)
+        shift = self.rows_theta @ theta
+        start = self.start(theta)
         lower = [self.lower, start, (self.rows_lower - shift) / self.rows_length]
         upper = [self.upper, start, (self.rows_upper - shift) / self.rows_length]
         return np.concatenate(lower), np.concatenate(upper)

@@ -20,7 +20,8 @@ def unit_half(law: PiecewiseAffine) -> Array:
 
 def balls(law: PiecewiseAffine) -> list[tuple[Array, float]]:
     """Center and radius, in half-widths of the box, of a large ball in each region."""
-    half, found = unit_half(law), []
+    half = unit_half(law)
+    found = []
     for region in range(law.n_regions):
         A, b = half_spaces(law, region)
         center, radius = largest_ball(A * half, b.copy())
@@ -35,8 +36,10 @@ def slacks(law: PiecewiseAffine, points: Array) -> Array:
 
 def edges(law: PiecewiseAffine, seed: int, each: int = 4) -> tuple[Array, Array]:
     """Points (count, n) on facets, and the directions in which the region ends there."""
-    half, rng = unit_half(law), np.random.default_rng(seed)
-    points, ways = [], []
+    half = unit_half(law)
+    rng = np.random.default_rng(seed)
+    points = []
+    ways = []
     for region, (center, _) in enumerate(balls(law)):
         A, b = half_spaces(law, region)
         for way in half * rng.normal(size=(each, law.n_theta)):

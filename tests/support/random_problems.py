@@ -72,7 +72,8 @@ def _bounds(rng: np.random.Generator, kind: str, x_unit: Array) -> dict[str, Any
     C = rng.normal(size=(1, len(x_unit))) / x_unit
     box = {"theta_min": low, "theta_max": high}
     inner = rng.uniform(0.3, 1.1, len(x_unit))
-    states, outputs = {"x_min": low * inner, "x_max": high * inner}, OutputBounds(C, -1.5, 1.0)
+    states = {"x_min": low * inner, "x_max": high * inner}
+    outputs = OutputBounds(C, -1.5, 1.0)
     if kind == "soft states":
         return {**states, "soft": SoftBounds(0.5 * x_unit, penalty=300.0)}
     if kind == "soft outputs":
@@ -84,7 +85,9 @@ def _parts(
     rng: np.random.Generator, names: set[str], plant: Matrices, units: tuple[Array, Array]
 ) -> dict[str, Any]:
     """Reference, disturbance and rates, those that are named."""
-    (A, B, _), (x_unit, u_unit), found = plant, units, {}
+    A, B, _ = plant
+    x_unit, u_unit = units
+    found = {}
     if "tracking" in names:
         found["tracking"] = Tracking(_tracked(rng, A, B) / x_unit, *_between(rng, 0.1, 1, 1))
     if "disturbance" in names:
@@ -123,7 +126,8 @@ def problems(
     if ends and not names:
         F = rng.normal(size=(2, n)) / x_unit
         values["terminal"] = Terminal(set=(F, rng.uniform(0.5, 3, 2)))
-    A, B = x_unit[:, None] * A / x_unit, x_unit[:, None] * B / u_unit
+    A = x_unit[:, None] * A / x_unit
+    B = x_unit[:, None] * B / u_unit
     E = x_unit[:, None] * E if "disturbance" in names else np.zeros((n, 0))
     mpc = LinearMPC(LinearModel(A, B, 1.0, E=E), **values)
     try:
@@ -136,7 +140,8 @@ def problems(
 
 def in_box(mpc: LinearMPC, count: int, stretch: float = 1.0, seed: int = 0) -> Array:
     """Points (count, n) of the box of theta, or of one ``stretch`` times as wide."""
-    middle, half = (mpc.theta_max + mpc.theta_min) / 2, (mpc.theta_max - mpc.theta_min) / 2
+    middle = (mpc.theta_max + mpc.theta_min) / 2
+    half = (mpc.theta_max - mpc.theta_min) / 2
     drawn = np.random.default_rng(seed).uniform(-1, 1, (count, mpc.n_theta))
     return np.asarray(middle + stretch * half * drawn)
 
@@ -150,7 +155,8 @@ def room(mpc: LinearMPC, theta: Array) -> float:
     lower, upper = qp.limits(theta)
     equal = qp.sense == EQUALITY
     A = np.vstack([np.eye(len(qp.unit)), qp.rows])
-    rows, values = [], []
+    rows = []
+    values = []
     for side, bound in ((1.0, upper), (-1.0, -lower)):
         kept = ~equal & np.isfinite(bound)
         rows.append(np.column_stack([side * A[kept], np.ones(kept.sum())]))

@@ -31,7 +31,8 @@ class Checkpoint(BaseCallback):
 
     def __init__(self, at: int, folder: Path | None = None) -> None:
         super().__init__()
-        self.at, self.folder = at, folder
+        self.at = at
+        self.folder = folder
 
     def _on_rollout_start(self) -> None:
         if self.model.num_timesteps != self.at:
@@ -98,10 +99,12 @@ def fresh_trainings() -> None:
     In a process of its own, with a folder and one for the machine code of networks as arguments.
     The law and the code that finds it have been read before.
     """
-    folder, os.environ["NUMBA_CACHE_DIR"] = Path(sys.argv[1]), sys.argv[2]
+    folder = Path(sys.argv[1])
+    os.environ["NUMBA_CACHE_DIR"] = sys.argv[2]
     numba.core.config.reload_config()
     for n in (1, 4):
-        part, record = folder / str(n), folder / "guard.csv"
+        part = folder / str(n)
+        record = folder / "guard.csv"
         resumes = part.exists()
         part.mkdir(parents=True, exist_ok=True)
         model = build(env=envs(n))

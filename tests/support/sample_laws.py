@@ -57,7 +57,9 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
 @cache
 def reactor_in_plant_units() -> LinearMPC:
     """Return the reactor's MPC with its operating point."""
-    mpc, x, u = problems.cstr(), cstr.X_SS, cstr.U_SS
+    mpc = problems.cstr()
+    x = cstr.X_SS
+    u = cstr.U_SS
     return replace(
         mpc,
         model=replace(mpc.model, x_ss=x, u_ss=u),
@@ -83,7 +85,8 @@ def law_of(name: str, infeasible: str = "nearest_region") -> PiecewiseAffine:
 def box_points(law: PiecewiseAffine, count: int, stretch: float = 1.0, seed: int = 0) -> th.Tensor:
     """Points (count, n) in float32, uniform in the box of parameters, or in one ``stretch`` it."""
     rng = np.random.default_rng(seed)
-    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
+    middle = (law.theta_max + law.theta_min) / 2
+    half = (law.theta_max - law.theta_min) / 2
     points = middle + stretch * half * rng.uniform(-1, 1, (count, law.n_theta))
     return th.as_tensor(points, dtype=th.float32)
 
@@ -119,12 +122,15 @@ def facet_points(law: PiecewiseAffine, count: int = 4000) -> th.Tensor:
     """
     ends = box_points(law, 2 * count, seed=1).double().numpy()
     ends = ends[law.in_domain(ends)]
-    a, b = ends[: len(ends) // 2], ends[len(ends) // 2 : 2 * (len(ends) // 2)]
+    a = ends[: len(ends) // 2]
+    b = ends[len(ends) // 2 : 2 * (len(ends) // 2)]
     crossing = law.locate(a) != law.locate(b)
-    a, b = a[crossing], b[crossing]
+    a = a[crossing]
+    b = b[crossing]
     start = law.locate(a)
     for _ in range(60):
         middle = (a + b) / 2
         same = (law.locate(middle) == start)[:, None]
-        a, b = np.where(same, middle, a), np.where(same, b, middle)
+        a = np.where(same, middle, a)
+        b = np.where(same, b, middle)
     return th.as_tensor(a, dtype=th.float32)

@@ -16,7 +16,8 @@ class LinearPlant(gym.Env):
     """The prediction model itself as the plant, with the cost of the MPC, in float64."""
 
     def __init__(self, mpc: LinearMPC, start: float = 1.0) -> None:
-        self.mpc, self.start = mpc, start
+        self.mpc = mpc
+        self.start = start
         n = mpc.n_theta
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (n,), np.float32)
         self.action_space = gym.spaces.Box(
@@ -58,8 +59,10 @@ def asymmetric_pendulum_mpc() -> LinearMPC:
 
 def feasible_states(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return ``count`` float32-exact states at which the online QP is feasible, and its inputs."""
-    online, rng = OnlineMPC(mpc), np.random.default_rng(seed)
-    states, inputs = [], []
+    online = OnlineMPC(mpc)
+    rng = np.random.default_rng(seed)
+    states = []
+    inputs = []
     while len(states) < count:
         theta = rng.uniform(mpc.theta_min, mpc.theta_max).astype(np.float32).astype(np.float64)
         u = online(theta)

@@ -28,7 +28,8 @@ EYE_ROWS = np.vstack([np.eye(2), -np.eye(2)])
 
 def small_mpc(model: LinearModel = DOUBLE_INTEGRATOR, **changes: Any) -> LinearMPC:
     """Unit weights, two steps, inputs in [-1, 1], predicted states in [-5, 5]."""
-    n, m = model.n_states, model.n_inputs
+    n = model.n_states
+    m = model.n_inputs
     values: dict[str, Any] = {"Q": np.eye(n), "R": np.eye(m), "horizon": 2}
     values |= {"u_min": -1, "u_max": 1, "x_min": -5, "x_max": 5}
     return LinearMPC(model, **{**values, **changes})
@@ -47,7 +48,8 @@ def benchmark() -> LinearMPC:
 
 def in_units(units: Array, input_unit: float) -> LinearMPC:
     """The benchmark with other units for the states and the input: the same problem."""
-    to, back = np.diag(units), np.diag(1 / units)
+    to = np.diag(units)
+    back = np.diag(1 / units)
     model = LinearModel(
         to @ DOUBLE_INTEGRATOR.A @ back, to @ DOUBLE_INTEGRATOR.B / input_unit, dt=1.0
     )

@@ -73,10 +73,12 @@ class Spec:
 
 def draw(rng: np.random.Generator, features: tuple[str, ...]) -> Spec:
     """Draw a problem with these features, and some of the others' neighbors."""
-    n, m = int(rng.integers(1, 4)), int(rng.integers(1, 3))
+    n = int(rng.integers(1, 4))
+    m = int(rng.integers(1, 3))
     m = min(n, m)
     while True:
-        A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+        A = rng.normal(size=(n, n))
+        B = rng.normal(size=(n, m))
         A *= rng.uniform(0.4, 1.05) / np.max(np.abs(np.linalg.eigvals(A)))
         C = rng.normal(size=(m, n))
         square = np.block([[A - np.eye(n), B], [C, np.zeros((m, m))]])
@@ -88,7 +90,8 @@ def draw(rng: np.random.Generator, features: tuple[str, ...]) -> Spec:
     tracks = bool("preview" in features or rng.random() < 0.5)
     loaded = tracks and bool("preview" in features or rng.random() < 0.5)
     rated = bool(rng.random() < 0.4)
-    x_ss, u_ss = rng.normal(size=n) * 3, rng.normal(size=m) * 3
+    x_ss = rng.normal(size=n) * 3
+    u_ss = rng.normal(size=m) * 3
 
     def around(point: Array, low: float, high: float) -> tuple[Array, Array]:
         size = len(point)
@@ -162,12 +165,16 @@ class SparseQP:
         self.P = self._terminal()
 
     def _terminal(self) -> Array:
-        s, n, m = self.s, self.n, self.m
+        s = self.s
+        n = self.n
+        m = self.m
         root = np.sqrt(s.gamma)
         if not self.weighs_rate:
             return linalg.solve_discrete_are(root * s.A, root * s.B, s.Q, s.R)
-        A, B = linalg.block_diag(s.A, np.zeros((m, m))), np.vstack([s.B, np.eye(m)])
-        Q, cross = linalg.block_diag(s.Q, s.R_du), np.vstack([np.zeros((n, m)), -s.R_du])
+        A = linalg.block_diag(s.A, np.zeros((m, m)))
+        B = np.vstack([s.B, np.eye(m)])
+        Q = linalg.block_diag(s.Q, s.R_du)
+        cross = np.vstack([np.zeros((n, m)), -s.R_du])
         return linalg.solve_discrete_are(root * A, root * B, Q, s.R + s.R_du, s=cross)
 
     def x(self, k: int) -> Array:
@@ -182,17 +189,22 @@ class SparseQP:
         s = self.s
         found: dict[str, Any] = {}
         rest = theta
-        found["x"], rest = rest[: self.n], rest[self.n :]
-        p, d = (len(s.C) if s.tracks else 0), s.E.shape[1]
+        found["x"] = rest[: self.n]
+        rest = rest[self.n :]
+        p = len(s.C) if s.tracks else 0
+        d = s.E.shape[1]
         for name, size, ahead in (("r", p, s.ahead[0]), ("d", d, s.ahead[1])):
             count = size * (ahead + 1)
-            found[name], rest = rest[:count].reshape(ahead + 1, size), rest[count:]
+            found[name] = rest[:count].reshape(ahead + 1, size)
+            rest = rest[count:]
         found["bounds"] = dict(zip(s.parametric, rest, strict=False))
         found["u_prev"] = rest[len(s.parametric) :]
         return found
 
     def _target(self, r: Array, d: Array) -> tuple[Array, Array]:
-        s, n, m = self.s, self.n, self.m
+        s = self.s
+        n = self.n
+        m = self.m
         if not s.tracks:
             return s.x_ss, s.u_ss
         square = np.block([[s.A - np.eye(n), s.B], [s.C, np.zeros((m, m))]])
@@ -202,8 +214,10 @@ class SparseQP:
 
     def __call__(self, theta: Array) -> Array | None:  # noqa: C901 (one page to read)
         """Return u_0 in plant units, None where there is none or it is not certain."""
-        s, given = self.s, self._parts(theta)
-        H, c = np.zeros((self.size, self.size)), np.zeros(self.size)
+        s = self.s
+        given = self._parts(theta)
+        H = np.zeros((self.size, self.size))
+        c = np.zeros(self.size)
         equal: list[tuple[Array, Array]] = [(self.x(0), given["x"])]
         upper: list[tuple[Array, Array]] = []
 
@@ -226,7 +240,8 @@ class SparseQP:
         slack_x, slack_m = np.eye(self.size)[-2:]
         hard_x = not np.any(s.soft_x)
         for k in range(s.N):
-            r, d = known(given["r"], k), known(given["d"], k)
+            r = known(given["r"], k)
+            d = known(given["d"], k)
             x_s, u_s = self._target(r, d)
             g = s.gamma**k
             weigh(self.x(k), x_s, g * s.Q)
@@ -255,9 +270,11 @@ class SparseQP:
                     sides = s.mixed[0][i : i + 1], s.mixed[1][i : i + 1]
                     between(row[None], sides, (s.soft[i] * slack_m)[None])
         x_s, u_s = self._target(known(given["r"], s.N), known(given["d"], s.N))
-        end, goal = self.x(s.N), x_s
+        end = self.x(s.N)
+        goal = x_s
         if self.weighs_rate:
-            end, goal = np.vstack([end, self.u(s.N - 1)]), np.concatenate([x_s, u_s])
+            end = np.vstack([end, self.u(s.N - 1)])
+            goal = np.concatenate([x_s, u_s])
         weigh(end, goal, s.gamma**s.N * self.P)
         for slack in (slack_x, slack_m):
             H = H + 2 * PENALTY * np.outer(slack, slack)
@@ -286,7 +303,8 @@ def _solve(H: Array, c: Array, G: Array, h: Array, A: Array, b: Array) -> Array 
         K = np.block([[H, tight.T], [tight, np.zeros((len(tight), len(tight)))]])
         right = np.concatenate([-c, b, h[active]])
         both = np.linalg.lstsq(K, right, rcond=1e-13)[0]
-        values, multipliers = both[: len(c)], both[len(c) + len(b) :]
+        values = both[: len(c)]
+        multipliers = both[len(c) + len(b) :]
         off = G @ values - h
         if np.abs(K @ both - right).max() > 1e-7:
             return None
@@ -308,11 +326,14 @@ def worst_difference(features: tuple[str, ...], seed: int, points: int = 8) -> t
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # steady states at the edge
         mpc = problem(spec)
-    exact, laws = SparseQP(spec), [mpc.online()]
+    exact = SparseQP(spec)
+    laws = [mpc.online()]
     with contextlib.suppress(ExplicitLimitError, ExplicitSolutionError, ValueError):
         laws.append(mpc.explicit(region_limit=MOST_REGIONS))
-    center, half = (mpc.theta_max + mpc.theta_min) / 2, mpc.theta_half
-    worst, count = 0.0, 0
+    center = (mpc.theta_max + mpc.theta_min) / 2
+    half = mpc.theta_half
+    worst = 0.0
+    count = 0
     for share in rng.uniform(0.1, 1, points):
         theta = center + share * half * rng.uniform(-1, 1, mpc.n_theta)
         u = exact(theta)

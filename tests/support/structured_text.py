@@ -69,7 +69,8 @@ def _initial(kind: str, value: str) -> Any:
 
 
 def _python(body: str) -> str:
-    lines, depth = [], 0
+    lines = []
+    depth = 0
     for line in (each.strip() for each in body.splitlines()):
         if not line or line.startswith("end_function_block"):
             continue

@@ -41,14 +41,16 @@ class Cart(gym.Env[Any, Any]):
 
     def __init__(self, steps: int = 60) -> None:
         mpc = problem()
-        low, high = np.float32(mpc.theta_min), np.float32(mpc.theta_max)
+        low = np.float32(mpc.theta_min)
+        high = np.float32(mpc.theta_max)
         self.observation_space = ProblemBox(low, high, problem=mpc)
         self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
         self.length = steps
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.t = self.np_random.uniform([-1.5, -0.5], [1.5, 0.5]), 0
+        self.x = self.np_random.uniform([-1.5, -0.5], [1.5, 0.5])
+        self.t = 0
         return self.x.astype(np.float32), {}
 
     def step(self, action):
@@ -63,11 +65,15 @@ class Cart(gym.Env[Any, Any]):
 
 def log(episodes: int, noise: float = 0.0, first: int = 0, act: Any = None) -> list[Any]:
     """Return episodes of the MPC, or of another function, with sensor noise."""
-    rng, env, found = np.random.default_rng(first), Cart(), []
+    rng = np.random.default_rng(first)
+    env = Cart()
+    found = []
     act = problem().explicit() if act is None else act
     for seed in range(first, first + episodes):
-        x, over = env.reset(seed=seed)[0], False
-        states, actions = [x + noise * rng.standard_normal(2)], []
+        x = env.reset(seed=seed)[0]
+        over = False
+        states = [x + noise * rng.standard_normal(2)]
+        actions = []
         while not over:
             actions.append(np.atleast_1d(act(states[-1])))
             x, _, _, over, _ = env.step(actions[-1])
@@ -91,9 +97,12 @@ def twin(episodes: int = 5) -> PlantTwin:
 
 def mean_cost(act: Any, seeds: range = range(900, 940)) -> np.ndarray:
     """Return the costs of a policy on the plant."""
-    env, costs = Cart(), []
+    env = Cart()
+    costs = []
     for seed in seeds:
-        x, over, cost = env.reset(seed=seed)[0], False, 0.0
+        x = env.reset(seed=seed)[0]
+        over = False
+        cost = 0.0
         while not over:
             x, reward, _, over, _ = env.step(act(x))
             cost -= reward
@@ -146,7 +155,8 @@ class Moved(gym.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, *, seed=None, options=None):
         x, info = self.env.reset(seed=seed, options=options)
-        self.wanted, self.t = np.random.default_rng(seed).uniform(-0.5, 0.5, 2), 0
+        self.wanted = np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
+        self.t = 0
         return np.float32([*x, self.wanted[0]]), info
 
     def step(self, action):
@@ -167,11 +177,16 @@ def observed_log(episodes: int = 5, plant: Any = None) -> list[Any]:
 
     The third entry of each are the plant's states, the fourth the observer's estimates.
     """
-    law, env, found = offset_free_problem()[0].explicit(), observed_env(plant), []
+    law = offset_free_problem()[0].explicit()
+    env = observed_env(plant)
+    found = []
     for seed in range(episodes):
-        theta, over = env.reset(seed=seed)[0], False
-        rows, actions = [theta], []
-        states, estimates = [env.unwrapped.x], [env.observer.estimate]
+        theta = env.reset(seed=seed)[0]
+        over = False
+        rows = [theta]
+        actions = []
+        states = [env.unwrapped.x]
+        estimates = [env.observer.estimate]
         while not over:
             actions.append(law(theta).astype(np.float32))
             theta, _, _, over, _ = env.step(actions[-1])

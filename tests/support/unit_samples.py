@@ -8,12 +8,14 @@ from gymnasium.wrappers import TimeLimit
 
 from sb3_yann import LinearModel, LinearMPC
 
-X_SS, U_SS = np.array([350.0, 2.0]), np.array([40.0])
+X_SS = np.array([350.0, 2.0])
+U_SS = np.array([40.0])
 MODEL = LinearModel(
     [[0.9, 0.2], [0, 0.7]], [[0], [0.5]], 0.1, X_SS, U_SS, state_names=["temperature", "level"]
 )
 LIMITS = {"x_min": [340, 0], "x_max": [360, 4], "u_min": 38, "u_max": 45}
-CENTER, SCALE = np.array([345.0, 2.0]), np.array([10.0, 2.0])
+CENTER = np.array([345.0, 2.0])
+SCALE = np.array([10.0, 2.0])
 
 
 def plant_mpc() -> LinearMPC:
@@ -33,7 +35,9 @@ class OwnUnits(gym.Env):
     """The model as a plant; it shows and takes what it is asked to."""
 
     def __init__(self, shows: str, takes: str, dtype: type = np.float64) -> None:
-        self.shows, self.takes, self.dtype = SHOWS[shows], takes, dtype
+        self.shows = SHOWS[shows]
+        self.takes = takes
+        self.dtype = dtype
         low, high, _ = TAKES[takes]
         self.action_space = gym.spaces.Box(dtype(low), dtype(high), (1,), dtype)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), dtype)

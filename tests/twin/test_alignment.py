@@ -30,10 +30,14 @@ def mpc() -> LinearMPC:
 
 def logged(kind: str, seed: int = 0, noise: float = 0.01) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return episodes of a plant of other gains: of the MPC, another controller, or open loop."""
-    rng, law, found = np.random.default_rng(seed), mpc().explicit(), []
+    rng = np.random.default_rng(seed)
+    law = mpc().explicit()
+    found = []
     for _ in range(6):
-        x, held = rng.uniform(-1.5, 1.5, 2), np.zeros(2)
-        states, inputs = [x + noise * rng.normal(size=2)], []
+        x = rng.uniform(-1.5, 1.5, 2)
+        held = np.zeros(2)
+        states = [x + noise * rng.normal(size=2)]
+        inputs = []
         for k in range(40):
             held = rng.uniform(-0.4, 0.4, 2) if k % 5 == 0 else held
             u = held
@@ -153,10 +157,13 @@ def heated(
     gain: float, dither: float, open_loop: bool = False, steps: int = 40, hold: int = 4
 ) -> list:
     """Return episodes of a room whose heater has so many times the model's gain."""
-    rng, law, found = np.random.default_rng(5), room().explicit(), []
+    rng = np.random.default_rng(5)
+    law = room().explicit()
+    found = []
     held = np.zeros(1)
     for _ in range(6):
-        states, inputs = [rng.uniform(-2, 2, 2)], []
+        states = [rng.uniform(-2, 2, 2)]
+        inputs = []
         for k in range(steps):
             drawn = rng.normal(size=1)
             held = drawn if k % hold == 0 else held
@@ -235,11 +242,14 @@ def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed
 
 def tank() -> list[tuple[np.ndarray, np.ndarray]]:
     """Return level and temperature of a tank whose power acts over the level, both controlled."""
-    rng, found = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    found = []
     for _ in range(6):
-        level, warm = rng.uniform(0.1, 1.0), rng.uniform(30, 70)
+        level = rng.uniform(0.1, 1.0)
+        warm = rng.uniform(30, 70)
         level_set, warm_set, more = rng.uniform([0.1, 30, -10], [1.0, 80, 10])
-        states, inputs = [(level, warm)], []
+        states = [(level, warm)]
+        inputs = []
         for _ in range(150):
             q = np.clip(0.5 * np.sqrt(level) + 0.8 * (level_set - level), 0, 1.2)
             power = np.clip(q * (warm_set - 20) + level * (warm_set - warm) + more, 0, 80)
@@ -311,7 +321,8 @@ def test_the_cart_s_log_in_other_units_is_refused_or_not_trusted(change) -> None
 
 
 def test_what_is_missing_in_a_poor_log_is_advised() -> None:
-    one, still = reactor()[:1], [(x, 0 * u + 0.1) for x, u in reactor()]
+    one = reactor()[:1]
+    still = [(x, 0 * u + 0.1) for x, u in reactor()]
     for episodes, advice in (
         (one, "Log at least one episode more"),
         (still, "Make a small step test on U,"),

@@ -12,7 +12,8 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import random_episode as episode
 
-K, N = 3, 2
+K = 3
+N = 2
 
 
 def network(seed: int, hidden: int) -> Residual:
@@ -25,7 +26,8 @@ def network(seed: int, hidden: int) -> Residual:
 
 @pytest.mark.parametrize("hidden", [0, 4])
 def test_it_is_the_sum_of_a_network_and_a_polynomial(hidden: int) -> None:
-    found, z = network(1, hidden), np.random.default_rng(0).uniform(-1, 1, (9, K))
+    found = network(1, hidden)
+    z = np.random.default_rng(0).uniform(-1, 1, (9, K))
     W1, b1, W2, b2, W3, b3, L, Q = found.weights
     expected = np.tanh(np.tanh(z @ W1 + b1) @ W2 + b2) @ W3 + b3 + z @ L
     expected += np.einsum("bi,ijn,bj->bn", z, Q.reshape(K, K, N), z)
@@ -45,10 +47,12 @@ def rotor() -> LinearMPC:
 
 def episodes(turn: float, low: float) -> list[Episode]:
     """Return episodes of a rotor with a little friction, its angle shown from ``low`` on."""
-    rng, found = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    found = []
     for _ in range(6):
         x = np.array([turn * rng.uniform(), rng.uniform(-1, 1) * turn / 4])
-        thetas, inputs = [], rng.uniform(-1, 1, (60, 1))
+        thetas = []
+        inputs = rng.uniform(-1, 1, (60, 1))
         for u in [*inputs, [0.0]]:
             thetas.append([low + (x[0] - low) % turn, x[1]])
             x = x + DT * np.array([x[1], u[0] - 0.1 * x[1]])
@@ -58,7 +62,8 @@ def episodes(turn: float, low: float) -> list[Episode]:
 
 @pytest.mark.parametrize(("turn", "low"), [(2 * np.pi, -np.pi), (2 * np.pi, 0.0), (360.0, -180.0)])
 def test_a_wrapped_angle_is_found_and_its_jumps_are_not_learnt(turn, low) -> None:
-    mpc, log = rotor(), episodes(turn, low)
+    mpc = rotor()
+    log = episodes(turn, low)
     coordinates = Coordinates.of(mpc, log)
     np.testing.assert_allclose(coordinates.turn, [turn, 0.0])
     (network,) = fit_ensemble(coordinates, [log], 0, updates=500)
@@ -72,21 +77,25 @@ def test_a_wrapped_angle_is_found_and_its_jumps_are_not_learnt(turn, low) -> Non
 
 def bent(mpc: LinearMPC, members: int = 2) -> tuple[Dynamics, Episode]:
     """Return dynamics with quadratic residuals, and the episode that scales them."""
-    log, found = episode(mpc), []
+    log = episode(mpc)
+    found = []
     coordinates = Coordinates.of(mpc, [log])
     for seed in range(members):
         rng = np.random.default_rng(seed)
         k = len(coordinates.scale)
         Q = 0.02 * rng.normal(size=(k, k, 2))
-        L, b = 0.02 * rng.normal(size=(k, 2)), 0.02 * rng.normal(size=2)
+        L = 0.02 * rng.normal(size=(k, 2))
+        b = 0.02 * rng.normal(size=2)
         found.append(Residual.polynomial(L, b, Q + np.swapaxes(Q, 0, 1)))
     return Dynamics(mpc, coordinates, tuple(found)), log
 
 
 def stepped(dynamics: Dynamics, member: int, theta: np.ndarray, u: np.ndarray) -> np.ndarray:
     """One row after another: the model, and the residual in scaled, clipped coordinates."""
-    mpc, box = dynamics.problem, dynamics.coordinates
-    n, d = mpc.model.n_states, mpc.layout.disturbance
+    mpc = dynamics.problem
+    box = dynamics.coordinates
+    n = mpc.model.n_states
+    d = mpc.layout.disturbance
     features = np.concatenate([theta[:n], theta[d], u])
     z = np.clip(features, box.low, box.high) / box.scale
     after = theta.copy()
@@ -113,7 +122,8 @@ def test_a_step_is_the_model_with_its_disturbance_and_the_residual_inside_the_bo
 def test_a_replay_takes_inputs_set_points_and_disturbances_of_the_log_and_nothing_else() -> None:
     mpc = solved("servo with all of it")
     dynamics, log = bent(mpc)
-    starts, given = np.array([0, 3, 7]), mpc.layout.constant
+    starts = np.array([0, 3, 7])
+    given = mpc.layout.constant
     found = dynamics.replay(log, starts, 5)
     assert found.shape == (2, 3, 6, 2)
     for member in range(2):
@@ -129,7 +139,9 @@ def test_a_replay_takes_inputs_set_points_and_disturbances_of_the_log_and_nothin
 def test_in_a_closed_loop_the_logged_inputs_are_corrected_by_the_law() -> None:
     mpc = solved("servo with all of it")
     dynamics, log = bent(mpc)
-    law, given, expected = mpc.explicit(), mpc.layout.constant, np.zeros(2)
+    law = mpc.explicit()
+    given = mpc.layout.constant
+    expected = np.zeros(2)
     corrected = 0
     for member in range(2):
         theta = log.thetas[0].copy()

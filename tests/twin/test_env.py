@@ -26,11 +26,14 @@ def test_it_is_an_env_with_the_plant_s_spaces() -> None:
 
 def test_an_episode_is_that_of_a_member_costs_the_stage_cost_and_is_as_long_as_the_log_s() -> None:
     found = twin()
-    env, steps, over = found.env(member=3), 0, False
+    env = found.env(member=3)
+    steps = 0
+    over = False
     _, info = env.reset(seed=7)
     assert info["member"] == 3
     while not over:
-        before, u = info["state"], np.float32([np.sin(steps)])
+        before = info["state"]
+        u = np.float32([np.sin(steps)])
         _, reward, terminated, over, info = env.step(u)
         assert reward == -info["cost"] == -float(problem().stage_cost(before, u.astype(float)))
         expected = found.dynamics.step(np.tile(before, (5, 1, 1)), np.tile(u, (5, 1, 1)))[3, 0]
@@ -78,7 +81,9 @@ def held() -> tuple[PlantTwin, list[Episode]]:
 
 def test_an_episode_takes_set_points_and_length_of_a_logged_one() -> None:
     found, logs = held()
-    env, mpc, seen = found.env(), found.problem, set()
+    env = found.env()
+    mpc = found.problem
+    seen = set()
     for seed in range(12):
         theta, info = env.reset(seed=seed)
         np.testing.assert_array_equal(theta, info["state"].astype(np.float32))
@@ -86,7 +91,8 @@ def test_an_episode_takes_set_points_and_length_of_a_logged_one() -> None:
         seen.add(k)
         assert np.all(info["state"][:2] >= found.starts.low)
         assert np.all(info["state"][:2] <= found.starts.high)
-        over, steps = False, 0
+        over = False
+        steps = 0
         while not over:
             before = info["state"]
             theta, reward, _, over, info = env.step(np.float32([5.0]))  # beyond the bound of 2

@@ -20,7 +20,8 @@ from sb3_yann_envs import ProblemBox
 from twin_samples import POLYNOMIALS, Cart, problem
 from twin_samples import twin as cart_twin
 
-DT, FRICTION = 0.05, 2.4
+DT = 0.05
+FRICTION = 2.4
 TESTS = range(900, 930)
 MPC = LinearMPC(
     LinearModel([[0.92]], [[0.25]], 1.0), Q=[[1]], R=[[0.08]], horizon=3,
@@ -35,15 +36,20 @@ class Lagging(gym.Env[Any, Any]):
     action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
 
     def __init__(self, lag: float, gain: float, noise: float = 0.006) -> None:
-        self.lag, self.gain, self.noise = lag, gain, noise
+        self.lag = lag
+        self.gain = gain
+        self.noise = noise
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.u, self.k = self.np_random.uniform(-1.3, 1.3, 1), np.zeros(1), 0
+        self.x = self.np_random.uniform(-1.3, 1.3, 1)
+        self.u = np.zeros(1)
+        self.k = 0
         return self.x + self.noise * self.np_random.normal(size=1), {}
 
     def step(self, action):
-        a, self.k = np.asarray(action, float), self.k + 1
+        a = np.asarray(action, float)
+        self.k = self.k + 1
         cost = float(MPC.stage_cost(self.x, a))
         self.u = self.lag * self.u + (1 - self.lag) * a
         self.x = 0.92 * self.x + 0.25 * self.gain * self.u
@@ -70,8 +76,10 @@ def test_the_mpc_itself_changes_nothing() -> None:
 
 
 def test_the_truth_lies_within_the_interval() -> None:
-    plant, seeds = Lagging(0.0, 0.6), range(5000, 5040)
-    found, law = twin(plant, 12), law_of(MPC)
+    plant = Lagging(0.0, 0.6)
+    seeds = range(5000, 5040)
+    found = twin(plant, 12)
+    law = law_of(MPC)
     before = evaluate(MPC.explicit(), lambda: copy.copy(plant), seeds).costs
     for gain in (0.8, 1.1, 1.4):
 
@@ -127,13 +135,16 @@ class Motor(gym.Env[Any, Any]):
     """The motor with dry friction. Its MPC's input is on a bound but near the target."""
 
     def __init__(self, mpc: LinearMPC) -> None:
-        low, high = np.float32(mpc.theta_min), np.float32(mpc.theta_max)
-        self.mpc, self.observation_space = mpc, ProblemBox(low, high, problem=mpc)
+        low = np.float32(mpc.theta_min)
+        high = np.float32(mpc.theta_max)
+        self.mpc = mpc
+        self.observation_space = ProblemBox(low, high, problem=mpc)
         self.action_space = gym.spaces.Box(-12, 12, (1,), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.t = self.np_random.uniform([-3, -5], [3, 5]), 0
+        self.x = self.np_random.uniform([-3, -5], [3, 5])
+        self.t = 0
         return self.x.astype(np.float32), {}
 
     def step(self, action):
@@ -148,16 +159,23 @@ class Motor(gym.Env[Any, Any]):
                 after = speed + DT / 10 * (drive - FRICTION * way)
                 speed = 0.0 if speed * after < 0 else after
             place += DT / 10 * speed
-        self.x, self.t = np.array([place, speed]), self.t + 1
+        self.x = np.array([place, speed])
+        self.t += 1
         return self.x.astype(np.float32), -cost, False, self.t >= 100, {}
 
 
 def episodes(mpc: LinearMPC, act: Any, seeds: range) -> tuple[list[Any], np.ndarray]:
     """Return a log of the motor, and what each episode cost."""
-    env, law, found, costs = Motor(mpc), mpc.law(), [], []
+    env = Motor(mpc)
+    law = mpc.law()
+    found = []
+    costs = []
     for seed in seeds:
-        x, over, cost = env.reset(seed=seed)[0], False, 0.0
-        states, actions = [x], []
+        x = env.reset(seed=seed)[0]
+        over = False
+        cost = 0.0
+        states = [x]
+        actions = []
         while not over:
             actions.append(np.atleast_1d((act or law)(x)))
             x, reward, _, over, _ = env.step(actions[-1])
@@ -174,7 +192,8 @@ def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_ne
 ) -> None:
     monkeypatch.setattr(plant_twin, "LONG_LOG", 100)
     mpc = motor()
-    logged, (_, before) = episodes(mpc, None, range(100, 130))[0], episodes(mpc, None, TESTS)
+    logged = episodes(mpc, None, range(100, 130))[0]
+    _, before = episodes(mpc, None, TESTS)
     for kinds in (("none", "linear", "quadratic"), ("none", "network")):
         twin = PlantTwin.fit(mpc, logged, residuals=kinds)
         assert twin.trusted

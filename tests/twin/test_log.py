@@ -9,7 +9,8 @@ from sb3_yann import DisturbanceBounds, LinearModel, LinearMPC, RateLimits, Trac
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from twin_samples import problem
 
-X, U = np.zeros((11, 2)), np.full((10, 1), 0.1)
+X = np.zeros((11, 2))
+U = np.full((10, 1), 0.1)
 HOLED = np.where(np.arange(11)[:, None] == 4, np.nan, X)
 
 
@@ -38,8 +39,11 @@ def test_the_parts_of_theta_come_from_beside_the_states_or_with_them() -> None:
         tracking=Tracking([0], -1, 1), disturbances=DisturbanceBounds(-1, 1),
         rate=RateLimits(-0.5, 0.5),
     )  # fmt: skip
-    x, u, rng = np.zeros((8, 1)), np.linspace(-0.3, 0.3, 7)[:, None], np.random.default_rng(0)
-    r, d = 0.5, rng.uniform(-1, 1, (8, 1))
+    x = np.zeros((8, 1))
+    u = np.linspace(-0.3, 0.3, 7)[:, None]
+    rng = np.random.default_rng(0)
+    r = 0.5
+    d = rng.uniform(-1, 1, (8, 1))
     (episode,) = as_episodes(mpc, [(x, u)], [r], [d], [[0.2]])
     expected = np.column_stack([x, np.full(8, r), d, np.r_[0.2, u[:, 0]]])
     np.testing.assert_array_equal(episode.thetas, expected)
@@ -59,7 +63,8 @@ def test_a_log_is_in_plant_units(previous) -> None:
         tracking=Tracking([0], 299, 301), disturbances=DisturbanceBounds(-1, 1),
         rate=RateLimits(-0.5, 0.5),
     )  # fmt: skip
-    rng, u = np.random.default_rng(0), np.linspace(-0.3, 0.3, 7)[:, None]
+    rng = np.random.default_rng(0)
+    u = np.linspace(-0.3, 0.3, 7)[:, None]
     x, r, d = (rng.uniform(-1, 1, (8, 1)) for _ in range(3))
     (expected,) = as_episodes(mpc.deviations, [(x, u)], [r], [d], previous)
     shown = None if previous is None else [[40.2]]
@@ -90,7 +95,9 @@ def loaded() -> LinearMPC:
 
 
 def test_an_observer_s_disturbances_are_not_known_where_they_are_not_given() -> None:
-    x, u, r = np.zeros((8, 1)), np.linspace(-0.3, 0.3, 7)[:, None], 0.5
+    x = np.zeros((8, 1))
+    u = np.linspace(-0.3, 0.3, 7)[:, None]
+    r = 0.5
     (episode,) = as_episodes(loaded(), [(x, u)], [r], observed=True)
     assert np.isnan(episode.thetas[:, 2:4]).all()
     known = np.column_stack([x, np.full(8, 0.5), np.r_[0.0, u[:, 0]]])

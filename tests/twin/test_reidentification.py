@@ -11,7 +11,8 @@ from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, UntrustedTwinE
 from sb3_yann.control import OutputBounds, Terminal
 from twin_samples import log, mean_cost, problem, twin
 
-PUMP, LEAK = 0.07, 0.02
+PUMP = 0.07
+LEAK = 0.02
 """What a level gains by the pump, and loses, in a step; the model says 0.1 and nothing."""
 
 
@@ -28,10 +29,12 @@ def worn_log(
     mpc: LinearMPC, pump: float = PUMP, leak: float = LEAK, noise: float = 1e-3
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return episodes of a tracking MPC on the tank."""
-    rng, found = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    found = []
     law = mpc.explicit().plant_input
     for _ in range(6):
-        theta, inputs = [5 + np.array([rng.uniform(-1, 1), rng.uniform(-1, 1)])], []
+        theta = [5 + np.array([rng.uniform(-1, 1), rng.uniform(-1, 1)])]
+        inputs = []
         for _ in range(40):
             x, r = theta[-1]
             inputs.append(law([x, r]))

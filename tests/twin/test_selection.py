@@ -28,12 +28,14 @@ def test_weights_are_those_of_a_ridge_regression_on_what_the_model_leaves(name, 
     box = Coordinates.of(mpc, log[1:])  # the first one lies outside of it in part
     (found,) = ridge(box, log, [Setting(degree, 1e-3, 30.0)])
     z, y = (np.concatenate(each) for each in zip(*map(box.regression, log), strict=True))
-    k, constant = z.shape[1], mpc.layout.has_constants
+    k = z.shape[1]
+    constant = mpc.layout.has_constants
     powers = [p for d in range(1, degree + 1) for p in combinations_with_replacement(range(k), d)]
     F = np.column_stack([np.prod(z[:, p], axis=1) for p in map(list, powers)])
     weight = np.array([1e-3 * (30 if k - 1 in p else 1) for p in powers])
     if constant:
-        F, weight = np.column_stack([F, np.ones(len(F))]), np.append(weight, 0.0)
+        F = np.column_stack([F, np.ones(len(F))])
+        weight = np.append(weight, 0.0)
     solution = np.linalg.solve(F.T @ F + len(F) * np.diag(weight), F.T @ y)
     np.testing.assert_allclose(found.predict(z), F @ solution, rtol=1e-4, atol=1e-8)
     at_rest = found.predict(np.zeros((1, k)))
@@ -63,15 +65,19 @@ def test_a_free_run_s_error_is_that_of_the_model_from_twenty_logged_states() -> 
     box = Coordinates.of(mpc, log)
     found = held_out(box, log, candidates(box, log, []))
     assert found.horizons.tolist() == [5, 7, 12, 18, 28, 45]
-    A, B, E = mpc.model.A, mpc.model.B, mpc.model.E
+    A = mpc.model.A
+    B = mpc.model.B
+    E = mpc.model.E
     for i, each in enumerate(log):
         horizons = [h for h in found.horizons if h <= len(each)]
         last = len(each) - horizons[-1]
         squares = np.zeros((0, len(horizons), 2))
         for start in np.unique(np.linspace(0, last, 20).astype(int)):
-            x, path = each.thetas[start, :2], []
+            x = each.thetas[start, :2]
+            path = []
             for k in range(horizons[-1]):
-                d, u = each.thetas[start + k, 3:4], each.actions[start + k]
+                d = each.thetas[start + k, 3:4]
+                u = each.actions[start + k]
                 x = A @ x + B @ u + E @ d
                 path.append(((x - each.thetas[start + k + 1, :2]) / box.units) ** 2)
             squares = np.append(squares, [np.array(path)[np.array(horizons) - 1]], axis=0)

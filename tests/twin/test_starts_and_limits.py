@@ -22,7 +22,8 @@ def test_the_box_of_starts_is_on_average_that_of_the_plant() -> None:
 
 
 def test_draws_lie_where_they_should_and_have_the_log_s_rest() -> None:
-    starts, rng = twin().starts, np.random.default_rng(0)
+    starts = twin().starts
+    rng = np.random.default_rng(0)
     drawn = starts.draw(200, rng)
     assert np.all((drawn >= starts.low) & (drawn <= starts.high))
     around = starts.draw_around(2000, rng)
@@ -42,22 +43,28 @@ def test_the_log_and_the_starts_lie_within_the_limits_and_nan_does_not() -> None
 
 
 def test_a_start_is_the_rarer_the_farther_it_lies_outside_the_range_of_the_log() -> None:
-    starts, rng, k = twin().starts, np.random.default_rng(0), len(twin().episodes)
-    middle, half = (starts.high + starts.low) / 2, np.ptp(starts.first[:, :2], axis=0) / 2
+    starts = twin().starts
+    rng = np.random.default_rng(0)
+    k = len(twin().episodes)
+    middle = (starts.high + starts.low) / 2
+    half = np.ptp(starts.first[:, :2], axis=0) / 2
     at = middle + half * np.array([[0.0, 0.0], [0.9, -1.0], [0.0, 2.0], [-3.0, 0.5]])
     expected = 2 / (k + 1) * np.array([1, 1, 1.5 ** (1 - k), 2.0 ** (1 - k)])
     np.testing.assert_allclose(starts.chance_beyond(at), expected)
     # That is how often it happens, in each coordinate alone.
     drawn = rng.uniform(-1, 1, (20_000, k + 1))
-    seen, new = drawn[:, :k], drawn[:, k]
-    middle, half = (seen.max(1) + seen.min(1)) / 2, np.ptp(seen, axis=1) / 2
+    seen = drawn[:, :k]
+    new = drawn[:, k]
+    middle = (seen.max(1) + seen.min(1)) / 2
+    half = np.ptp(seen, axis=1) / 2
     for rho in (1.0, 1.5, 2.0):
         often = np.mean(np.abs(new - middle) > rho * half)
         assert abs(often - 2 / (k + 1) * ((1 + rho) / 2) ** (1.0 - k)) < 0.01
 
 
 def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
-    mpc, rng = solved("servo with rates"), np.random.default_rng(0)
+    mpc = solved("servo with rates")
+    rng = np.random.default_rng(0)
     held = mpc.layout.reference
     thetas = 0.2 * mpc.theta_half * rng.uniform(-1, 1, (4, mpc.n_theta))
     episodes = (
@@ -78,7 +85,8 @@ def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
 def limits_of(mpc: LinearMPC, **box: np.ndarray) -> Limits:
     """Return the limits of a box of data and of starts."""
     k = mpc.model.n_states + mpc.model.n_inputs
-    low, high = np.full(k, -0.5), np.full(k, 0.7)
+    low = np.full(k, -0.5)
+    high = np.full(k, 0.7)
     coordinates = Coordinates(low, high, np.ones(k), np.ones(2), RowLayout(mpc))
     given = {"low": np.array([-1.0, -0.1]), "high": np.array([0.2, 1.5])} | box
     row = np.zeros((2, mpc.n_theta))
@@ -97,7 +105,8 @@ def test_the_limits_hold_the_data_and_the_starts_with_a_quarter_of_their_width()
 def test_hard_bounds_cut_the_limits_and_soft_ones_do_not() -> None:
     own = {"tracking": None, "x_min": [-0.4, -0.3], "x_max": [0.3, 0.6], "theta_min": -5,
            "theta_max": 5}  # fmt: skip
-    hard, soft = servo(**own), servo(**own, soft=SoftBounds([0.0, 1.0], penalty=300))
+    hard = servo(**own)
+    soft = servo(**own, soft=SoftBounds([0.0, 1.0], penalty=300))
     np.testing.assert_allclose(limits_of(hard).low, [-0.4, -0.3], atol=1e-7)
     np.testing.assert_allclose(limits_of(hard).high, [0.3, 0.6], atol=1e-7)
     found = limits_of(soft)
@@ -114,7 +123,8 @@ def test_with_set_points_the_limits_hold_what_the_mpc_plans() -> None:
     zero = np.zeros(2)
     found = Limits.of(coordinates, Starts(RowLayout(mpc), zero, zero, row, rows))
     thetas, _ = mpc.simulate(row[0], 30)
-    low, high = thetas[:, :2].min(0), thetas[:, :2].max(0)
+    low = thetas[:, :2].min(0)
+    high = thetas[:, :2].max(0)
     width = 0.25 * (high - low)
     np.testing.assert_allclose(found.high, np.maximum(high + width, k[:2]), atol=1e-6)
     np.testing.assert_allclose(found.low, np.minimum(low - width, -k[:2]), atol=1e-6)

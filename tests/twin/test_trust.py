@@ -48,7 +48,8 @@ def test_of_one_record_what_is_lacking_are_rows_and_hours() -> None:
 
 def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains() -> None:
     rng = np.random.default_rng(0)
-    x, own = rng.uniform(-1, 1, (401, 2)), 0.1 * rng.standard_normal((400, 1))
+    x = rng.uniform(-1, 1, (401, 2))
+    own = 0.1 * rng.standard_normal((400, 1))
     feedback = 0.2 * x[:-1, :1] - 0.1 * x[:-1, 1:]
     (episode,) = as_episodes(problem(), [(x, feedback + own)])
     share, moves = trusts.excitation(problem(), (episode,))
@@ -93,10 +94,13 @@ def test_the_edges_of_what_is_trusted() -> None:
 
 def test_the_noise_of_the_sensors_is_what_one_step_s_errors_amount_to() -> None:
     """Noise e of the states leaves e+ - A e of a step."""
-    mpc, rng, sizes = problem(), np.random.default_rng(0), np.array([0.02, 0.005])
+    mpc = problem()
+    rng = np.random.default_rng(0)
+    sizes = np.array([0.02, 0.005])
     logs = []
     for seed in range(4):
-        x, rows = np.random.default_rng(seed).uniform(-0.5, 0.5, 2), []
+        x = np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
+        rows = []
         u = 0.3 * rng.uniform(-1, 1, (400, 1))
         for each in u:
             rows.append(x)
@@ -127,7 +131,8 @@ def test_the_report_counts_what_it_leaves_out_and_says_what_the_log_does_not_sho
     table = [each.split() for each in text.splitlines() if each.startswith("  nothing moves")]
     assert [float(each) for each in table[0][2:]] == pytest.approx(given.standing, rel=1e-2)
     rows = {each[:17].strip(): each[19:].split() for each in text.splitlines()}
-    chosen, errors = given.chosen, given.runs.errors
+    chosen = given.chosen
+    errors = given.runs.errors
     assert [float(e) for e in rows["linear model"]] == pytest.approx(errors[0], rel=1e-2)
     assert [float(e) for e in rows["twin"]] == pytest.approx(errors[chosen], rel=1e-2)
     none = dataclasses.replace(given, predicted=np.zeros(0), actual=np.zeros(0))
@@ -141,7 +146,8 @@ def lines(axes: Axes) -> dict[str, np.ndarray]:
 
 
 def test_the_picture_of_costs_has_a_band_of_a_quarter_of_the_mean() -> None:
-    predicted, actual = np.array([8.0, 18.0, 1e6]), np.array([10.0, 20.0, 30.0])
+    predicted = np.array([8.0, 18.0, 1e6])
+    actual = np.array([10.0, 20.0, 30.0])
     given = dataclasses.replace(twin().trust, predicted=predicted, actual=actual)
     costs, runs = plot_twin(given)
     drawn = lines(costs)

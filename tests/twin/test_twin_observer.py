@@ -46,22 +46,28 @@ class Same(Cart):
         self.dynamics = dynamics
 
     def step(self, action: Any) -> Any:
-        u, n = np.clip(np.asarray(action, float), -1, 1), self.dynamics.problem.n_theta
+        u = np.clip(np.asarray(action, float), -1, 1)
+        n = self.dynamics.problem.n_theta
         row = self.dynamics.row.begin(np.array([*self.x, *np.zeros(n - 2)]))
         after = self.dynamics.step(row[None, None], u[None, None])[0, 0]
-        self.x, self.t = after[self.dynamics.row.state], self.t + 1
+        self.x = after[self.dynamics.row.state]
+        self.t += 1
         return self.x.astype(np.float32), 0.0, False, self.t >= self.length, {}
 
 
 def test_the_twin_s_env_is_the_wrapped_plant_step_by_step() -> None:
-    found, clipped = observed(), 0
+    found = observed()
+    clipped = 0
     dynamics = found.dynamics
     member = Dynamics(found.problem, dynamics.coordinates, dynamics.members[2:3])
-    plant, env, over = observed_env(Same(member)), found.env(member=2), False
+    plant = observed_env(Same(member))
+    env = found.env(member=2)
+    over = False
     shown, _ = plant.reset(seed=3)
     env.reset(seed=3)
     env.reset(options={"state": shown.astype(float)})
-    rng, law = np.random.default_rng(0), found.problem.explicit()
+    rng = np.random.default_rng(0)
+    law = found.problem.explicit()
     while not over:
         u = np.float32(np.clip(law(shown) + 0.2 * rng.standard_normal(1), -1, 1))
         shown, _, _, over, _ = plant.step(u)
@@ -75,7 +81,8 @@ def test_the_twin_s_env_is_the_wrapped_plant_step_by_step() -> None:
 @pytest.mark.parametrize("begin", [0, 20])
 def test_the_log_tells_what_was_measured_and_estimated(begin) -> None:
     mpc, observer = offset_free_problem()
-    row, clipped = RowLayout(mpc, observer), 0
+    row = RowLayout(mpc, observer)
+    clipped = 0
     for thetas, actions, states, estimates in observed_log(plant=Cart()):
         rows, inputs = row.recovered(thetas[begin:].astype(float), actions[begin:].astype(float))
         lost = begin + (begin > 0)  # what was measured amid an estimate is not known
@@ -101,7 +108,8 @@ def test_an_observer_is_run_over_a_log_of_measurements() -> None:
 
 
 def test_it_learns_what_an_estimate_that_is_taken_for_measured_hides() -> None:
-    mpc, found = offset_free_problem()[0], observed()
+    mpc = offset_free_problem()[0]
+    found = observed()
     assert found.trusted and found.trust.cost_error < 1e-3
     with pytest.warns(EstimatedDisturbanceWarning, match="Pass observer="):
         blind = PlantTwin.fit(mpc, [each[:2] for each in observed_log()])
@@ -110,14 +118,18 @@ def test_it_learns_what_an_estimate_that_is_taken_for_measured_hides() -> None:
 
 def test_a_measured_disturbance_is_not_taken_for_an_estimate() -> None:
     model = LinearModel([[1.0, DT], [0.0, 0.95]], [[0.0], [DT]], DT, E=[[0.0], [1.0]])
-    plain, rng = problem(), np.random.default_rng(0)
+    plain = problem()
+    rng = np.random.default_rng(0)
     mpc = LinearMPC(
         model, Q=plain.Q, R=plain.R, horizon=2, u_min=-1, u_max=1, theta_min=[-3, -3],
         theta_max=[3, 3], disturbances=DisturbanceBounds(-0.2, 0.2),
     )  # fmt: skip
-    episodes, loads = [], []
+    episodes = []
+    loads = []
     for _ in range(3):
-        x, d, rows = np.zeros(2), np.zeros(1), []
+        x = np.zeros(2)
+        d = np.zeros(1)
+        rows = []
         for _ in range(60):
             rows.append([x, rng.uniform(-1, 1, 1), d])
             x = model.A @ x + model.B @ rows[-1][1] + 1.2 * model.E @ d + 0.01 * x**2
@@ -134,7 +146,8 @@ def followed(steps: int, noise: float = 0.0, still: bool = False) -> Episode:
     """Return an episode whose disturbance follows the model's errors, but for some noise."""
     mpc, _ = offset_free_problem()
     rng = np.random.default_rng(0)
-    thetas, u = np.zeros((steps + 1, mpc.n_theta)), rng.uniform(-1, 1, (steps, 1))
+    thetas = np.zeros((steps + 1, mpc.n_theta))
+    u = rng.uniform(-1, 1, (steps, 1))
     errors = 0.01 * rng.standard_normal((steps, 2))
     for k in range(steps):
         ahead = mpc.predict(thetas[k], u[k])
@@ -162,8 +175,10 @@ def test_a_disturbance_that_moves_with_the_errors_is_an_estimate_and_a_noisy_one
 
 
 def test_the_slopes_of_a_step_are_those_of_differences_on_bounds_of_d_as_well() -> None:
-    found, rng = observed(), np.random.default_rng(0)
-    dynamics, row = found.dynamics, found.dynamics.row
+    found = observed()
+    rng = np.random.default_rng(0)
+    dynamics = found.dynamics
+    row = found.dynamics.row
     at = np.array([found.starts.draw_logged(40, rng) for _ in dynamics.members])
     at[..., row._raw] = 2 * D_MAX * rng.uniform(-1, 1, at[..., row._raw].shape)
     u = rng.uniform(-0.9, 0.9, (*at.shape[:2], 1))
@@ -180,7 +195,8 @@ def test_the_slopes_of_a_step_are_those_of_differences_on_bounds_of_d_as_well() 
 
 
 def test_starts_begin_with_the_estimate_of_an_observer_that_begins() -> None:
-    found, rng = observed(), np.random.default_rng(0)
+    found = observed()
+    rng = np.random.default_rng(0)
     row = found.dynamics.row
     for drawn in (found.starts.draw_between(50, rng), found.starts.draw(50, rng)):
         assert drawn.shape == (50, row.size)
@@ -190,11 +206,15 @@ def test_starts_begin_with_the_estimate_of_an_observer_that_begins() -> None:
 
 
 def test_a_plan_in_it_takes_the_estimate_for_constant() -> None:
-    found, rng = observed(), np.random.default_rng(0)
-    plant, rows = TwinPlant(found.dynamics, [0, 3]), np.arange(2)
-    theta, u = found.dynamics.row.shown(found.starts.draw_logged(2, rng)), np.full((2, 1), 0.3)
+    found = observed()
+    rng = np.random.default_rng(0)
+    plant = TwinPlant(found.dynamics, [0, 3])
+    rows = np.arange(2)
+    theta = found.dynamics.row.shown(found.starts.draw_logged(2, rng))
+    u = np.full((2, 1), 0.3)
     A, B = (each[0] for each in plant.jacobians(theta[None], u[None], rows))
-    after, step = plant.step(theta, u, rows), 1e-6
+    after = plant.step(theta, u, rows)
+    step = 1e-6
     np.testing.assert_array_equal(after[:, 2:], theta[:, 2:])
     for j in range(5):
         moved = plant.step(theta + step * np.eye(5)[j], u, rows)

@@ -69,9 +69,13 @@ def seen() -> gym.Env[Any, Any]:
 
 def played(policy: Any, seed: int, push: float = 0.0) -> tuple[Array, Array, Array, Array]:
     """Return thetas, outputs, inputs and references of an episode."""
-    env, rng = seen(), np.random.default_rng(seed)
-    theta, over = env.reset(seed=seed)[0], False
-    thetas, outputs, inputs = [theta], [env.unwrapped.x[1]], []
+    env = seen()
+    rng = np.random.default_rng(seed)
+    theta = env.reset(seed=seed)[0]
+    over = False
+    thetas = [theta]
+    outputs = [env.unwrapped.x[1]]
+    inputs = []
     while not over:
         u = np.clip(policy(theta) + push * rng.uniform(-1, 1, 1), -2, 2)
         theta, _, _, over, _ = env.step(u)

@@ -83,10 +83,8 @@ def test_a_policy_on_it_is_the_mpc_and_its_reward_minus_the_cost() -> None:
     mpc = full()
     env = PlantEnv(slope, mpc, hold=20)
     assert env.reset(seed=0)[0].shape == (3,) and env.reset(seed=0)[0][2] == 2
-    model, audit = (
-        DDPG("YannPolicy", env, policy_kwargs={"problem": mpc}, device="cpu"),
-        CostAudit(),
-    )
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": mpc}, device="cpu")
+    audit = CostAudit()
     ours, law = (evaluate(each, lambda: PlantEnv(slope, mpc), range(4)) for each in (
         model, mpc.explicit()))  # fmt: skip
     np.testing.assert_allclose(ours.costs, law.costs, rtol=1e-4)
@@ -210,7 +208,8 @@ def test_a_step_that_fails_leaves_the_global_generators_alone() -> None:
     env = SeededGlobals(Walk())
     env.reset(seed=0)
     del env.unwrapped.steps
-    before, generator = random.getstate(), get_bit_generator()
+    before = random.getstate()
+    generator = get_bit_generator()
     with pytest.raises(AttributeError, match="steps"):
         env.step(np.zeros(1))
     assert random.getstate() == before and get_bit_generator() is generator

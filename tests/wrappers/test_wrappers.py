@@ -301,7 +301,8 @@ class Loaded(gym.Env):
 
     def reset(self, seed=None, options=None):
         super().reset(seed=seed)
-        self.x, self.k = np.zeros(1), 0
+        self.x = np.zeros(1)
+        self.k = 0
         return self.x.copy(), {"disturbance": np.array([2.0])}
 
     def step(self, u):
@@ -332,7 +333,8 @@ def test_with_a_measured_load_and_an_observer_the_plant_rests_at_its_set_point(h
     env = MeasuredDisturbance(SetPoint(Loaded(), [1.5], [1.5001]), [-5], [5])
     env = gym.wrappers.TimeLimit(env, 500) if between else env
     env = ObserveDisturbance(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)
-    law, (theta, _) = mpc.law(), env.reset(seed=1)
+    law = mpc.law()
+    theta, _ = env.reset(seed=1)
     seen = []
     for _ in range(160):
         theta, *_ = env.step(law(theta))
@@ -344,10 +346,8 @@ def test_with_a_measured_load_and_an_observer_the_plant_rests_at_its_set_point(h
 
 def test_an_observer_without_a_measured_load_is_refused_in_any_order() -> None:
     mpc = loaded([[0.07, 1.0]], estimated=[1])
-    knows, blind = (
-        DisturbanceObserver(mpc.model),
-        DisturbanceObserver(LinearModel([[0.8]], [[0.2]], 1, E=[[1.0]])),
-    )
+    knows = DisturbanceObserver(mpc.model)
+    blind = DisturbanceObserver(LinearModel([[0.8]], [[0.2]], 1, E=[[1.0]]))
     plain = SetPoint(Loaded(), [-1], [1])
     measured = MeasuredDisturbance(plain, [-5], [5])
     for env in (measured, PreviousInput(measured), PastInputs(measured, [1])):
@@ -365,7 +365,8 @@ def test_an_observer_without_a_measured_load_is_refused_in_any_order() -> None:
 # ---- Wrappers show plant units, and the cost is that of the problem ----
 
 
-X_SS, U_SS = np.array([350.0, 2.0]), np.array([10.0])
+X_SS = np.array([350.0, 2.0])
+U_SS = np.array([10.0])
 MODEL = LinearModel([[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0, X_SS, U_SS)
 MPC = LinearMPC(
     MODEL, Q=np.eye(2), R=[[1]], horizon=2, u_min=8, u_max=15, theta_min=[300, 0],
@@ -377,7 +378,8 @@ class Reactor(gym.Env):
     """The model, as a plant that shows temperatures and takes flows, and perhaps more."""
 
     def __init__(self, extra: int = 0) -> None:
-        low, high = [300.0, 0.0, *[-1.0] * extra], [400.0, 4.0, *[1.0] * extra]
+        low = [300.0, 0.0, *[-1.0] * extra]
+        high = [400.0, 4.0, *[1.0] * extra]
         self.observation_space = gym.spaces.Box(np.array(low), np.array(high), dtype=np.float64)
         self.action_space = gym.spaces.Box(np.float32([8]), np.float32([15]))
         self.extra = extra
@@ -428,7 +430,8 @@ class Valve(gym.Env):
 
 def test_an_observer_shows_plant_units() -> None:
     """The same numbers as about zero, with the operating point put on."""
-    E, d_ss = [[0.0], [1.0]], [0.25]
+    E = [[0.0], [1.0]]
+    d_ss = [0.25]
     model = LinearModel(MODEL.A, MODEL.B, 1.0, X_SS, U_SS, E, d_ss)
     own = LinearModel(MODEL.A, MODEL.B, 1.0, E=E)
     env = ObserveDisturbance(Reactor(), DisturbanceObserver(model), -2, 2)

@@ -27,7 +27,8 @@ def late(delays: tuple[int, int], noise: float, hold: int = 1, mean: float = 0.0
 
 
 def test_an_episode_keeps_the_steps_before_which_all_inputs_on_their_way_are_known() -> None:
-    x, u = np.arange(10.0).reshape(5, 2), np.arange(8.0).reshape(4, 2)
+    x = np.arange(10.0).reshape(5, 2)
+    u = np.arange(8.0).reshape(4, 2)
     (one,) = with_memory([Episode(x, u)], [3, 1])
     assert one.states.tolist() == [[6, 7, 4, 2, 0, 5], [8, 9, 6, 4, 2, 7]]
     assert one.driven.tolist() == [[6, 7]]
@@ -103,7 +104,10 @@ def test_a_law_with_dead_time_is_better_than_one_that_ignores_it() -> None:
             model = LinearModel.from_data(x, u, dt=1, delay=delay, x_ss=[0, 0], u_ss=[0, 0])
         weights["Q"] = np.diag([1.0, 1.0, *[0.0] * (model.n_states - 2)])
         mpc = LinearMPC(model, **weights, theta_min=-20, theta_max=20)
-        law, at, way, total = mpc.explicit(), np.array([5.0, 2.0]), [np.zeros(2)] * 2, 0.0
+        law = mpc.explicit()
+        at = np.array([5.0, 2.0])
+        way = [np.zeros(2)] * 2
+        total = 0.0
         for _ in range(40):
             memory = [each[0] for each in way] if model.n_states > 2 else []
             v = np.clip(law(np.r_[at, memory]), -1, 1)
@@ -119,7 +123,8 @@ def test_a_law_with_dead_time_is_better_than_one_that_ignores_it() -> None:
 
 def test_curvature_is_called_by_its_name() -> None:
     rng = np.random.default_rng(0)
-    x, u = np.zeros((401, 2)), np.repeat(rng.uniform(-1, 1, (80, 1)), 5, axis=0)
+    x = np.zeros((401, 2))
+    u = np.repeat(rng.uniform(-1, 1, (80, 1)), 5, axis=0)
     for k in range(400):
         a, b = x[k]
         x[k + 1] = a + 0.2 * (b - a**3 - 0.5 * a * b), 0.8 * b + 0.5 * np.exp(u[k, 0])
@@ -150,7 +155,8 @@ def test_a_bad_delay_is_named(delay: Any) -> None:
 
 def test_the_wrapper_that_shows_inputs_on_their_way_is_named_with_what_they_were() -> None:
     rng = np.random.default_rng(0)
-    u, x = rng.uniform(30, 50, 300), [70.0, 70.0, 70.0]
+    u = rng.uniform(30, 50, 300)
+    x = [70.0, 70.0, 70.0]
     for k in range(2, 300):
         x.append(70 + 0.9 * (x[-1] - 70) + 0.3 * (u[k - 2] - 40))
     found = identify(np.array(x)[:, None], u[:, None], dt=1, delay="auto", u_ss=[40])

@@ -30,7 +30,8 @@ def linear(order: int, measured: int, seed: int, hold: int, noise: float = 0.0) 
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(order, order))
     A *= 0.93 / np.abs(np.linalg.eigvals(A)).max()
-    B, u = rng.normal(size=(order, 1)), held(500, 1, hold, seed)
+    B = rng.normal(size=(order, 1))
+    u = held(500, 1, hold, seed)
     x = np.zeros((501, order))
     for k in range(500):
         x[k + 1] = A @ x[k] + B @ u[k]
@@ -51,7 +52,9 @@ def test_a_linear_plant_with_states_that_are_not_measured_is_not_called_nonlinea
 
 
 def test_a_second_order_plant_of_which_one_output_is_logged_has_no_dead_time_of_two() -> None:
-    u, y, v = held(1500, 1, 12, 3), [0.0], 0.0
+    u = held(1500, 1, 12, 3)
+    y = [0.0]
+    v = 0.0
     for a in u[:, 0]:
         y.append(y[-1] + 0.07 * v)
         v = 0.95 * v + 0.2 * a
@@ -73,7 +76,8 @@ def bilinear(x: np.ndarray, u: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("plant", [tank, bilinear])
 @pytest.mark.parametrize("hold", [4, 12])
 def test_a_plant_that_is_not_linear_is_still_called_so(plant: Any, hold: int) -> None:
-    u, x = held(600, 1, hold, 1), np.ones((601, 1))
+    u = held(600, 1, hold, 1)
+    x = np.ones((601, 1))
     for k in range(600):
         x[k + 1] = plant(x[k], u[k])
     assert "The plant is not linear" in notes(x, u)
@@ -81,7 +85,9 @@ def test_a_plant_that_is_not_linear_is_still_called_so(plant: Any, hold: int) ->
 
 @pytest.mark.parametrize("noise", [0.0, 0.005, 0.03])
 def test_dead_time_is_still_found_behind_sensor_noise(noise: float) -> None:
-    rng, u, x = np.random.default_rng(2), held(700, 1, 7, 2), np.zeros((701, 1))
+    rng = np.random.default_rng(2)
+    u = held(700, 1, 7, 2)
+    x = np.zeros((701, 1))
     for k in range(700):
         x[k + 1] = 0.88 * x[k] + (0.4 * u[k - 3] if k > 2 else 0.0)
     x = x + noise * x.std() * rng.normal(size=x.shape)

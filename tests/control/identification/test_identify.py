@@ -60,7 +60,8 @@ def test_data_without_noise_give_the_matrices_back() -> None:
 def test_data_of_a_fast_sampled_plant_give_the_matrices_back() -> None:
     plant = LinearModel.from_continuous([[0, 1], [-2, -0.3]], [[0], [1]], 0.01)
     rng = np.random.default_rng(0)
-    u, x = np.repeat(rng.normal(size=(40, 1)), 25, axis=0), np.zeros((1001, 2))
+    u = np.repeat(rng.normal(size=(40, 1)), 25, axis=0)
+    x = np.zeros((1001, 2))
     for k in range(1000):
         x[k + 1] = plant.step(x[k], u[k])
     model = LinearModel.from_data(x, u, dt=0.01)
@@ -141,7 +142,8 @@ def test_last_part_of_a_single_episode_is_held_out() -> None:
 def test_fit_is_what_its_definition_says() -> None:
     x, u, _ = record(0, process=0.1)
     found = identify(x, u, dt=1, offset=False)
-    test, inputs = x[320:], u[320:]
+    test = x[320:]
+    inputs = u[320:]
     for steps, fit in ((1, found.one_step_fit), (10, found.ten_step_fit)):
         predicted = []
         for k in range(80 - steps + 1):
@@ -192,7 +194,8 @@ DOUBLE = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
 def drive(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return states and inputs of the double integrator with a little process noise."""
     rng = np.random.default_rng(seed)
-    u, x = rng.uniform(-1, 1, (200, 1)), np.zeros((201, 2))
+    u = rng.uniform(-1, 1, (200, 1))
+    x = np.zeros((201, 2))
     for k in range(200):
         x[k + 1] = DOUBLE.step(x[k], u[k]) + rng.normal(0, 0.001, 2)
     return x, u
@@ -217,7 +220,8 @@ def test_law_of_a_model_whose_operating_point_moves_is_warned_of() -> None:
 def delayed(steps: int, hold: int = 1, process: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
     """Return a record in which the input acts so many steps late."""
     rng = np.random.default_rng(1)
-    u, x = np.repeat(rng.uniform(-1, 1, (400 // hold, 1)), hold, axis=0), np.zeros((401, 2))
+    u = np.repeat(rng.uniform(-1, 1, (400 // hold, 1)), hold, axis=0)
+    x = np.zeros((401, 2))
     for k in range(400):
         acting = u[k - steps] if k >= steps else np.zeros(1)
         x[k + 1] = A @ x[k] + B @ acting + process * SPREAD * rng.normal(size=2)
@@ -253,7 +257,8 @@ def test_sensor_noise_is_taken_for_no_delay() -> None:
 
 def closed_loop(test_signal: float) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
-    x, u = np.ones((201, 2)), np.zeros((200, 1))
+    x = np.ones((201, 2))
+    u = np.zeros((200, 1))
     for k in range(200):
         u[k] = -0.4 * x[k, 0] - 0.2 * x[k, 1] + test_signal * rng.normal()
         x[k + 1] = A @ x[k] + B @ u[k] + 0.1 * rng.normal(size=2)
@@ -374,7 +379,8 @@ def test_an_interval_is_that_of_student_s_t_about_each_entry(level: float) -> No
     np.testing.assert_allclose(np.diag(found.noise_covariance), squares / 35)
     width = stats.t.isf((1 - level) / 2, 35)
     for name, columns in (("A", [1, 2]), ("B", [3]), ("E", [4])):
-        value, error = coefficients.T[:, columns], errors[:, columns]
+        value = coefficients.T[:, columns]
+        error = errors[:, columns]
         np.testing.assert_allclose(getattr(found.model, name), value)
         np.testing.assert_allclose(getattr(found, f"standard_error_{name}"), error)
         low, high = found.interval(name, level)

@@ -15,7 +15,8 @@ MODEL = LinearModel([[0.9, 0.1], [0, 0.8]], [[0], [1]], 1.0)
 
 def log(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    u, x = rng.uniform(-1, 1, (80, 1)), np.zeros((81, 2))
+    u = rng.uniform(-1, 1, (80, 1))
+    x = np.zeros((81, 2))
     for k in range(80):
         x[k + 1] = MODEL.A @ x[k] + MODEL.B @ u[k]
     return x, u

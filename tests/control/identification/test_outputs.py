@@ -23,7 +23,8 @@ def played(
 ) -> Array:
     """Return noisy outputs (T + 1, q) about (20, -3)."""
     rng = np.random.default_rng(seed)
-    x, y = np.zeros(len(A)), []
+    x = np.zeros(len(A))
+    y = []
     for k in range(len(u) + 1):
         y.append(C @ x + [20.0, -3.0][: len(C)] + rng.normal(0, noise, len(C)))
         if k < len(u):
@@ -40,10 +41,15 @@ def steps(count: int, m: int, seed: int, hold: int = 4) -> Array:
 
 def best_possible(model: dict[str, Any], y: Array, u: Array, noise: float, ahead: int) -> Array:
     """Return what the plant's own Kalman filter predicts (T + 1 - ahead, q)."""
-    A, B, C, delay = model["A"], model["B"], model["C"], model.get("delay", 0)
+    A = model["A"]
+    B = model["B"]
+    C = model["C"]
+    delay = model.get("delay", 0)
     offset = np.array([20.0, -3.0])[: len(C)]
     v = np.vstack([np.zeros((delay, u.shape[1])), u])[: len(u)]
-    x, P, found = np.zeros(len(A)), np.eye(len(A)), []
+    x = np.zeros(len(A))
+    P = np.eye(len(A))
+    found = []
     for k in range(len(u) + 1 - ahead):
         gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + noise**2 * np.eye(len(C)))
         z = x + gain @ (y[k] - offset - C @ x)
@@ -94,7 +100,9 @@ def test_the_operating_point_is_where_the_plant_rests(found: IdentifiedOutputs) 
 
 
 def test_dead_time_is_told_from_order() -> None:
-    a, b, c = np.array([[0.9, 0.2], [-0.2, 0.9]]), np.array([[0.0], [0.5]]), np.array([[1.0, 0.5]])
+    a = np.array([[0.9, 0.2], [-0.2, 0.9]])
+    b = np.array([[0.0], [0.5]])
+    c = np.array([[1.0, 0.5]])
     u = steps(1200, 1, 2)
     found = identify_outputs(played(u, a, b, c, 3, delay=5), u, dt=1)
     assert (found.order, found.delays, found.model.n_states) == (2, (5,), 7)
@@ -117,7 +125,9 @@ def test_a_record_that_begins_at_rest_hides_no_dead_time() -> None:
 
 
 def test_an_integrator_keeps_its_pole() -> None:
-    a, b, c = np.array([[1.0, 0.3], [0.0, 0.8]]), np.array([[0.0], [0.2]]), np.array([[1.0, 0.0]])
+    a = np.array([[1.0, 0.3], [0.0, 0.8]])
+    b = np.array([[0.0], [0.2]])
+    c = np.array([[1.0, 0.0]])
     u = steps(1500, 1, 4) - 3
     found = identify_outputs(played(u, a, b, c, 5), u, dt=1)
     assert np.max(np.abs(np.linalg.eigvals(found.model.A))) == pytest.approx(1, abs=0.01)
@@ -164,8 +174,11 @@ def test_a_measured_disturbance_makes_E() -> None:
 
 def test_feedback_alone_identifies_nothing() -> None:
     rng = np.random.default_rng(0)
-    x, u, y = np.zeros(2), [], []
-    before, held = 0.0, 0.0
+    x = np.zeros(2)
+    u = []
+    y = []
+    before = 0.0
+    held = 0.0
     for _ in range(500):
         y.append(np.array([x[0] + 0.05 * rng.normal()]))
         held = held - 0.5 * (y[-1][0] - before) - 0.05 * y[-1][0]  # a PI controller at rest
@@ -189,7 +202,8 @@ def test_an_input_without_effect_is_named() -> None:
 
 def test_a_curved_plant_is_not_taken_for_dead_time() -> None:
     u = steps(1500, 1, 1) - 3
-    x, y = np.zeros(1), [np.zeros(1)]
+    x = np.zeros(1)
+    y = [np.zeros(1)]
     rng = np.random.default_rng(2)
     for each in u:
         x = 0.8 * x + each + 0.3 * each**2

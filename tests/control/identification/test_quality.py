@@ -22,7 +22,8 @@ from sb3_yann.log import Episode
 def log(steps: int = 300, curved: float = 0.0, noise: float = 0.1, seed: int = 0) -> Episode:
     """Return steps of a plant with two states, one input and one disturbance."""
     rng = np.random.default_rng(seed)
-    driven, x = rng.uniform(-1, 1, (steps, 2)), np.zeros((steps + 1, 2))
+    driven = rng.uniform(-1, 1, (steps, 2))
+    x = np.zeros((steps + 1, 2))
     for k in range(steps):
         u, d = driven[k]
         x[k + 1] = [0.8 * x[k, 0] + u, 0.5 * x[k, 1] + 0.3 * x[k, 0] + d + curved * u * d]
@@ -46,8 +47,10 @@ def explained(found: Regression, episodes: list[Episode]) -> tuple[np.ndarray, .
     before, rest = (
         left - basis @ np.linalg.lstsq(basis, left, rcond=None)[0] for basis in (plain, whole)
     )
-    free, q = len(Z) - whole.shape[1], whole.shape[1] - plain.shape[1]
-    size, remains = (before**2).sum(axis=0), (rest**2).sum(axis=0)
+    free = len(Z) - whole.shape[1]
+    q = whole.shape[1] - plain.shape[1]
+    size = (before**2).sum(axis=0)
+    remains = (rest**2).sum(axis=0)
     share = 1 - remains / free / (size / (free + q))
     return share, stats.f.sf((size - remains) / q / (remains / free), q, free), rest
 
@@ -58,7 +61,8 @@ def test_curvature_is_named_from_a_tenth_on_and_where_chance_does_not_explain_it
         episode = log(steps, curved, seed=seed)
         found = fit(episode)
         expected, chance, _ = explained(found, [episode])
-        sure, much = chance[1] < 1e-3, expected[1] > 0.1
+        sure = chance[1] < 1e-3
+        much = expected[1] > 0.1
         seen.add((bool(sure), bool(much)))
         named = curvature_test(found, [episode])[0][1]
         assert named == pytest.approx(expected[1] if sure and much else 0.0)

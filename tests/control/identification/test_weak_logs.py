@@ -8,7 +8,9 @@ import pytest
 from sb3_yann import LinearModel, identify
 from sb3_yann.control import lqr
 
-LIQUID, GAS, DT = 50.0, 100.0, 0.02
+LIQUID = 50.0
+GAS = 100.0
+DT = 0.02
 
 
 def column(x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -18,7 +20,8 @@ def column(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """
 
     def rate(x: np.ndarray) -> np.ndarray:
-        liquid, gas = x[:5], x[5:]
+        liquid = x[:5]
+        gas = x[5:]
         passed = 5 * (liquid - gas**2)
         dl = u[0] / 5 * (np.r_[0.6, liquid[:-1]] - liquid) - passed
         return np.r_[dl, u[1] / 5 * (np.r_[gas[1:], 0.05] - gas) + passed]
@@ -43,21 +46,24 @@ def rest() -> np.ndarray:
 
 
 X_SS = rest()
-Q, R = np.eye(10) / 0.02**2, 0.09 * np.diag(1 / U_SS**2)
+Q = np.eye(10) / 0.02**2
+R = 0.09 * np.diag(1 / U_SS**2)
 
 
 def weak_log(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a log in which the liquid moves by 30 %, and the gas by 2 %."""
     rng = np.random.default_rng(seed)
     moves = np.repeat(rng.uniform(-1, 1, (20, 2)), 10, axis=0)
-    u, x = U_SS * (1 + moves * [0.3, 0.02]), [X_SS]
+    u = U_SS * (1 + moves * [0.3, 0.02])
+    x = [X_SS]
     for each in u:
         x.append(column(x[-1], each))
     return np.array(x), u
 
 
 def closed_loop_cost(K: np.ndarray) -> float:
-    x, total = X_SS + 0.02 * np.random.default_rng(9).normal(size=10), 0.0
+    x = X_SS + 0.02 * np.random.default_rng(9).normal(size=10)
+    total = 0.0
     for _ in range(60):
         u = np.clip(U_SS + K @ (x - X_SS), 0.2 * U_SS, 3 * U_SS)
         total += float((x - X_SS) @ Q @ (x - X_SS) + (u - U_SS) @ R @ (u - U_SS))
@@ -85,7 +91,8 @@ def test_a_weak_log_of_a_column_gives_a_law_as_good_as_its_equations(seed: int) 
 
 def test_a_log_that_says_nothing_is_refused_with_what_did_not_move() -> None:
     rng = np.random.default_rng(0)
-    x, u = np.zeros((101, 1)), np.zeros((100, 1))
+    x = np.zeros((101, 1))
+    u = np.zeros((100, 1))
     for k in range(100):  # feedback alone ties the input to the state, until it is opened
         u[k] = -0.9 * x[k] + 1e-4 * rng.normal() if k < 80 else 1.0
         x[k + 1] = 0.99 * x[k] + u[k] + 0.1 * rng.normal()
@@ -97,7 +104,8 @@ def test_a_log_that_says_nothing_is_refused_with_what_did_not_move() -> None:
 
 def test_a_perfect_log_that_is_weak_is_left_as_it_is() -> None:
     plant = LinearModel.from_continuous([[0, 1], [-2, -0.3]], [[0], [1]], 0.001)
-    u, x = np.random.default_rng(0).normal(size=(300, 1)), [np.zeros(2)]
+    u = np.random.default_rng(0).normal(size=(300, 1))
+    x = [np.zeros(2)]
     for each in u:
         x.append(plant.step(x[-1], each))
     found = identify(np.array(x), u, dt=0.001)
@@ -108,7 +116,8 @@ def test_intervals_of_the_poles_hold_the_truth() -> None:
     inside = 0
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        x, u = np.zeros((301, 2)), rng.normal(size=(300, 1))
+        x = np.zeros((301, 2))
+        u = rng.normal(size=(300, 1))
         for k in range(300):
             x[k + 1] = (
                 [[0.9, 0.2], [0.0, 0.7]] @ x[k] + [0.0, 1.0] * u[k] + 0.1 * rng.normal(size=2)
@@ -122,7 +131,8 @@ def test_intervals_of_the_poles_hold_the_truth() -> None:
 
 def test_a_pole_that_may_be_unstable_is_reported() -> None:
     rng = np.random.default_rng(0)
-    x, u = np.zeros((61, 1)), rng.normal(size=(60, 1))
+    x = np.zeros((61, 1))
+    u = rng.normal(size=(60, 1))
     for k in range(60):
         x[k + 1] = 0.999 * x[k] + u[k] + 0.5 * rng.normal()
     assert "may be unstable in the plant" in LinearModel.from_data(x, u, dt=1).report()

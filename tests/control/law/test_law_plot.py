@@ -18,7 +18,8 @@ def polygons(axes) -> dict[int, np.ndarray]:
 @pytest.mark.parametrize("entries", [(0, 1), (1, 0)])
 def test_what_lies_in_a_polygon_lies_in_its_region(mpc: LinearMPC, entries) -> None:
     law = mpc.explicit()
-    drawn, point = polygons(law.plot(entries=entries)), np.array(mpc.theta_ss)
+    drawn = polygons(law.plot(entries=entries))
+    point = np.array(mpc.theta_ss)
     assert len(drawn) > 1
     for region, corners in drawn.items():
         for weight in (0.0, 0.9):  # the middle, and near each corner
@@ -28,8 +29,10 @@ def test_what_lies_in_a_polygon_lies_in_its_region(mpc: LinearMPC, entries) -> N
 
 
 def test_polygons_fill_where_the_mpc_has_a_solution(mpc: LinearMPC) -> None:
-    law, rng = mpc.explicit(), np.random.default_rng(0)
-    low, high = law.theta_min[:2], law.theta_max[:2]
+    law = mpc.explicit()
+    rng = np.random.default_rng(0)
+    low = law.theta_min[:2]
+    high = law.theta_max[:2]
     theta = np.zeros((4000, law.n_theta))
     theta[:, :2] = rng.uniform(low, high, (len(theta), 2))
     found = slices(law, (0, 1), np.zeros(law.n_theta))
@@ -39,7 +42,8 @@ def test_polygons_fill_where_the_mpc_has_a_solution(mpc: LinearMPC) -> None:
 
 def test_other_coordinates_are_where_the_plane_is_cut() -> None:
     mpc = problems.cstr()
-    law, at = mpc.explicit(), np.array(mpc.theta_ss)
+    law = mpc.explicit()
+    at = np.array(mpc.theta_ss)
     at[3] -= 60.0
     cold = polygons(law.plot(entries=(0, 1), at=at))
     assert [*cold] == [int(law.locate(at - mpc.theta_ss))]

@@ -54,7 +54,8 @@ def test_facets_and_vertices_belong_to_the_domain(name: str) -> None:
 
 @pytest.mark.parametrize("batch", [(), (5,), (0,)])
 def test_shapes_follow_those_of_theta(batch: tuple[int, ...]) -> None:
-    law, theta = law_of("two inputs"), np.zeros((*batch, 2))
+    law = law_of("two inputs")
+    theta = np.zeros((*batch, 2))
     assert law(theta).shape == (*batch, 2)
     assert np.shape(law.locate(theta)) == np.shape(law.in_domain(theta)) == batch
 
@@ -192,7 +193,8 @@ def saved(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Any, Path, An
 
 def test_a_file_holds_operating_point_sampling_time_names_and_units(saved: Any) -> None:
     law, path, kind = saved
-    model, read = reactor().model, kind.load(path)
+    model = reactor().model
+    read = kind.load(path)
     assert read == law and read.model == model
     for name in ("dt", "state_names", "input_names", "units"):
         assert getattr(read.model, name) == getattr(model, name)

@@ -26,7 +26,8 @@ MODEL = LinearModel(
 @given(st.integers(1, 4), st.integers(1, 3), st.floats(1e-3, 2.0), st.integers(0, 2**32 - 1))
 def test_sampling_is_the_matrix_exponential(n: int, m: int, dt: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    A = rng.normal(size=(n, n))
+    B = rng.normal(size=(n, m))
     # x' = A x + B u with u' = 0, in one exponential (Van Loan 1978)
     both = expm(dt * np.vstack([np.hstack([A, B]), np.zeros((m, n + m))]))
     model = LinearModel.from_continuous(A, B, dt)
@@ -34,7 +35,9 @@ def test_sampling_is_the_matrix_exponential(n: int, m: int, dt: float, seed: int
 
 
 def test_disturbances_are_sampled_like_inputs() -> None:
-    A, B, E = [[0, 1], [-2, -1]], [[0], [1]], [[1], [3]]
+    A = [[0, 1], [-2, -1]]
+    B = [[0], [1]]
+    E = [[1], [3]]
     model = LinearModel.from_continuous(A, B, 0.3, E=E, d_ss=[5])
     other = LinearModel.from_continuous(A, E, 0.3)
     np.testing.assert_allclose(model.E, other.B, rtol=1e-12)
@@ -82,7 +85,8 @@ def test_dynamics_take_measured_disturbances() -> None:
 
 
 def test_dynamics_are_exact_to_nine_digits_in_coordinates_of_hundreds() -> None:
-    x, u = cstr.X_SS, cstr.U_SS
+    x = cstr.X_SS
+    u = cstr.U_SS
     truth = np.zeros((4, 5))
     for i in range(5):  # complex steps: no difference is taken, so nothing is lost to rounding
         z = np.concatenate([x, u]).astype(complex)
@@ -100,14 +104,17 @@ def test_kink_in_the_dynamics_is_refused() -> None:
 
 
 def test_step_takes_one_state_and_a_batch() -> None:
-    x, u = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[1.0], [-1.0]])
+    x = np.array([[1.0, 2.0], [3.0, 4.0]])
+    u = np.array([[1.0], [-1.0]])
     expected = [[1.2, 2.8], [3.4, 2.6]]  # by hand
     np.testing.assert_allclose(MODEL.step(x, u), expected)
     np.testing.assert_allclose(MODEL.step(x[0], u[0]), expected[0])
 
 
 def test_step_adds_the_disturbance() -> None:
-    x, u, d = np.ones((2, 2)), np.zeros((2, 1)), np.array([[1.0], [-1.0]])
+    x = np.ones((2, 2))
+    u = np.zeros((2, 1))
+    d = np.array([[1.0], [-1.0]])
     np.testing.assert_allclose(MODEL.step(x, u, d), [[3.1, 0.9], [-0.9, 0.9]])  # by hand
 
 
@@ -205,7 +212,8 @@ NAMES: dict[str, Any] = {
     "input_names": ["pump"],
     "units": {"level": "cm", "pump": "V"},
 }
-A, B = [[0.9, 0.1], [0.0, 0.8]], [[1.0], [0.5]]
+A = [[0.9, 0.1], [0.0, 0.8]]
+B = [[1.0], [0.5]]
 
 
 def test_names_and_units_are_shown() -> None:
@@ -219,7 +227,8 @@ def test_names_and_units_are_shown() -> None:
 
 
 def test_names_are_kept_by_copies_and_do_not_count_in_equality() -> None:
-    model, plain = LinearModel(A, B, dt=1.0, **NAMES), LinearModel(A, B, dt=1.0)
+    model = LinearModel(A, B, dt=1.0, **NAMES)
+    plain = LinearModel(A, B, dt=1.0)
     assert model == plain
     assert hash(model) == hash(plain)
     for other in (

@@ -15,7 +15,8 @@ def of_poles(*poles: float, dt: float = 0.1) -> LinearModel:
 
 def rotating(size: float, period: float) -> LinearModel:
     """Return a model whose pair of poles has this magnitude and period in samples."""
-    c, s = size * np.cos(2 * np.pi / period), size * np.sin(2 * np.pi / period)
+    c = size * np.cos(2 * np.pi / period)
+    s = size * np.sin(2 * np.pi / period)
     return LinearModel([[c, s], [-s, c]], [[0], [1]], 0.1)
 
 

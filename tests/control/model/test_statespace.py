@@ -10,7 +10,10 @@ import pytest
 
 from sb3_yann import LinearModel
 
-A, B, EYE, ZERO = [[0, 1], [-4, -0.5]], [[0, 1], [1, 0]], np.eye(2), np.zeros((2, 2))
+A = [[0, 1], [-4, -0.5]]
+B = [[0, 1], [1, 0]]
+EYE = np.eye(2)
+ZERO = np.zeros((2, 2))
 
 
 def test_a_discrete_system_is_taken_as_it_is() -> None:

@@ -12,7 +12,8 @@ from general_problems import servo
 from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only, small_mpc
 from sb3_yann import LinearModel, LinearMPC, OutputBounds, RateLimits, SoftBounds, Terminal
 
-NAN, INF = np.nan, np.inf
+NAN = np.nan
+INF = np.inf
 TURN = [[np.cos(1), np.sin(1), 0], [-np.sin(1), np.cos(1), 0], [0, 0, 0.5]]
 
 BAD_MODELS: list[tuple[dict[str, Any], type[Exception], str]] = [

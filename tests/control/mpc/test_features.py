@@ -77,8 +77,10 @@ def test_a_preview_of_what_stays_is_no_preview(weights: dict[str, Any]) -> None:
 
 def _bellman(mpc: LinearMPC, gamma: float) -> float:
     """Return the largest residual of the value near where the law rests, relative to costs."""
-    own, law = mpc.deviations, mpc.law("online")
-    value, (A, B) = mpc.value_terms(gamma), own.prediction
+    own = mpc.deviations
+    law = mpc.law("online")
+    value = mpc.value_terms(gamma)
+    A, B = own.prediction
     theta = own.theta_rest
     for _ in range(3000):
         theta = A @ theta + B @ law(theta)
@@ -176,7 +178,8 @@ def test_a_bound_that_moves_in_is_reached_as_fast_as_the_rate_allows(
 
 
 def test_an_operating_point_moves_bounds_that_change_as_all_else() -> None:
-    x, u = np.array([10.0, 20.0]), np.array([4.0])
+    x = np.array([10.0, 20.0])
+    u = np.array([4.0])
     parts: dict[str, Any] = {"parametric_bounds": ["u_max", "x_min", "du_max", "mixed_max"]}
     parts |= {"rate": RateLimits(-0.9, 0.9)}
     own = cart(mixed=MixedBounds([[1, 0]], [[1]], -4, 4), **parts)
@@ -277,8 +280,12 @@ def test_four_states_and_a_horizon_of_twenty_have_few_regions_with_a_control_hor
 
 def test_a_preview_makes_up_for_a_dead_time_as_well_as_a_sparse_program() -> None:
     n = 6
-    A, B = np.eye(n, k=-1), np.eye(n, 1, k=-1)
-    A[0, 0], A[1, 0], A[0, 5] = 0.9, 0, 0.1  # the input acts five samples later
+    A = np.eye(n, k=-1)
+    B = np.eye(n, 1, k=-1)
+    # the input acts five samples later
+    A[0, 0] = 0.9
+    A[1, 0] = 0
+    A[0, 5] = 0.1
     wide = np.full(n, 4.0)
     spec = Spec(
         A, B, np.zeros((n, 0)), np.zeros(n), np.zeros(1), np.zeros(0), Q=np.diag([1.0] + [0] * 5),
@@ -289,7 +296,8 @@ def test_a_preview_makes_up_for_a_dead_time_as_well_as_a_sparse_program() -> Non
     references = np.repeat([0.0, 1.0, -0.5], 12)
 
     def cost(act: Any, preview: int) -> float:
-        x, total = np.zeros(n), 0.0
+        x = np.zeros(n)
+        total = 0.0
         for k in range(len(references)):
             known = references[np.minimum(np.arange(k, k + preview + 1), len(references) - 1)]
             u = act(np.concatenate([x, known]))

@@ -94,10 +94,12 @@ def test_the_law_reaches_beyond_a_soft_bound_without_a_note() -> None:
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> None:
     mpc = solved(name)
-    law, P = mpc.explicit(), mpc.value_matrix(gamma)
+    law = mpc.explicit()
+    P = mpc.value_matrix(gamma)
     theta = 1e-3 * box_points(mpc, 5, seed=2)
     at_rest = law.locate(np.zeros(mpc.n_theta))
-    value, cost = np.einsum("bi,ij,bj->b", theta, P, theta), np.zeros(5)
+    value = np.einsum("bi,ij,bj->b", theta, P, theta)
+    cost = np.zeros(5)
     for k in range(400):
         assert np.all(law.locate(theta) == at_rest)
         u = law(theta)
@@ -108,8 +110,10 @@ def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> N
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
-    mpc, rng = solved(name), np.random.default_rng(0)
-    theta, u = box_points(mpc, 50), rng.normal(size=(50, mpc.model.n_inputs))
+    mpc = solved(name)
+    rng = np.random.default_rng(0)
+    theta = box_points(mpc, 50)
+    u = rng.normal(size=(50, mpc.model.n_inputs))
     z = np.hstack([theta, u])
     form = np.einsum("bi,ij,bj->b", z, mpc.stage_matrix, z)
     np.testing.assert_allclose(mpc.stage_cost(theta, u), form, rtol=1e-9, atol=1e-9)
@@ -123,7 +127,8 @@ def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
 
 def test_stage_cost_is_the_formula() -> None:
     mpc = servo(rate=RateLimits(R_du=[[2.0]]))
-    theta, u = np.array([0.3, -0.1, 0.5, 0.2]), np.array([0.4])
+    theta = np.array([0.3, -0.1, 0.5, 0.2])
+    u = np.array([0.4])
     x_s, u_s = mpc.steady_state([0.5])
     e = theta[:2] - x_s
     expected = e @ mpc.Q @ e + 0.1 * (u - u_s) ** 2 + 2.0 * (0.4 - 0.2) ** 2
@@ -133,11 +138,13 @@ def test_stage_cost_is_the_formula() -> None:
 def test_a_weight_on_the_rate_has_the_gain_of_the_augmented_lqr() -> None:
     box = {"x_min": None, "x_max": None, "theta_min": -9, "theta_max": 9}
     mpc = servo(rate=RateLimits(R_du=[[2.0]]), **box, u_min=-90, u_max=90)
-    A, B = THERMAL.A, THERMAL.B
+    A = THERMAL.A
+    B = THERMAL.B
     bigger = LinearModel(
         np.block([[A, np.zeros((2, 1))], [np.zeros((1, 3))]]), np.vstack([B, [[1.0]]]), 1.0
     )
-    Q, R = np.diag([1, 1, 2.0]), np.array([[0.1 + 2.0]])
+    Q = np.diag([1, 1, 2.0])
+    R = np.array([[0.1 + 2.0]])
     N = np.array([[0], [0], [-2.0]])
     P = lqr.riccati(bigger, Q, R, cross=N)
     K = lqr.gain(bigger, R, P, cross=N)

@@ -32,7 +32,9 @@ INVARIANT = {
 @pytest.mark.parametrize("name", INVARIANT)
 def test_none_of_a_thousand_closed_loops_becomes_infeasible(name: str) -> None:
     mpc = INVARIANT[name]()
-    law, rng, theta = mpc.explicit(), np.random.default_rng(0), np.zeros((0, mpc.n_theta))
+    law = mpc.explicit()
+    rng = np.random.default_rng(0)
+    theta = np.zeros((0, mpc.n_theta))
     while len(theta) < 1000:
         points = rng.uniform(mpc.theta_min, mpc.theta_max, (1000, mpc.n_theta))
         theta = np.vstack([theta, points[law.in_domain(points)]])[:1000]
@@ -47,7 +49,8 @@ def test_without_it_some_do(name: str) -> None:
     free = np.zeros((0, mpc.n_theta)), np.zeros(0)
     values = {field: getattr(mpc, field) for field in mpc.__dataclass_fields__}
     mpc = LinearMPC(**{**values, "terminal": Terminal(mpc.terminal.cost, free)})
-    law, rng = mpc.explicit(), np.random.default_rng(0)
+    law = mpc.explicit()
+    rng = np.random.default_rng(0)
     theta = rng.uniform(mpc.theta_min, mpc.theta_max, (2000, mpc.n_theta))
     theta = theta[law.in_domain(theta)]
     for _ in range(50):
@@ -80,7 +83,8 @@ def test_the_set_is_the_largest_one_on_a_plant_with_one_state() -> None:
     law = mpc.explicit()
     K = float(law.gains[law.locate([0.0])][0, 0])
     F, g = mpc.terminal.set
-    upper, lower = min(2, 1 / -K), max(-2, 0.5 / K)
+    upper = min(2, 1 / -K)
+    lower = max(-2, 0.5 / K)
     ends = sorted((g / F[:, 0]).tolist())
     assert ends == pytest.approx([lower, upper])
 
@@ -161,8 +165,11 @@ def test_of_a_cart_it_leaves_room_to_brake():
     ],
 )
 def test_from_each_corner_an_input_leads_back_into_it(mpc):
-    kept, (A, B) = mpc.kept_set, mpc.prediction
-    n, m, parts = mpc.n_theta, mpc.model.n_inputs, mpc.layout
+    kept = mpc.kept_set
+    A, B = mpc.prediction
+    n = mpc.n_theta
+    m = mpc.model.n_inputs
+    parts = mpc.layout
     low, high = np.full((2, n), None)
     low[parts.state.stop :] = mpc.theta_min[parts.state.stop :]
     high[parts.state.stop :] = mpc.theta_max[parts.state.stop :]
@@ -189,7 +196,8 @@ def test_from_each_corner_an_input_leads_back_into_it(mpc):
 
 def test_with_an_invariant_terminal_set_it_is_where_the_mpc_has_a_solution():
     mpc = general_problems.solved("invariant")
-    kept, law = mpc.kept_set, mpc.explicit()
+    kept = mpc.kept_set
+    law = mpc.explicit()
     theta = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (3000, mpc.n_theta))
     slack = (kept.g - theta @ kept.F.T).min(axis=1)
     clear = np.abs(slack) > 1e-6
