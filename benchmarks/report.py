@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import numpy as np
-
 import sb3_yann
 from benchmarks import (
     deployment,
@@ -22,9 +20,8 @@ from benchmarks import (
     peers,
 )
 from benchmarks.problems import PROBLEMS, SMALLEST
-from benchmarks.records import Bench, Figure, Figures, heading, times
+from benchmarks.records import Bench, Figures, heading
 from benchmarks.sections import TITLES
-from benchmarks.timing import ratios
 from experiments.markdown import table
 
 PACKAGES = ("numpy", "numba", "scipy", "torch", "stable-baselines3", "ppopt", "daqp", "osqp")
@@ -43,6 +40,8 @@ ON_THE_PAGE = {
     deployment.SECTION: "",
 }
 """The sections of the page, and what each has to say; `make bench` prints all."""
+PRINTED_ALONE = {evaluation.LOCATE, offline.EACH, peers.NO_OVERLAP}
+"""Rows that `make bench` prints and the page leaves out."""
 LEGEND = (
     "What is compared was measured in turns, after a warm-up, and its answers were compared first. "
     "Cells are medians; after a colon, how many times the first row's time that is, turn by turn. "
@@ -52,51 +51,9 @@ LEGEND = (
 
 def write_report(bench: Bench, path: Path, command: str) -> None:
     """Write the report."""
-    short = in_short(bench.figures)
-    parts = [
-        "# Performance",
-        f"## In short\n\n{short}" if short else "",
-        how_it_was_made(bench, command),
-        *_sections(bench.figures),
-    ]
+    parts = ["# Performance", how_it_was_made(bench, command), *_sections(bench.figures)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-
-
-def in_short(figures: Figures) -> str:
-    """Return the rows of the page's first table: how many times as long the peers take."""
-    rows = [[name, *cells] for name, cells in _quoted(figures)]
-    sizes = [column for column in figures.columns(evaluation.ONE) if column.isdigit()]
-    return table(["", *map(heading, sizes)], rows) if rows and sizes else ""
-
-
-def _quoted(figures: Figures) -> Iterator[tuple[str, list[str]]]:
-    sizes = figures.columns(evaluation.ONE)
-    lines = (
-        (evaluation.ONE, peers.PPOPT, "law, one point: ppopt's evaluation takes"),
-        (evaluation.ONE, peers.DAQP, "law, one point: an online QP (daqp) takes"),
-        (evaluation.MANY, peers.LITERAL, "law, 256 points: the paper's network takes"),
-        (networks.FORWARD_ONE, peers.MLP, "actor, one observation: a 256-256 MLP takes"),
-        (networks.TRAIN, peers.MLP, "training step of DDPG: with 256-256 MLPs it takes"),
-    )
-    own = [figures.get(evaluation.ONE, "ours", size) for size in sizes]
-    if any(own):
-        cells = [each.shown(spread=False) if each else "" for each in own]
-        yield "law, one point, in numpy", cells
-    for section, peer, name in lines:
-        cells = []
-        for size in sizes:
-            ours = figures.get(section, "ours", size)
-            theirs = figures.get(section, peer, size)
-            cells.append(_ratio(theirs, ours))
-        if any(cells):
-            yield name, cells
-
-
-def _ratio(theirs: Figure | None, ours: Figure | None) -> str:
-    if theirs is None or ours is None:
-        return ""
-    return times(float(np.median(ratios(theirs.samples, ours.samples))))
+    path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
 def how_it_was_made(bench: Bench, command: str) -> str:
@@ -140,7 +97,8 @@ def _sections(figures: Figures) -> Iterator[str]:
     for section in figures.sections():
         if section not in ON_THE_PAGE:
             continue
-        rows = [[name, *cells] for name, cells in figures.rows(section, spread=False)]
+        found = figures.rows(section, spread=False)
+        rows = [[name, *cells] for name, cells in found if name not in PRINTED_ALONE]
         header = ["", *map(heading, figures.columns(section))]
         parts = (f"## {TITLES[section]}", ON_THE_PAGE[section], table(header, rows))
-        yield "\n\n".join(part for part in parts if part)
+        yield "\n\n".join(parts)

@@ -33,8 +33,6 @@ class Row:
     seeds : int
     median, low, high : float
         Of the seeds' mean costs over all test starts.
-    closed : float or None
-        Share of the gap from the MPC to the optimum that is closed, in percent.
     worst, worst_share : float or None
         Largest cost above the MPC's over all seeds and starts; and in percent of the MPC's mean.
     excess : float or None
@@ -48,7 +46,6 @@ class Row:
     median: float
     low: float
     high: float
-    closed: float | None
     worst: float | None
     worst_share: float | None
     excess: float | None
@@ -80,24 +77,20 @@ def rows_of(outcomes: Mapping[Run, Outcome], plant: str, episodes: int) -> list[
 def _row(learner: str, runs: list[Outcome], levels: Mapping[str, Array]) -> Row:
     final = np.array([run.test_costs[-1] for run in runs])
     means = final.mean(axis=1)
-    median = float(np.median(means))
-    closed = worst = worst_share = excess = None
+    worst = worst_share = excess = None
     if MPC in levels:
         base = float(levels[MPC].mean())
         worst = float((final - levels[MPC]).max())
         worst_share = 100 * worst / base
-        gap = base - float(levels[OPTIMUM].mean()) if OPTIMUM in levels else 0.0
-        closed = 100 * (base - median) / gap if gap else None
     if all(len(run.training_costs) for run in runs):
         sums = [(run.training_costs - run.training_mpc_costs).sum() for run in runs]
         excess = float(np.median(sums))
     return Row(
         learner=learner,
         seeds=len(runs),
-        median=median,
+        median=float(np.median(means)),
         low=float(means.min()),
         high=float(means.max()),
-        closed=closed,
         worst=worst,
         worst_share=worst_share,
         excess=excess,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,20 +19,20 @@ LONG = (200, 500)
 RIVAL = "DDPG"
 NOTES = Path(__file__).with_name("notes.md")
 PACKAGES = ("stable-baselines3", "torch", "gymnasium", "numpy", "scipy", "ppopt")
-HEADER = ("learner", "seeds", "mean cost", "gap closed, %", "worst start, %", "excess cost")
+HEADER = ("learner", "seeds", "mean cost", "worst start, %", "excess cost")
 LEGEND = (
-    "*Mean cost* over all test starts: the median over the seeds (and the range). *Gap closed*: of "
-    f"the way from the MPC to the {OPTIMUM}. *Worst start*: the largest cost above the MPC's over "
-    "all seeds and starts, in percent of the MPC's mean. *Excess cost*: what all training episodes "
-    "together cost, as played, above the MPC from the same starts."
+    "*Mean cost* over all test starts: the median over the seeds (and the range). *Worst start*: "
+    "the largest cost above the MPC's over all seeds and starts, in percent of the MPC's mean. "
+    "*Excess cost*: what all training episodes together cost, as played, above the MPC from the "
+    "same starts."
 )
 PUBLISHED = (
     "Mean costs of the first ten test episodes, before and after {} training episodes, with the "
-    "first seed where no other is named. The paper's starts are not known, and ten are few."
+    "first seed where no other is named. The paper's starts are not known."
 )
 CURVES = (
-    "The line is the median over the seeds, the band goes from the first to the third quartile. "
-    "Where the seeds were trained for different times, the curve ends with the shortest."
+    "The median over the seeds, between the quartiles. Where they were trained for different "
+    "times, the curve ends with the shortest."
 )
 
 
@@ -54,21 +54,13 @@ def write_report(
     curves = [f"![{plant}]({path.name})" for plant, path in pictures.items()]
     parts = [
         "# Results",
-        f"## In short\n\n{in_short(outcomes)}",
         how_it_was_made(outcomes, command),
         *_headed(f"## The paper's averages\n\n{PUBLISHED.format(episodes)}", [printed]),
         *_headed(
             f"## After {episodes} training episodes\n\n{LEGEND}",
             [_learner_table(outcomes, plant, episodes) for plant in plants],
         ),
-        *(
-            part
-            for long in LONG
-            for part in _headed(
-                f"## After {long} training episodes",
-                [_learner_table(outcomes, plant, long, only_learned=True) for plant in plants],
-            )
-        ),
+        *_headed("## Longer training", [_longer_table(outcomes)]),
         *_headed(f"## Learning curves\n\n{CURVES}", curves),
         notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
     ]
@@ -78,7 +70,7 @@ def write_report(
 
 
 def in_short(outcomes: Mapping[Run, Outcome]) -> str:
-    """Return the table that the README quotes as well, with its legend."""
+    """Return the README's table, with its legend."""
     episodes = min(EPISODES, max((run.episodes for run in outcomes), default=0))
     found = []
     for plant in plants_of(outcomes):
@@ -128,35 +120,43 @@ def _headed(heading: str, parts: list[str]) -> list[str]:
     return [heading, *parts] if any(parts) else []
 
 
-def _learner_table(
-    outcomes: Mapping[Run, Outcome], plant: str, episodes: int, *, only_learned: bool = False
-) -> str:
+def _learner_table(outcomes: Mapping[Run, Outcome], plant: str, episodes: int) -> str:
     """Return the table of a plant; empty where nothing was learnt for so long."""
     rows = rows_of(outcomes, plant, episodes)
     if not any(row.excess is not None for row in rows):
         return ""
-    cells = [
-        [
-            f"**{row.learner}**" if row.learner in (OURS, EXPLORED) else row.learner,
-            str(row.seeds),
-            _mean(row),
-            number(row.closed, 1),
-            number(row.worst_share, sign="+"),
-            number(row.excess, 1, "+"),
-        ]
-        for row in rows
-        if row.excess is not None or not only_learned
+    return f"### {plant}\n\n{table(HEADER, map(_cells, rows))}{_beyond_limits(rows)}"
+
+
+def _longer_table(outcomes: Mapping[Run, Outcome]) -> str:
+    """Return what was learnt on all plants in more episodes; empty where nothing was."""
+    found = {
+        (plant, episodes): [r for r in rows_of(outcomes, plant, episodes) if r.excess is not None]
+        for plant in plants_of(outcomes)
+        for episodes in LONG
+    }
+    cells = [[at[0], str(at[1]), *_cells(row)] for at, rows in found.items() for row in rows]
+    rows = [row for each in found.values() for row in each]
+    return table(("plant", "episodes", *HEADER), cells) + _beyond_limits(rows) if cells else ""
+
+
+def _cells(row: Row) -> list[str]:
+    return [
+        f"**{row.learner}**" if row.learner in (OURS, EXPLORED) else row.learner,
+        str(row.seeds),
+        _mean(row),
+        number(row.worst_share, sign="+"),
+        number(row.excess, 1, "+"),
     ]
-    unsafe = [
+
+
+def _beyond_limits(rows: Sequence[Row]) -> str:
+    unsafe = "; ".join(
         f"{row.learner} {row.unsafe_training} (in tests {row.unsafe_tests})"
         for row in rows
         if row.unsafe_training or row.unsafe_tests
-    ]
-    beyond = "; ".join(unsafe) or "none"
-    return (
-        f"### {plant}\n\n{table(HEADER, cells)}\n\n"
-        f"Training episodes beyond a limit, over all seeds: {beyond}."
     )
+    return f"\n\nEpisodes beyond a limit, over all seeds: {unsafe}." if unsafe else ""
 
 
 def _mean(row: Row | None) -> str:

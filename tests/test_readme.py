@@ -198,7 +198,14 @@ def test_the_readme_is_one_page() -> None:
 
 
 def test_the_results_it_quotes_are_those_of_the_report() -> None:
-    in_short = page("docs/results.md").partition("## In short\n")[2].partition("\n## ")[0]
     quoted = README.partition("<!-- results: begin -->")[2].partition("<!-- results: end -->")[0]
-    assert "| **YANN-RL** |" in quoted
-    assert quoted.strip() == in_short.strip()
+    report = page("docs/results.md").partition("## After 50 training episodes")[2]
+    rows = [[cell.strip(" *") for cell in row.split("|")] for row in quoted.strip().splitlines()]
+    plants = [row for row in rows if len(row) > 6 and row[2][:1].isdigit()]
+    assert len(plants) == 4
+    for _, plant, optimum, mpc, ours, _, ddpg, _ in plants:
+        of_plant = report.partition(f"### {plant}\n")[2].partition("\n###")[0]
+        explored = rf"\| \*\*YANN-RL, a simulator explored\*\* \| \d+ \| {re.escape(ours)} \|"
+        assert re.search(explored, of_plant)
+        for learner, cost in (("optimum", optimum), ("MPC", mpc), ("DDPG", ddpg)):
+            assert not cost or re.search(rf"\| {learner} \| \d+ \| {re.escape(cost)} \|", of_plant)

@@ -75,6 +75,8 @@ def test_a_log_is_in_plant_units(previous) -> None:
         np.testing.assert_allclose(each.actions, expected.actions, atol=1e-12)
     with pytest.raises(ValueError, match=r"action 0 is -0.3 .* 39 and 41 .* is in plant units"):
         as_episodes(mpc, [(x, u)], [r], [d])
+    with pytest.raises(ValueError, match="episode 0: 7 states and 7 actions; there is one state m"):
+        as_episodes(mpc, [(x[1:] + 300, u + 40)], [r[1:] + 300], [d[1:]], shown)
 
 
 def test_an_input_a_thousandth_beyond_its_bound_is_rounding_and_more_is_not() -> None:
