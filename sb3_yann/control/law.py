@@ -48,8 +48,12 @@ class PlantLaw(ReadOnlyArrays):
         du_min and du_max, for a theta that ends with the previous input.
     moving : ndarray of int, shape (2, m), or None
         Which entries of theta are lower and upper bounds of the inputs, -1 for none.
+    clamped : ndarray, shape (2, n_theta), or None
+        Ends of the range of what is asked for, see `MPCProblem.clamped`: an entry of theta beyond
+        counts as at its end.
 
-    Inputs keep both where the problem has no solution as well, see `MPCProblem.input_range`.
+    Inputs keep rate and bounds where the problem has no solution as well, see
+    `MPCProblem.input_range`.
     """
 
     # The class is no dataclass: these are no fields of a law.
@@ -57,6 +61,7 @@ class PlantLaw(ReadOnlyArrays):
     theta_ss: Array | None = None
     rate: Array | None = None
     moving: NDArray[np.intp] | None = None
+    clamped: Array | None = None
     # What a file should hold, for a message.
     _kind = "a law"
 
@@ -85,14 +90,36 @@ class PlantLaw(ReadOnlyArrays):
         theta_ss: ArrayLike,
         rate: ArrayLike | None = None,
         moving: NDArray[np.intp] | None = None,
+        clamped: ArrayLike | None = None,
     ) -> Self:
         """Return the same law with its plant, see the attributes."""
         law = object.__new__(type(self))
         plant: dict[str, Any] = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
         plant |= {} if rate is None else {"rate": np.array(rate, np.float64)}
         plant |= {} if moving is None else {"moving": np.array(moving, np.intp)}
+        plant |= {} if clamped is None else {"clamped": np.array(clamped, np.float64)}
         law.__setstate__({**self.__getstate__(), **plant})
         return law
+
+    def clamp(self, theta: Array) -> Array:
+        """Return theta (..., n) with what is asked for within its range."""
+        if self.clamped is not None:
+            theta = np.minimum(np.maximum(theta, self.clamped[0]), self.clamped[1])
+        return theta
+
+    def _points(self, theta: ArrayLike) -> tuple[Array, Array]:
+        """Return theta as checked numbers, and as contiguous rows within what may be asked."""
+        points = to_float("theta", theta)
+        n = self.n_theta
+        if points.ndim not in (1, 2) or points.shape[-1] != n:
+            raise ValueError(f"theta has shape {points.shape}, expected ({n},) or (batch, {n}).")
+        rows = np.ascontiguousarray(np.atleast_2d(points))
+        if not np.all(np.isfinite(rows)):
+            bad = rows[~np.all(np.isfinite(rows), axis=1)][0].tolist()
+            raise ValueError(
+                f"theta holds NaN or infinite entries, {bad}; the law is defined for numbers."
+            )
+        return points, self.clamp(rows)
 
     @property
     def _is_fixed(self) -> bool:
@@ -187,7 +214,7 @@ class PlantLaw(ReadOnlyArrays):
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
         if self.model is not None:
             arrays["theta_ss"] = self.theta_ss
-            own = {"rate": self.rate, "moving": self.moving}
+            own = {"rate": self.rate, "moving": self.moving, "clamped": self.clamped}
             arrays |= {name: value for name, value in own.items() if value is not None}
             model = {name: value for name, value in vars(self.model).items() if value is not None}
             arrays |= {f"model_{name}": value for name, value in model.items()}
@@ -215,7 +242,12 @@ class PlantLaw(ReadOnlyArrays):
             check_array(name, data[name], (2, law.n_inputs)) if name in data else None
             for name in ("rate", "moving")
         )
-        return law.on_plant(model, theta_ss, rate, None if moving is None else moving.astype(int))
+        moves = None if moving is None else moving.astype(int)
+        clamped = None
+        if "clamped" in data:
+            low, high = data["clamped"]
+            clamped = check_bounds("clamped", low, high, law.n_theta)
+        return law.on_plant(model, theta_ss, rate, moves, clamped)
 
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""
@@ -337,14 +369,14 @@ class PiecewiseAffine(PlantLaw):
     def __call__(self, theta: ArrayLike) -> Array:
         """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
         # The short way: real numbers, none masked, in one row as compiled code takes them.
-        if type(theta) is np.ndarray and theta.ndim == 1 and self._is_fixed:
+        if type(theta) is np.ndarray and theta.shape == self.theta_min.shape and self._is_fixed:
             if theta.dtype.kind in "fiu" and theta.flags.carray:
                 u = np.empty(len(self.u_min))
-                if self._at(theta.astype(np.float64, copy=False), u):
+                if self._at(self.clamp(theta.astype(np.float64, copy=False)), u):
                     return u
         from sb3_yann.control._kernels.law import law_of_batch
 
-        points, rows = as_points(theta, self.n_theta)
+        points, rows = self._points(theta)
         inputs: Array = np.empty((len(rows), self.n_inputs))
         law_of_batch(*self.packed, rows, inputs)
         inputs = self._within_range(inputs, rows)
@@ -381,7 +413,7 @@ class PiecewiseAffine(PlantLaw):
         """Return the region in use and how far inside it each point lies, negative outside."""
         from sb3_yann.control._kernels.law import locate_batch
 
-        points, rows = as_points(theta, self.n_theta)
+        points, rows = self._points(theta)
         region = np.empty(len(rows), np.int64)
         inside = np.empty(len(rows))
         locate_batch(*self.packed, rows, region, inside)
@@ -453,20 +485,6 @@ def read_law(kind: str, path: str | PathLike[str], build: Callable[[dict[str, An
             f"{fspath(path)} does not hold {kind} ({what or type(error).__name__}). Write it with "
             "law.save(path)."
         ) from None
-
-
-def as_points(theta: ArrayLike, n: int) -> tuple[Array, Array]:
-    """Return theta as checked numbers (n,) or (batch, n), and as contiguous rows of a batch."""
-    points = to_float("theta", theta)
-    if points.ndim not in (1, 2) or points.shape[-1] != n:
-        raise ValueError(f"theta has shape {points.shape}, expected ({n},) or (batch, {n}).")
-    rows = np.ascontiguousarray(np.atleast_2d(points))
-    if not np.all(np.isfinite(rows)):
-        bad = rows[~np.all(np.isfinite(rows), axis=1)][0]
-        raise ValueError(
-            f"theta holds NaN or infinite entries, {bad.tolist()}; the law is defined for numbers."
-        )
-    return points, rows
 
 
 def bounds_of(law: Any, m: int, n: int) -> dict[str, Array]:

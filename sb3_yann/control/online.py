@@ -21,7 +21,7 @@ from sb3_yann.control.explicit.parametric_qp import (
     moderated,
     slack_costs,
 )
-from sb3_yann.control.law import INFEASIBLE_OPTIONS, PiecewiseAffine, PlantLaw, as_points, bounds_of
+from sb3_yann.control.law import INFEASIBLE_OPTIONS, PiecewiseAffine, PlantLaw, bounds_of
 
 if TYPE_CHECKING:
     from sb3_yann._numba import Integers
@@ -52,7 +52,7 @@ class OnlineLaw(PlantLaw):
       float64 cannot solve this either, the inputs that nothing constrains are clipped.
     - ``"zero_input"``: no deviation of the input, clipped to the bounds.
 
-    Other than :class:`PiecewiseAffine`, it does not end at the box of theta.
+    Other than :class:`PiecewiseAffine`, it does not end at the box of states.
 
     Attributes
     ----------
@@ -150,13 +150,13 @@ class OnlineLaw(PlantLaw):
 
     def __call__(self, theta: ArrayLike) -> Array:
         """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
-        points, rows = as_points(theta, self.n_theta)
+        points, rows = self._points(theta)
         inputs = self.known(rows)
         return inputs if points.ndim == 2 else inputs[0]
 
     def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
         """Tell whether the MPC has a solution at theta, for each row of a batch."""
-        points, rows = as_points(theta, self.n_theta)
+        points, rows = self._points(theta)
         return self._answers(rows)[1].reshape(points.shape[:-1])
 
     def gain(self, theta: ArrayLike) -> Array:
@@ -164,7 +164,7 @@ class OnlineLaw(PlantLaw):
 
         It is that of the constraints which are active at theta, before bounds clip the input.
         """
-        points, rows = as_points(theta, self.n_theta)
+        points, rows = self._points(theta)
         _, feasible, found, softened = self._answers(rows)
         gains = np.zeros((len(rows), self.n_inputs, self.n_theta))
         for i in np.flatnonzero(feasible):

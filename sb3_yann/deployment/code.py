@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.deployment.controller import MAX_THETA, Controller, steps_of
+from sb3_yann.deployment.controller import Controller, steps_of
 
 ControllerArrays = Mapping[str, Any]
 Tables = dict[str, NDArray[Any]]
@@ -80,7 +80,7 @@ def controller_tables(data: ControllerArrays, precision: str) -> tuple[Tables, T
     numbers: Tables = {name: data[name] for name in same.split()}
     numbers["action_scale"] = action_scale(data, precision)
     numbers["input_min"], numbers["input_max"] = data["bounds"]
-    numbers["far"] = MAX_THETA * np.abs(data["box"]).max(0)
+    numbers["theta_min"], numbers["theta_max"] = data["ends"]
     starts = np.array([*data["starts"], len(data["b"])])
     indices: Tables = {"starts": starts, "watched": data["watched"].astype(np.int64)}
     indices |= {"source": data["source"], "missing": data["missing"]}

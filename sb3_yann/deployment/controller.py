@@ -23,10 +23,9 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-FORMAT = 4  # of the arrays: a reader takes no other
+FORMAT = 5  # of the arrays: a reader takes no other
 POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
 MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
-MAX_THETA = 1e12  # theta is clipped to so many times its box: beyond, slacks would overflow
 
 
 class Status(IntFlag):
@@ -355,8 +354,7 @@ class Controller:
         with np.errstate(over="ignore", invalid="ignore"):
             theta = np.where(lost, 0.0, obs) @ data["obs_matrix"].T + data["obs_offset"]
         theta[(lost @ (data["obs_matrix"] != 0).T) | np.isnan(theta)] = 0.0
-        far = MAX_THETA * np.abs(data["box"]).max(0)  # beyond it slacks would overflow
-        theta = np.clip(theta, -far, far)
+        theta = np.clip(theta, *data["ends"])
         region, inside = self._locate(theta)
         law = (data["gains"][region] @ theta[..., None])[..., 0] + data["offsets"][region]
         if "qp_gram" in data:

@@ -23,6 +23,8 @@ from sb3_yann.policy.observations import AffineFeatures, keeps_entries
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.units import ActionUnits
 
+MAX_THETA = 1e12  # theta ends at so many times its box: beyond, slacks would overflow
+
 
 @dataclass(frozen=True)
 class Checks:
@@ -385,7 +387,7 @@ def _with_regions(law: Any) -> tuple[PiecewiseAffine, dict[str, Any]]:
         infeasible=law.infeasible,
     )
     if law.model is not None and law.theta_ss is not None:
-        free = free.on_plant(law.model, law.theta_ss, law.rate, law.moving)
+        free = free.on_plant(law.model, law.theta_ss, law.rate, law.moving, law.clamped)
     program = {
         "qp_D": dual.D,
         "qp_d0": dual.d0,
@@ -420,6 +422,8 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
         "per_input": 1 / half,
         "middle": middle / half,
     }
+    far = MAX_THETA * np.abs(arrays["box"]).max(0)
+    arrays["ends"] = np.array([law.clamp(-far), law.clamp(far)])
     arrays["bounds"][:, finite] = [[-1.0], [1.0]]  # to the bit
     arrays["resting"] = np.clip(-middle / half, *arrays["bounds"])
     arrays |= {"neighbors": np.empty(0, np.int64), "walk_slack": np.empty(0), "walk_from": 0}

@@ -117,6 +117,7 @@ def _policy(graph: _Graph, data: ControllerArrays, precision: str) -> tuple[str,
     shown = constant((data["obs_matrix"] != 0).astype(float).T)
     depends = op("Greater", op("MatMul", graph.number(lost), shown), zero)
     theta = op("Where", op("Or", depends, graph.not_finite(theta)), zero, theta)
+    theta = graph.between(theta, *(constant(each[None]) for each in data["ends"]))
     region, inside = _locate(graph, data, theta, search_tolerances(data, precision))
     law = graph.times(op("Gather", constant(data["gains"]), region), theta)
     law = op("Add", law, op("Gather", constant(data["offsets"]), region))

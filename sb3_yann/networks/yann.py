@@ -38,6 +38,7 @@ class LawLayer(nn.Module):
     change: th.Tensor
     confines: th.Tensor
     margin: th.Tensor
+    clamped: th.Tensor | None
     network: ZeroOutputNetwork
     reach: float | None
     constants: tuple[Array, Array, Array, float]  # for compiled code
@@ -60,6 +61,8 @@ class LawLayer(nn.Module):
         self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
         change: Array = np.empty((0, law.n_inputs))
         self.moving = law.moving
+        ends = None if law.clamped is None else th.as_tensor(np.array(law.clamped))
+        self.register_buffer("clamped", ends, persistent=False)
         if rate is not None:
             if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
                 raise ValueError(
@@ -106,8 +109,8 @@ class LawLayer(nn.Module):
         """Return the law and what the networks put out, by torch's operations, both (batch, m)."""
         raise NotImplementedError
 
-    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array]:
-        """Return the law, packed, and room for its inputs; or nothing packed, and the inputs."""
+    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array, Array]:
+        """Return the law, packed, room for its inputs, theta; or nothing packed, and the inputs."""
         raise NotImplementedError
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
@@ -118,6 +121,7 @@ class LawLayer(nn.Module):
 
             own = network.weights(), network.pinned_array
             return layer_on_cpu(self._for_loops, theta, self.constants, *own, self.row_gradients)
+        theta = clamp_theta(theta, self.clamped)
         law, correction = self._correction(theta)
         if self.reach is not None:
             # The bound holds for weights that overflow, or are no numbers, as well.
@@ -232,6 +236,11 @@ class LawLayer(nn.Module):
         self._keep_constants()
 
 
+def clamp_theta(theta: th.Tensor, ends: th.Tensor | None) -> th.Tensor:
+    """Return theta (batch, n) between ends (2, n), see `MPCProblem.clamped`; as it is for None."""
+    return theta if ends is None else theta.double().clamp(ends[0], ends[1])
+
+
 def _kept_in_actions(kept: KeptSet, middle: Array, half_range: Array) -> Array:
     """Return rows [a, b, c, half-width] for actions in [-1, 1], b of length 1.
 
@@ -314,6 +323,7 @@ class YannLayer(LawLayer):
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
+        theta = clamp_theta(theta, self.clamped)
         return self._law(theta, *self.locate(theta))
 
     def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
@@ -345,8 +355,9 @@ class YannLayer(LawLayer):
         u = u.clamp(-1, 1).to(self.theta_half)
         return u.clamp(*self.reachable(theta)) if self.rated else u
 
-    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array]:
-        return *self.base_law.packed, np.empty((len(theta), self.base_law.n_inputs))
+    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array, Array]:
+        inputs: Array = np.empty((len(theta), self.base_law.n_inputs))
+        return *self.base_law.packed, inputs, self.base_law.clamp(theta)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
         constants = "gains", "offsets", "resting", "half_space_A", "half_space_b"
@@ -442,6 +453,7 @@ class SharedYannLayer(LawLayer):
                 "A law beside a shared network is evaluated outside of torch: it cannot be traced "
                 "or compiled by it. Trace a policy with networks='per_region'."
             )
+        theta = clamp_theta(theta, self.clamped)
         u: th.Tensor = _Law.apply(theta, self)  # type: ignore[no-untyped-call]
         return u.clamp(*self.reachable(theta)) if self.rated else u
 
@@ -464,8 +476,8 @@ class SharedYannLayer(LawLayer):
         correction = self.network((theta / self.theta_half).to(self.theta_half))
         return self.law(theta), correction
 
-    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array]:
-        return np.empty(0), np.empty(0, np.int64), self.inputs(theta)
+    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array, Array]:
+        return np.empty(0), np.empty(0, np.int64), self.inputs(theta), self.base_law.clamp(theta)
 
     def _actions(self, theta: Array) -> Array:
         middle = self.middle.double().cpu().numpy()

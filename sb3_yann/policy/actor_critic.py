@@ -31,7 +31,7 @@ from sb3_yann.control.mpc.problem import Value
 from sb3_yann.control.online import Law
 from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
 from sb3_yann.networks.value import PredictionModel
-from sb3_yann.networks.yann import LawLayer
+from sb3_yann.networks.yann import LawLayer, clamp_theta
 from sb3_yann.policy.checks import require_own_problem
 from sb3_yann.policy.observations import SeesTheta, keeps_entries, without_entries
 from sb3_yann.policy.sb3_hooks import KeepsPrecision, what_is_not_finite
@@ -247,6 +247,8 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
     torch.Size([1, 1])
     """
 
+    clamped: th.Tensor | None
+
     def __init__(
         self,
         problem: LinearMPC,
@@ -275,12 +277,18 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
             "pinned": pin_equilibrium,
             "n_outputs": n_outputs,
         }
+        ends = None if problem.clamped is None else th.as_tensor(problem.clamped)
+        self.register_buffer("clamped", ends, persistent=False)
         self.q_networks = []
         for i in range(n_critics):
             common["activation"] = activation_fn()
             q_network = _initial_value(problem, gamma, options, common)
             self.add_module(f"qf{i}", q_network)
             self.q_networks.append(q_network)
+
+    def extract_features(self, obs: Any, features_extractor: Any) -> th.Tensor:
+        """Return theta as the law takes it: what is asked for within its range."""
+        return clamp_theta(super().extract_features(obs, features_extractor), self.clamped)
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """Return Q of each critic, all (batch, 1), in units of the env's reward."""

@@ -343,8 +343,8 @@ def as_box(
 
 FIXED = LawLayer, AfterstateValue, QuadraticStateActionValue, AffineFeatures
 """Modules whose buffers follow from the problem, or from the map to its theta."""
-FREE = {"confines", "margin", "value_scale"}
-"""Buffers of theirs that follow from what was learnt."""
+FREE = {"clamped", "confines", "margin", "value_scale"}
+"""Buffers of theirs that are not stored, or follow from what was learnt."""
 OF_ORDER_ONE = {"offsets", "resting", "half_space_b", "change"}
 """Those that are in units of a range: zeros among them are not exact."""
 SAME_LAW = 1e-6

@@ -302,7 +302,7 @@ def test_a_start_goes_on_from_the_plants_present_input(tmp_path) -> None:
     export(mpc, tmp_path / "plant.npz", estimator=observer, checks=Checks(transfer=20))
     controller = Controller.load(tmp_path / "plant.npz")
     # a load that nothing measures
-    u = np.array([3.7, 6.6])
+    u = np.array([3.1, 6.6])
     d = np.array([0.3, -0.2])
     deviation = np.linalg.solve(np.eye(3) - A, B @ (u - U_SS) + np.linalg.pinv(C) @ d)
     y = C @ (X_SS + deviation)

@@ -12,13 +12,25 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, TD3
 
+from deployed import Compiled, disturbed, needs_compiler
 from policy_samples import POLICIES, build, scalar_mpc, starts, updates, with_full_buffer
-from sb3_yann import LinearMPC, OnlineLawWarning, YannPolicy, export
+from sb3_yann import (
+    Controller,
+    DisturbanceBounds,
+    LinearModel,
+    LinearMPC,
+    OnlineLawWarning,
+    RateLimits,
+    Tracking,
+    YannPolicy,
+    export,
+)
 from sb3_yann.control import OnlineLaw
 from sb3_yann.control.mpc import linear_mpc
 from sb3_yann.networks import SharedYannLayer
 from sb3_yann.wrappers import MeasuredDisturbance, PreviousInput, SetPoint
 from sparse_qp import FEATURES, draw, problem
+from structured_text import FunctionBlock
 from weights import is_mpc
 
 
@@ -136,6 +148,66 @@ def test_an_export_holds_theta_with_what_lies_ahead(tmp_path: Any) -> None:
 
 
 # ---- Policies around a law that is solved online, or with one network for all of theta ----
+
+
+SERVOS: dict[str, dict[str, Any]] = {
+    "tracking": {},
+    "a measured disturbance": {"disturbances": DisturbanceBounds(-0.5, 0.5)},
+    "moves that cost": {"rate": RateLimits(-0.3, 0.3, [[1.0]])},
+    "a bound that changes": {"parametric_bounds": ["x_max[0]"], "infeasible": "zero_input"},
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", ["explicit", "online"])
+@pytest.mark.parametrize("name", SERVOS)
+def test_what_is_asked_for_beyond_its_range_counts_as_at_its_end_in_every_form(
+    name: str, kind: str, tmp_path: Any
+) -> None:
+    load = {"E": [[0.2], [0.1]]} if "disturbances" in SERVOS[name] else {}
+    model = LinearModel([[0.9, 0.1], [0, 0.8]], [[0.1], [0.5]], 1, [10, 20], [3], **load)
+    mpc = LinearMPC(
+        model, Q=np.diag([1, 0.1]), R=[[1]], horizon=5, x_min=[8, 18], x_max=[12, 22],
+        u_min=2, u_max=4, tracking=Tracking([[1, 0]], 9, 11), **SERVOS[name],
+    )  # fmt: skip
+    law = mpc.law(kind)
+    back = mpc.units.to_deviations
+    forms: dict[str, Any] = {"law": law.plant_input, "domain": lambda at: law.in_domain(back(at))}
+    forms["one row after another"] = lambda at: np.array([law.plant_input(row) for row in at])
+    for networks in ("per_region", "shared") if kind == "explicit" else ("shared",):
+        policy = disturbed(mpc, 0.1, law=kind, networks=networks, keep_bounds=False)
+        forms[networks] = lambda at, policy=policy: policy.predict(at)[0]
+        forms[f"torch, {networks}"] = lambda at, policy=policy: policy.actor(
+            th.as_tensor(at).requires_grad_()
+        ).detach()
+        forms[f"frozen, {networks}"] = lambda at, layer=policy.actor.mu: layer.frozen()(back(at))
+    forms["critic"] = lambda at: policy.critic(th.as_tensor(at), th.zeros(len(at), 1))[0].detach()
+    for path in ("law.npz", "policy.npz"):
+        export(law if path == "law.npz" else policy, tmp_path / path)
+        forms[path] = Controller.load(tmp_path / path).evaluate
+    compiled = Compiled(policy, tmp_path)
+    forms["C"] = lambda at: compiled.at(at)[0]
+    if kind == "explicit":
+        export(policy, tmp_path / "plant.st")
+        block = FunctionBlock((tmp_path / "plant.st").read_text())
+        forms["ST"] = lambda at: [block.step(obs=list(row), request=0)[0] for row in at]
+        onnx = pytest.importorskip("onnxruntime")
+        export(policy, tmp_path / "plant.onnx")
+        run = onnx.InferenceSession(str(tmp_path / "plant.onnx")).run
+        forms["ONNX"] = lambda at: run(None, {"obs": at})[0]
+
+    rng = np.random.default_rng(0)
+    ends = rng.uniform(mpc.theta_min, mpc.theta_max, (30, mpc.n_theta))
+    side = rng.choice([-1.0, 1.0], ends.shape)
+    asked = np.r_[mpc.layout.reference, mpc.layout.limits]
+    ends[:, asked] = np.where(side < 0, mpc.theta_min, mpc.theta_max)[:, asked]
+    outward = np.zeros_like(ends)
+    outward[:, asked] = (side * mpc.theta_half)[:, asked]
+    assert len(np.unique(forms["policy.npz"](ends))) > 15
+    for form, answer in forms.items():
+        for times in (1e-3, 1, 49):
+            found = np.asarray(answer(ends + times * outward))
+            np.testing.assert_array_equal(found, np.asarray(answer(ends)), form)
 
 
 SHAPES = pytest.mark.parametrize(

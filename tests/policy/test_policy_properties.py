@@ -99,7 +99,9 @@ def test_critic_is_the_value_of_the_problem_at_first(
     action = action.astype(np.float32)
     middle = (mpc.u_max + mpc.u_min) / 2
     half = (mpc.u_max - mpc.u_min) / 2
-    z = np.hstack([theta, middle + half * action])
+    # What is asked for counts within its range.
+    seen = theta if mpc.clamped is None else np.clip(theta, *mpc.clamped)
+    z = np.hstack([seen, middle + half * action])
     terms = z[:, :, None] * M * z[:, None]
     with th.no_grad():
         found = policy.critic(th.as_tensor(theta), th.as_tensor(action))

@@ -516,7 +516,7 @@ class LinearMPC(MPCProblem):
         return law.on_plant(*self._plant)
 
     @property
-    def _plant(self) -> tuple[LinearModel, Array, Array | None, NDArray[np.intp] | None]:
+    def _plant(self) -> tuple[Any, ...]:
         """What a law knows of the plant: see `PlantLaw`."""
         moving = np.full((2, self.model.n_inputs), -1)
         for at, name in enumerate(self.parametric_bounds, start=self.layout.limits.start):
@@ -524,7 +524,14 @@ class LinearMPC(MPCProblem):
             if kind == "u":
                 moving[int(upper), i] = at
         rate = np.stack([self.rate.du_min, self.rate.du_max]) if self.has_rate_bounds else None
-        return self.model, self.theta_ss, rate, moving if np.any(moving >= 0) else None
+        moves = moving if np.any(moving >= 0) else None
+        return self.model, self.theta_ss, rate, moves, self.clamped
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        for law in (*self._laws.values(), vars(self).get("_online")):
+            if law is not None and self.clamped is not None:  # no file of before says so
+                vars(law)["clamped"] = self.clamped
 
     @cached_property
     def _laws(self) -> dict[str, PiecewiseAffine]:

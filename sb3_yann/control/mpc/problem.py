@@ -198,6 +198,18 @@ class MPCProblem(ReadOnlyArrays):
         return np.asarray(self.layout.lift @ np.concatenate(parts))
 
     @cached_property
+    def clamped(self) -> Array | None:
+        """The range (2, n_theta) of what theta asks for, in deviations; None where that is nothing.
+
+        It is finite for references and for bounds that change at run time. Laws and policies take
+        what lies beyond as at its end. States and disturbances are what they are: they go on.
+        """
+        asked = np.r_[self.layout.reference, self.layout.limits]
+        found = np.full((2, self.n_theta), np.inf) * [[-1.0], [1.0]]
+        found[:, asked] = self.deviations.theta_min[asked], self.deviations.theta_max[asked]
+        return found if np.any(np.isfinite(found)) else None
+
+    @cached_property
     def theta_rest(self) -> Array:
         """Theta at rest in deviations (n_theta,): zero, and the widest of bounds that change."""
         rest = np.zeros(self.n_theta)

@@ -264,8 +264,9 @@ static unsigned act(const real seen[N_SEEN], int with_networks, real action[N_IN
                 known = known && isfinite(seen[i]);
             }
         }
-        /* What is not finite counts as at the operating point, what is far as not so far. */
-        theta[j] = known && theta[j] == theta[j] ? between(theta[j], -far[j], far[j]) : ZERO;
+        /* What is not finite counts as at the operating point, what is beyond as at the end. */
+        theta[j] = known && theta[j] == theta[j] ? theta[j] : ZERO;
+        theta[j] = between(theta[j], theta_min[j], theta_max[j]);
     }
     const int region = locate(theta, &inside);
 #if ONLINE

@@ -25,8 +25,9 @@ KEPT_TYPES = (
 """Types of what a forward pass keeps: x, used, slot, two hidden layers, outputs, see `forward`."""
 Constants = tuple[Array, Array, Array, float]
 """``scaling``, ``change``, ``kept`` and ``limit``, as in `forward`."""
-PackedLaw = tuple[Array, Integers, Array]
-"""A packed law, and room for its inputs; or two empty arrays, and the inputs of any law."""
+PackedLaw = tuple[Array, Integers, Array, Array]
+"""A packed law, room for its inputs, and theta; or two empty arrays, the inputs of any law, and
+theta: what is asked for lies within its range."""
 
 
 @compiled()
@@ -298,8 +299,7 @@ def layer_on_cpu(
     by_row : bool
         Whether gradients are sparse, with the rows of the regions in use.
     """
-    points = _rows(theta, weights[0])
-    known = (*pack(points), points, *constants)
+    known = (*pack(_rows(theta, weights[0])), *constants)
     if th.is_grad_enabled():
         actions: th.Tensor = _Layer.apply(known, pinned, by_row, *weights)  # type: ignore[no-untyped-call]
         return actions
@@ -316,8 +316,7 @@ def frozen_layer(
     rest = (*constants, *map(to_numpy, weights), pinned)
 
     def act(theta: Array) -> Single:
-        rows = _rows(theta, weights[0])
-        return _actions([*pack(rows), rows, *rest])[0]
+        return _actions([*pack(_rows(theta, weights[0])), *rest])[0]
 
     return act
 

@@ -238,3 +238,15 @@ def test_a_damaged_plant_is_a_value_error(saved: Any, damage: dict[str, Any]) ->
 def test_a_pickle_keeps_the_plant(saved: Any) -> None:
     copy = pickle.loads(pickle.dumps(saved[0]))
     assert copy.model == reactor().model and not copy.theta_ss.flags.writeable
+
+
+def test_laws_of_files_of_before_are_clamped_where_their_problem_is_at_hand(saved: Any) -> None:
+    law, path, kind = saved
+    old = {name: each for name, each in read_arrays(path).items() if name != "clamped"}
+    write_arrays(path, old)
+    assert kind.load(path) == law and kind.load(path).clamped is None
+    mpc = reactor()
+    name = "explicit" if kind is PiecewiseAffine else "online"
+    del vars(mpc.law(name))["clamped"]
+    again = pickle.loads(pickle.dumps(mpc)).law(name)
+    np.testing.assert_array_equal(again.clamped, law.clamped)
