@@ -16,8 +16,7 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann_envs import problems
 
 STEPS = 400  # of one episode
-SHOWN = range(40)  # starts for the cloning
-TESTS = range(1000, 1010)
+SHOWN, TESTS = range(40), range(1000, 1010)  # starts for the cloning, and for the tests
 
 
 def tested(model: DDPG) -> str:
@@ -29,8 +28,7 @@ def tested(model: DDPG) -> str:
 def cloned(seed: int) -> DDPG:
     """Return SB3's own DDPG, its actor fitted to what the MPC does in 40 episodes."""
     model = DDPG("MlpPolicy", "CSTR-v0", seed=seed, device="cpu")
-    actor = model.policy.actor
-    space = model.action_space
+    actor, space = model.policy.actor, model.action_space
     log = evaluate(problems.cstr().explicit(), "CSTR-v0", SHOWN)
     states = np.concatenate([x[:-1] for x in log.observations])
     x = torch.as_tensor(states, dtype=torch.float32)
@@ -60,8 +58,7 @@ def main() -> None:
     done = 0
     for episodes in [n for n in (0, 1, 2, 3, 5) if n < arguments.episodes] + [arguments.episodes]:
         for model in learners.values():
-            steps = STEPS * (episodes - done)
-            go_on = {"reset_num_timesteps": False}
+            steps, go_on = STEPS * (episodes - done), {"reset_num_timesteps": False}
             model.learn(steps, callback=NoActionNoise(), **go_on)
         done = episodes
         table.add_row(str(episodes), *map(tested, learners.values()))

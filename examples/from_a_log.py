@@ -16,8 +16,7 @@ from sb3_yann_envs import problems
 
 OUT = Path("out")
 LOG = OUT / "log.csv"
-EPISODES = range(5)
-TESTS = range(1000, 1030)
+EPISODES, TESTS = range(5), range(1000, 1030)
 
 
 def write_log() -> None:

@@ -16,8 +16,7 @@ from sb3_yann.wrappers import EstimateState, SetPoint, StageCost
 
 OUT = Path("out")
 LOG, PAGE, CODE, ARRAYS = (OUT / f"kettle.{suffix}" for suffix in ("csv", "html", "c", "npz"))
-DT = 10  # seconds
-LATE = 3  # samples
+DT, LATE = 10, 3  # seconds; samples
 
 
 class Kettle(gym.Env):
@@ -29,9 +28,7 @@ class Kettle(gym.Env):
     def reset(self, *, seed=None, options=None):
         """Begin at rest, with the valve at 40 %."""
         super().reset(seed=seed)
-        self.jacket = 108.0
-        self.kettle = 80.0
-        self.on_its_way = [40.0] * LATE
+        self.jacket, self.kettle, self.on_its_way = 108.0, 80.0, [40.0] * LATE
         return self.shown(), {}
 
     def shown(self):
@@ -50,12 +47,8 @@ class Kettle(gym.Env):
 def main() -> None:
     """Let an operator move the valve; then model, MPC, page and code; then close the loop."""
     OUT.mkdir(exist_ok=True)
-    plant = Kettle()
-    rng = np.random.default_rng(0)
-    valve = 40.0
-    began = datetime(2026, 1, 5, 8)
-    y = plant.reset(seed=0)[0]
-    rows = ["time,temperature,pressure,valve"]
+    plant, rng, valve, began = Kettle(), np.random.default_rng(0), 40.0, datetime(2026, 1, 5, 8)
+    y, rows = plant.reset(seed=0)[0], ["time,temperature,pressure,valve"]
     for k in range(1440):
         valve = rng.uniform(25, 55) if rng.random() < 0.1 else valve
         rows.append(f"{began + timedelta(seconds=k * DT)},{y[0]:.3f},{y[1]:.4f},{valve:.2f}")
@@ -76,8 +69,7 @@ def main() -> None:
     checks = yann.Checks([0, 0, 75], [120, 3, 85], frozen_after=30, missing=2)
     for path in (CODE, ARRAYS):
         print(yann.export(policy, path, estimator=observer, checks=checks))
-    controller = yann.Controller.load(ARRAYS)
-    y = plant.reset(seed=1)[0]
+    controller, y = yann.Controller.load(ARRAYS), plant.reset(seed=1)[0]
     for k in range(120):
         y = plant.step(controller([*y, 82], manual=None if k else [40]))[0]
     print(f"Set-point 82 °C: the kettle is at {plant.kettle:.2f} °C. Saved: {PAGE}, {CODE}")

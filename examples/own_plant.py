@@ -19,8 +19,7 @@ from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
 from sb3_yann.evaluation import comparison_table, evaluate, plots
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
-STEPS = 60  # of one episode
-HOLD = 20  # until the set-points change
+STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
 TEST_SEEDS = range(2000, 2050)  # starts, set-points and disturbances that training never sees
 
 
@@ -28,9 +27,7 @@ def design() -> LinearMPC:
     """Return the MPC of a model that was identified from a log."""
     write_log("out/log.csv")  # you have yours
     log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
-    x = log[:, 1:5]
-    u = log[:-1, 5:7]
-    d = log[:-1, 7:]
+    x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
     plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
     plant = plant.named(["h1", "h2", "h3", "h4"], ["v1", "v2"], [*["cm"] * 4, "V", "V"], "s")
     # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
@@ -56,8 +53,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # the networks are too small to share among cores
-    console = Console(highlight=False)
-    mpc = design()
+    console, mpc = Console(highlight=False), design()
     console.print(mpc.model.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes.

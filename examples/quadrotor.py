@@ -53,8 +53,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # the networks are too small to share among cores
-    console = Console(highlight=False)
-    mpc = hover()
+    console, mpc = Console(highlight=False), hover()
     make = partial(make_env, mpc)
 
     policy = {"problem": mpc, "law": "online"}

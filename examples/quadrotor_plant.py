@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 DT = 0.05  # s
 SUBSTEPS = 2  # Runge-Kutta steps in a sample
-MASS = 0.8  # kg
-GRAVITY = 9.81  # m/s2
+MASS, GRAVITY = 0.8, 9.81  # kg, m/s2
 INERTIA = np.array([0.008, 0.008, 0.014])  # kg m2
-ARM = 0.2  # m: of a rotor
-YAW = 0.02  # m: torque about the vertical for each newton of thrust
+ARM, YAW = 0.2, 0.02  # m: of a rotor; torque about the vertical for each newton of thrust
 DRAG = 0.12  # N s2/m2, of the air
 MAX_THRUST = 5.0  # N, of one rotor
-MAX_TILT = 1.2  # rad: beyond it falls
-FLOOR = -3.0  # m: the ground
+MAX_TILT, FLOOR = 1.2, -3.0  # rad, m: beyond them it falls, or hits the ground
 CRASH = 2000.0  # added to the cost
 STARTS = np.repeat([1.5, 0.4, 1.0, 0.5], 3)  # m, rad, m/s, rad/s
 
@@ -29,11 +26,8 @@ def derivative(x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.flo
     Newton's and Euler's equations of a rigid body, with yaw-pitch-roll angles and a drag that grows
     with the square of the speed. ``u`` (4,) are the rotors' thrusts: front, right, back and left.
     """
-    pitch = x[4]
-    velocity = x[6:9]
-    (p, q, r) = x[9:]
-    (sr, sp, sy) = np.sin(x[3:6])
-    (cr, cp, cy) = np.cos(x[3:6])
+    pitch, velocity, (p, q, r) = x[4], x[6:9], x[9:]
+    (sr, sp, sy), (cr, cp, cy) = np.sin(x[3:6]), np.cos(x[3:6])
     up = np.array([sr * sy + cr * sp * cy, cr * sp * sy - sr * cy, cr * cp])
     drag = DRAG * np.sqrt(velocity @ velocity) * velocity
     acceleration = (u.sum() * up - drag) / MASS - [0.0, 0.0, GRAVITY]
@@ -71,8 +65,7 @@ class Quadrotor(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Hold the thrusts for one sample."""
-        u = np.clip(action, 0.0, MAX_THRUST)
-        h = DT / SUBSTEPS
+        u, h = np.clip(action, 0.0, MAX_THRUST), DT / SUBSTEPS
         for _ in range(SUBSTEPS):  # the classical Runge-Kutta method
             k1 = derivative(self.x, u)
             k2 = derivative(self.x + h / 2 * k1, u)

@@ -41,8 +41,7 @@ def derivative(levels: Any, voltages: Any, d: float = 0.0, wear: float = 0.0) ->
         a * math.sqrt(2 * GRAVITY * h) if h > 0 else 0.0
         for a, h in zip(OUTLET, (h1, h2, h3, h4), strict=True)
     )
-    pump1 = (1 - wear) * PUMP_GAIN[0] * v1
-    pump2 = (1 - wear) * PUMP_GAIN[1] * v2
+    pump1, pump2 = (1 - wear) * PUMP_GAIN[0] * v1, (1 - wear) * PUMP_GAIN[1] * v2
     return (
         (SPLIT[0] * pump1 + out3 - out1) / AREA[0],
         (SPLIT[1] * pump2 + out4 - out2) / AREA[1],
@@ -53,8 +52,7 @@ def derivative(levels: Any, voltages: Any, d: float = 0.0, wear: float = 0.0) ->
 
 def advance(levels: Any, voltages: Any, d: float = 0.0, wear: float = 0.0) -> tuple[float, ...]:
     """Return the levels one sample later, by the classical Runge-Kutta method; none is below 0."""
-    h = tuple(levels)
-    step = DT / SUBSTEPS
+    h, step = tuple(levels), DT / SUBSTEPS
     for _ in range(SUBSTEPS):
         k1 = derivative(h, voltages, d, wear)
         k2 = derivative(_moved(h, k1, step / 2), voltages, d, wear)
@@ -122,11 +120,9 @@ class QuadrupleTank(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __init__(self, noise: float = 0.0, wear: float = 0.0) -> None:
         self.observation_space = gymnasium.spaces.Box(0, FULL, (4,), np.float32)
         self.action_space = gymnasium.spaces.Box(0, MAX_VOLTAGE, (2,), np.float32)
-        self.noise = noise
-        self.wear = wear
+        self.noise, self.wear = noise, wear
         self.levels: tuple[float, ...] = LEVELS_SS
-        self.d = 0.0
-        self.fixed = False
+        self.d, self.fixed = 0.0, False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -135,8 +131,7 @@ class QuadrupleTank(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         super().reset(seed=seed)
         self.fixed = bool(options) and "state" in options
         if self.fixed:
-            self.levels = tuple(map(float, options["state"]))
-            self.d = 0.0
+            self.levels, self.d = tuple(map(float, options["state"])), 0.0
             if not all(0 <= h <= FULL for h in self.levels) or len(self.levels) != 4:
                 raise ValueError(f"state = {self.levels} must be four levels from 0 to 20 cm.")
         else:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DDPG, PPO, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
 
 from event_files import scalars
+from guard_samples import MPC, STEPS, Slide, build
 from sample_plants import Recorder
-from sb3_yann import ControlDiagnostics, NoActionNoise, YannPolicy
+from sb3_yann import ControlDiagnostics, NoActionNoise, SimulatedEpisodes, YannPolicy
+from sb3_yann.callbacks import _Exploration
+from sb3_yann.policy import AffineObservation
 from weights import last_layer, unpin
 
 
@@ -125,3 +133,156 @@ def test_the_critic_error_compares_q_with_the_return_that_followed() -> None:
     returns = np.array([-1.75, -1.5, -1.0])  # three steps at -1, discounted by a half
     expected = np.abs(q - returns).mean() / np.abs(returns).mean()
     assert model.logger.name_to_value["yann/critic_error"] == pytest.approx(expected, rel=1e-5)
+
+
+FEW = {"per_episode": 3}
+
+
+class Ends(Slide):
+    """Terminates after two steps from some of its starts."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, self.low_start and self.t == 2, truncated, info
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed, options=options)
+        self.low_start = self.x[0] < 0
+        return observation, info
+
+
+def learnt(model, steps: int, *callbacks):
+    return model.learn(steps, callback=[NoActionNoise(), *callbacks], reset_num_timesteps=False)
+
+
+def rows(model) -> slice:
+    return slice(0, model.replay_buffer.size())
+
+
+def test_the_plant_meets_the_policy_alone_and_the_buffer_holds_both_in_whole_episodes() -> None:
+    model = build(learning_rate=0.0)
+    learnt(model, 2 * STEPS + 1, SimulatedEpisodes(Slide, **FEW))
+    buffer = model.replay_buffer
+    whole = 3 * STEPS
+    expected = [True] * whole + [False] * STEPS + [True] * whole + [False] * STEPS + [True] * whole
+    marks = np.array([*expected, False])
+    law = MPC.explicit()(buffer.observations[rows(model), 0].astype(float))
+    noise = np.abs(buffer.actions[rows(model), 0] - law)[:, 0]
+    assert noise[~marks].max() < 1e-5 and 0.03 < noise[marks].mean() < 0.3
+    ends = np.flatnonzero(buffer.dones[rows(model), 0])
+    assert ends.tolist() == [STEPS * (k + 1) - 1 for k in range(11)]
+    assert buffer.timeouts[ends, 0].all()  # Slide truncates
+    follows = buffer.next_observations[: ends[-1], 0] == buffer.observations[1 : ends[-1] + 1, 0]
+    assert follows[:, 0].tolist() == [k not in ends for k in range(ends[-1])]
+
+
+def test_what_is_stored_is_what_the_simulator_did() -> None:
+    model = build(learning_rate=0.0)
+    learnt(model, 1, SimulatedEpisodes(Ends, per_episode=8, seed=5))
+    buffer = model.replay_buffer
+    at = 0
+    for seed in range(5, 13):
+        env = Ends()
+        observation = env.reset(seed=seed)[0]
+        over = False
+        while not over:
+            np.testing.assert_array_equal(buffer.observations[at, 0], observation)
+            action = buffer.actions[at, 0]
+            observation, reward, terminated, truncated, _ = env.step(action)
+            over = terminated or truncated
+            np.testing.assert_array_equal(buffer.next_observations[at, 0], observation)
+            assert buffer.rewards[at, 0] == pytest.approx(reward, rel=1e-6)
+            assert (buffer.dones[at, 0], buffer.timeouts[at, 0]) == (over, truncated)
+            at += 1
+    assert at == buffer.size() - 1 and 0 < sum(buffer.timeouts[:at, 0]) < 8
+
+
+def test_a_run_that_is_cut_off_goes_on_where_it_was() -> None:
+    simulated = partial(SimulatedEpisodes, Slide, **FEW)
+    whole = learnt(build(), 3 * STEPS, simulated())
+    parts = learnt(build(), STEPS, simulated())
+    assert parts.simulated.due and parts.simulated.episodes == 3
+    learnt(parts, 2 * STEPS, simulated())
+    assert parts.simulated == whole.simulated and whole.simulated.episodes == 9
+    n = whole.replay_buffer.size()
+    assert n == parts.replay_buffer.size() == 3 * STEPS + 9 * STEPS
+
+
+@pytest.mark.parametrize("n_envs", [2, 4])
+def test_with_several_envs_each_column_holds_whole_episodes_but_for_its_last(n_envs) -> None:
+    model = build(TD3, env=make_vec_env(Slide, n_envs), learning_rate=0.0, n_steps=3)
+    learnt(model, n_envs * (STEPS + 1), SimulatedEpisodes(Ends, per_episode=5))
+    buffer = model.replay_buffer
+    assert model.simulated.episodes == 10
+    for column in range(n_envs):
+        now, after = (
+            each[rows(model), column, 0] for each in (buffer.observations, buffer.next_observations)
+        )
+        breaks = np.flatnonzero(now[1:] != after[:-1])
+        ended = buffer.dones[rows(model), column].astype(bool)
+        ended |= buffer.timeouts[rows(model), column].astype(bool)
+        assert ended[breaks].all()
+
+
+def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> None:
+    venv = VecNormalize(make_vec_env(Slide, 1), training=False, norm_reward=False)
+    venv.obs_rms.mean = np.array([1.0])
+    venv.obs_rms.var = np.array([4.0])
+    venv.clip_obs = np.inf
+    seen = AffineObservation.from_vec_normalize(venv)
+    model = build(env=venv, actor={"observation": seen}, learning_rate=0.0)
+    learnt(model, 1, SimulatedEpisodes(Slide, per_episode=3, noise=0.0, step_tests=0))
+    shown = model.replay_buffer.observations[: 3 * STEPS, 0].astype(float)
+    taken = model.replay_buffer.actions[: 3 * STEPS, 0]
+    np.testing.assert_allclose(taken, MPC.explicit()(shown), atol=1e-5)
+
+
+def test_step_tests_hold_an_action_from_all_of_the_space_for_one_to_so_many_samples() -> None:
+    rng = np.random.default_rng(0)
+    explore = _Exploration(
+        SimulatedEpisodes(Slide, step_tests=0.1, max_hold_steps=4, noise=0.01), rng
+    )
+    acted = np.array([explore(np.array([0.9, -0.9])) for _ in range(20_000)])
+    tested = np.abs(acted - [0.9, -0.9]).max(1) > 0.1
+    assert tested.mean() == pytest.approx(2.5 / (2.5 + 9), abs=0.02)  # after 9 of noise
+    held = np.all(acted[1:] == acted[:-1], axis=1)
+    lengths = np.diff(np.flatnonzero(~held))
+    assert set(lengths[lengths > 1]) == {2, 3, 4}
+    assert np.abs(acted[tested].mean(0)).max() < 0.1 and acted[tested].min() < -0.99
+    assert acted[~tested].std(0) == pytest.approx([0.01, 0.01], rel=0.15)
+
+
+def test_the_training_env_itself_and_another_plant_are_refused() -> None:
+    env = Slide()
+    with pytest.raises(ValueError, match="The simulator is the training env"):
+        learnt(build(env=env), 1, SimulatedEpisodes(env))
+    with pytest.raises(ValueError, match=r"observations of shape \(4,\).* the training env \(1,\)"):
+        learnt(build(), 1, SimulatedEpisodes("CSTR-v0"))
+    with pytest.raises(TypeError, match="SimulatedEpisodes needs a YannPolicy"):
+        DDPG("MlpPolicy", "CSTR-v0").learn(1, callback=SimulatedEpisodes("CSTR-v0"))
+    with pytest.raises(ValueError, match="optimize_memory_usage=True"):
+        unlike = {"handle_timeout_termination": False}
+        model = build(optimize_memory_usage=True, replay_buffer_kwargs=unlike)
+        learnt(model, 1, SimulatedEpisodes(Slide))
+
+
+def test_its_envs_are_made_once_and_closed() -> None:
+    made: list[Slide] = []
+
+    class Closing(Slide):
+        def __init__(self) -> None:
+            super().__init__()
+            self.open = True
+            made.append(self)
+
+        def close(self) -> None:
+            self.open = False
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            assert all(each.open for each in made)
+            return True
+
+    learnt(build(), 2 * STEPS + 1, SimulatedEpisodes(Closing, **FEW), Stop())
+    assert len(made) == 3 and not any(each.open for each in made)
+    assert gym.spaces.utils.flatdim(made[0].action_space) == 1

@@ -6,10 +6,16 @@ import io
 import sys
 from typing import Any
 
+import numba
 import pytest
+from numba.core.dispatcher import Dispatcher
 
+from fresh_process import run_python
 from sb3_yann import _progress
 from sb3_yann._progress import Progress, bar, is_watched, shown
+from sb3_yann.control._kernels import law, online, polyhedra
+from sb3_yann.networks._kernels import afterstate_value, yann_layer
+from sb3_yann_envs import cstr
 
 
 class Clock:
@@ -104,3 +110,93 @@ def test_false_silences_all_that_is_called(clock, capsys) -> None:
     assert capsys.readouterr() == ("", "")
     counted(clock, each=1.0)
     assert capsys.readouterr().err
+
+
+LAWS = law, online, polyhedra
+MODULES = (*LAWS, yann_layer, afterstate_value, cstr)
+CALLED = {
+    f"{module.__name__}.{name}": function
+    for module in MODULES
+    for name, function in vars(module).items()
+    if isinstance(function, Dispatcher) and not function._can_compile  # others are parts of these
+}
+
+
+@pytest.mark.parametrize("name", CALLED)
+def test_no_compiled_function_that_python_calls_returns_an_array(name) -> None:
+    scalars = numba.types.Number, numba.types.Boolean, numba.types.NoneType
+    for signature in CALLED[name].nopython_signatures:
+        returned = signature.return_type
+        # A tuple of numbers is made without any code of Python; an array is not.
+        parts = returned if isinstance(returned, numba.types.UniTuple) else [returned]
+        assert all(isinstance(each, scalars) for each in parts), returned
+
+
+def test_all_that_is_known_to_be_called_is_looked_at() -> None:
+    names = {name.rpartition(".")[2] for name in CALLED}
+    assert names >= {
+        "law_at",
+        "law_of_batch",
+        "locate_batch",
+        "bounded_region",
+        "forward",
+    }
+    assert names >= {
+        "solve_batch",
+        "inputs_of_batch",
+        "recall",
+        "remember",
+        "support",
+    }
+    assert names >= {"backward", "_forms", "_output", "_output_backward", "_forms_backward"}
+    assert names >= {"_rates", "advance", "advance_all", "is_rich"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("critic", ["afterstate", "state_action"])
+def test_compiled_code_is_loaded_when_a_policy_is_built(critic) -> None:
+    # In learn a Ctrl-C while numba begins would break it for the whole process.
+    program = f"""
+import sys, sb3_yann
+from stable_baselines3 import DDPG
+DDPG("YannPolicy", "CSTR-v0", device="cpu", policy_kwargs={{"critic": "{critic}"}})
+print(*sys.modules)
+"""
+    done = run_python(program)
+    loaded = done.stdout.decode().split()
+    assert loaded, done.stderr.decode()
+    assert "sb3_yann.networks._kernels.yann_layer" in loaded
+    assert ("sb3_yann.networks._kernels.afterstate_value" in loaded) == (critic == "afterstate")
+
+
+INTERRUPTED = """
+import collections, random, signal
+import gymnasium, torch as th
+from stable_baselines3 import DDPG
+from sb3_yann import NoActionNoise, YannPolicy
+
+th.set_num_threads(1)
+draw, raised = random.Random(0), collections.Counter()
+model = DDPG(YannPolicy, gymnasium.make("CSTR-v0"), seed=0, batch_size=8, learning_starts=10)
+model.learn(50, callback=NoActionNoise())
+# A shell starts what runs in its background with the signal ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+for _ in range(60):
+    th.set_grad_enabled(True)  # which torch's own no_grad forgets if it is cut off itself
+    model._last_obs = None  # an episode may have been cut off in the midst of a step
+    try:
+        signal.setitimer(signal.ITIMER_REAL, draw.uniform(0.01, 0.04), 1.0)
+        model.learn(10**6, callback=NoActionNoise(), reset_num_timesteps=False)
+    except (KeyboardInterrupt, Exception) as error:
+        raised[type(error).__name__] += 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+print(dict(raised))
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_any_moment_of_training_is_a_keyboard_interrupt() -> None:
+    done = run_python(INTERRUPTED, timeout=200)
+    assert done.stdout.decode() == "{'KeyboardInterrupt': 60}\n", done.stderr.decode()

@@ -1,7 +1,9 @@
-"""The examples run from any folder, print their table and save their picture."""
+"""The examples run from any folder, print their table and save their picture; their plants."""
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import os
 import re
 import shutil
@@ -9,9 +11,42 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import DDPG
+
+from quadrotor import hover
+from quadrotor_plant import DRAG, GRAVITY, INERTIA, MASS, Quadrotor, derivative
+from quadruple_tank import (
+    DT,
+    FULL,
+    LEVELS_SS,
+    VOLTAGES_SS,
+    QuadrupleTank,
+    advance,
+    write_log,
+)
+from quadruple_tank import (
+    derivative as tank_derivative,
+)
+from sb3_yann import LinearModel
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(name: str, folder: Path, *arguments: str) -> str:
+    """Run an example to its end in a folder, and return what it prints."""
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / f"{name}.py", *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 PRINTED = {
@@ -43,16 +78,9 @@ NIGHTLY = [pytest.param(name, marks=pytest.mark.nightly) for name in PRINTED if 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cstr", *NIGHTLY])
 def test_the_example_runs_to_its_picture(name, tmp_path) -> None:
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / f"{name}.py", "--episodes", "1"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
-    )
-    assert done.returncode == 0, done.stderr
+    printed = run(name, tmp_path, "--episodes", "1")
     for each in PRINTED[name]:
-        assert each in done.stdout
+        assert each in printed
     assert (tmp_path / "out" / f"{name}.png").stat().st_size > 10_000
 
 
@@ -66,34 +94,20 @@ def test_an_example_fits_a_page(path) -> None:
 
 @pytest.mark.slow
 def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / "from_a_log.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
-    )
-    assert done.returncode == 0, done.stderr
+    printed = run("from_a_log", tmp_path)
     assert "Verdict: trusted." in (tmp_path / "out" / "twin.txt").read_text(encoding="utf-8")
-    costs = re.findall(r"mean cost +(.*) \(MPC\) -> (.*)", done.stdout)[0]
+    costs = re.findall(r"mean cost +(.*) \(MPC\) -> (.*)", printed)[0]
     before, after = map(float, costs)
-    assert after < 0.99 * before and "violations: 0" in done.stdout
+    assert after < 0.99 * before and "violations: 0" in printed
     assert (tmp_path / "out" / "from_a_log.zip").exists()
     assert (tmp_path / "out" / "from_a_log.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
 def test_three_tags_become_a_page_and_code(tmp_path) -> None:
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / "outputs_only.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
-    )
-    assert done.returncode == 0, done.stderr
-    assert "order 2" in done.stdout and "act for [3] samples" in done.stdout
-    reached = re.search(r"the kettle is at (.*) °C", done.stdout)
+    printed = run("outputs_only", tmp_path)
+    assert "order 2" in printed and "act for [3] samples" in printed
+    reached = re.search(r"the kettle is at (.*) °C", printed)
     assert abs(float(reached[1]) - 82) < 0.3
     assert (tmp_path / "out" / "kettle.html").stat().st_size > 10_000
     built = ["gcc", "-std=c99", "kettle.c", "kettle_selftest.c", "-lm", "-o", "test"]
@@ -104,15 +118,166 @@ def test_three_tags_become_a_page_and_code(tmp_path) -> None:
 
 @pytest.mark.nightly
 def test_a_cloned_policy_forgets_and_a_yann_policy_does_not(tmp_path) -> None:
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / "cloned_policy.py", "--episodes", "1"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
-    )
-    assert done.returncode == 0, done.stderr
-    rows = re.findall(r"│ (\d) +│ ([\d.,]+) \(\d+\) +│ ([\d.,]+) \(\d+\)", done.stdout)
+    printed = run("cloned_policy", tmp_path, "--episodes", "1")
+    rows = re.findall(r"│ (\d) +│ ([\d.,]+) \(\d+\) +│ ([\d.,]+) \(\d+\)", printed)
     costs = {int(n): [float(each.replace(",", "")) for each in rest] for n, *rest in rows}
     assert costs[0][0] == pytest.approx(costs[0][1], rel=0.01)  # both are the MPC at first
     assert costs[1][0] > 1.1 * costs[0][0] and costs[1][1] == costs[0][1]
+
+
+HOVER = np.full(4, MASS * GRAVITY / 4)
+
+
+def test_it_rests_where_the_thrusts_carry_it_at_any_place_and_yaw() -> None:
+    x = np.zeros(12)
+    x[[0, 1, 2, 5]] = 3.0, -2.0, 1.0, 0.7
+    np.testing.assert_allclose(derivative(x, HOVER), 0, atol=1e-14)
+
+
+def test_without_thrust_energy_goes_into_the_drag_and_angular_momentum_stays() -> None:
+    x = np.array([0, 0, 0, 0.3, -0.2, 0.5, 1.0, -2.0, 0.5, 0.4, -0.3, 0.6])
+    rate = derivative(x, np.zeros(4))
+    v = x[6:9]
+    w = x[9:]
+    power = MASS * v @ rate[6:9] + MASS * GRAVITY * v[2]
+    np.testing.assert_allclose(power, -DRAG * np.linalg.norm(v) ** 3)
+    np.testing.assert_allclose(w @ (INERTIA * rate[9:]), 0, atol=1e-15)  # rotational energy
+    np.testing.assert_allclose((INERTIA * w) @ (INERTIA * rate[9:]), 0, atol=1e-15)
+
+
+@pytest.mark.filterwarnings("ignore:.*For Box action spaces", "ignore:.*infinity")
+def test_it_falls_when_it_tilts_too_far_and_is_a_gymnasium_env() -> None:
+    env = Quadrotor()
+    env.reset(seed=0, options={"state": [0, 0, 0, 1.3] + [0] * 8})
+    _, reward, terminated, _, info = env.step(HOVER.astype(np.float32))
+    assert terminated and info["violation"] and reward < -1000
+    check_env(Quadrotor(), skip_render_check=True)
+
+
+def test_its_mpc_hovers_with_the_thrusts_that_carry_it() -> None:
+    mpc = hover()
+    np.testing.assert_allclose(mpc.model.u_ss, HOVER)
+    law = mpc.online()
+    env = Quadrotor()
+    assert isinstance(env, gymnasium.Env)
+    x, _ = env.reset(seed=0)
+    for _ in range(100):
+        x = env.step(np.float32(mpc.model.u_ss + law(x.astype(float))))[0]
+    assert np.abs(x).max() < 0.02
+
+
+def rest_of_tank(wear: float = 0.0) -> np.ndarray:
+    """Return where the levels come to rest with 3 V at both pumps."""
+    levels = LEVELS_SS
+    for _ in range(300):
+        levels = advance(levels, VOLTAGES_SS, wear=wear)
+    return np.array(levels)
+
+
+def test_it_rests_at_the_published_operating_point() -> None:
+    # Table I of the paper prints (12.4, 12.7, 1.8, 1.4) cm; from its equations follow
+    # (12.26, 12.78, 1.63, 1.41).
+    assert np.max(np.abs(rest_of_tank() - LEVELS_SS)) < 0.2
+    np.testing.assert_allclose(tank_derivative(rest_of_tank(), VOLTAGES_SS), 0, atol=1e-12)
+
+
+def test_its_time_constants_are_the_published_ones() -> None:
+    def dynamics(x, u, d):
+        return tank_derivative(x, u, d[0])
+
+    model = LinearModel.from_dynamics(dynamics, rest_of_tank(), VOLTAGES_SS, DT, [0.0])
+    found = -DT / np.log(np.diag(model.A))  # A is upper triangular: tanks 3, 4 flow into 1, 2
+    assert found == pytest.approx([62, 90, 23, 30], abs=0.7)  # T1 to T4 at P-
+
+
+def test_its_steady_gains_are_the_published_ones() -> None:
+    model = LinearModel.from_env(QuadrupleTank, rest_of_tank(), VOLTAGES_SS)
+    gains = np.linalg.solve(np.eye(4) - model.A, model.B)[:2]
+    # G-(0) in V/V, printed as [2.6, 1.5; 1.4, 2.8]; the sensors give 0.5 V for each cm
+    np.testing.assert_allclose(0.5 * gains, [[2.6, 1.5], [1.4, 2.8]], atol=0.15)
+
+
+def test_worn_pumps_leave_less_water_in_every_tank() -> None:
+    assert np.all(rest_of_tank(wear=0.1) < rest_of_tank())
+
+
+@pytest.mark.filterwarnings("ignore:.*")  # the checker recommends actions in [-1, 1]
+def test_gymnasium_s_checker_finds_nothing_wrong() -> None:
+    check_env(QuadrupleTank(noise=0.02), skip_render_check=True)
+
+
+def test_a_seed_reproduces_an_episode_and_the_plant_s_luck_is_not_the_policy_s() -> None:
+    def disturbances(voltage: float) -> list[float]:
+        env = QuadrupleTank(noise=0.02)
+        env.reset(seed=7)
+        return [env.step(np.full(2, voltage))[4]["disturbance"] for _ in range(200)]
+
+    assert disturbances(3.0) == disturbances(3.0) == disturbances(0.0)
+    assert len(set(disturbances(3.0))) > 1
+
+
+def test_a_tank_that_overflows_is_a_violation_and_stays_full() -> None:
+    env = QuadrupleTank()
+    env.reset(options={"state": [19.9, 10, 5, 5]})
+    levels, reward, terminated, _, info = env.step(np.array([10, 10]))
+    assert info["violation"]
+    assert levels[0] == FULL
+    assert reward == -1
+    assert not terminated
+
+
+def test_an_empty_tank_stays_empty() -> None:
+    env = QuadrupleTank()
+    env.reset(options={"state": [0.1, 0.1, 0, 0]})
+    for _ in range(10):
+        levels, *_ = env.step(np.zeros(2))
+    assert levels.tolist() == pytest.approx([0, 0, 0, 0], abs=1e-3)
+
+
+@pytest.mark.parametrize("state", [[1, 2, 3], [1, 2, 3, 21], [-1, 2, 3, 4]])
+def test_levels_that_no_tank_has_are_named(state) -> None:
+    with pytest.raises(ValueError, match="must be four levels from 0 to 20 cm"):
+        QuadrupleTank().reset(options={"state": state})
+
+
+def test_the_log_is_the_same_each_time_and_gives_the_model(tmp_path) -> None:
+    for name in ("one.csv", "two.csv"):
+        write_log(tmp_path / name)
+    assert (tmp_path / "one.csv").read_text() == (tmp_path / "two.csv").read_text()
+    log = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
+    x = log[:, 1:5]
+    u = log[:-1, 5:7]
+    d = log[:-1, 7:]
+    found = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=VOLTAGES_SS, d_ss=[0])
+    true = LinearModel.from_env(QuadrupleTank, rest_of_tank(), VOLTAGES_SS)
+    assert np.max(np.abs(found.A - true.A)) < 0.06
+    assert np.max(np.abs(found.B - true.B)) < 0.06
+    assert np.max(np.abs(found.x_ss - rest_of_tank())) < 0.2
+
+
+SCRIPT = Path(__file__).parents[2] / "examples" / "pcgym_cstr.py"
+
+
+def test_it_takes_twenty_lines() -> None:
+    tree = ast.parse(SCRIPT.read_text(encoding="utf-8"))
+    left_out = (ast.Import, ast.ImportFrom, ast.If)  # the last one calls main
+    lines = set()
+    for node in ast.walk(tree):
+        text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if isinstance(node, ast.stmt) and not isinstance(node, left_out) and not text:
+            lines.add(node.lineno)
+    assert len(lines) <= 21  # twenty, and the call of main
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pcgym") is None, reason="PC-Gym is not installed")
+def test_the_policy_starts_as_the_offset_free_mpc() -> None:
+    import pcgym_cstr
+
+    env = pcgym_cstr.make_env()
+    law = pcgym_cstr.mpc.explicit()
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": pcgym_cstr.mpc}, gamma=0.95)
+    theta, _ = env.reset(seed=0)
+    for _ in range(5):
+        np.testing.assert_allclose(model.predict(theta)[0], law(theta), atol=1e-4)
+        theta, reward, *_, info = env.step(law(theta))
+        assert reward <= 0 <= info["pcgym_cost"]

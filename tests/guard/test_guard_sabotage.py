@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import warnings
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG, TD3
 
 from guard_samples import (
@@ -30,8 +37,23 @@ from guard_samples import (
     verdicts,
     worse,
 )
-from sb3_yann import NonFiniteWarning, StepSize
-from weights import is_mpc, later_layer
+from sb3_yann import (
+    AcceptanceRule,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    NonFiniteWarning,
+    OutputBounds,
+    SoftBounds,
+    StepSize,
+    report,
+)
+from sb3_yann.compare import Scores, Tolerance, less_safe, no_worse, unsafe_columns
+from sb3_yann.control.mpc.bound_excess import BoundNames, excess_of_episodes
+from sb3_yann.evaluation import evaluate
+from sb3_yann.wrappers import StageCost
+from weights import first_layer, is_mpc, last_layer, later_layer
 
 SABOTAGE = {
     "worse": worse,
@@ -233,3 +255,198 @@ def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
     worse(model.policy)
     train(model, STEPS + 1, guard)  # five more, not what was left
     assert [each.restored for each in guard.decisions[-2:]] == [False, True]
+
+
+A = np.array([[1, 0.2], [0, 1]])
+B = np.array([[0.02], [0.2]])
+LIMIT = 0.6
+COMMON: Any = {"Q": np.diag([1, 0]), "R": [[0.05]], "horizon": 6, "u_min": -2, "u_max": 2}
+WIDE: Any = {"theta_min": [-3, -2], "theta_max": [3, 2]}
+BOX: Any = {"x_min": [-9, -LIMIT], "x_max": [9, LIMIT]}
+KINDS: dict[str, Any] = {
+    "hard states": {**BOX, "theta_min": [-3, -LIMIT], "theta_max": [3, LIMIT]},
+    "hard outputs": {**WIDE, "outputs": OutputBounds([[0, 1]], -LIMIT, LIMIT)},
+    "soft states": {**WIDE, **BOX, "soft": SoftBounds(x=[0, LIMIT], penalty=500)},
+}
+
+
+class Carriage(gym.Env[Any, Any]):
+    """A double integrator whose info says nothing."""
+
+    observation_space = gym.spaces.Box(-20, 20, (2,), np.float64)
+    action_space = gym.spaces.Box(-2, 2, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begin at rest."""
+        super().reset(seed=seed)
+        self.x = np.array([self.np_random.uniform(1.5, 2.5), 0.0])
+        return self.x.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        """Move."""
+        self.x = A @ self.x + B @ np.clip(action, -2, 2)
+        return self.x.copy(), 0.0, False, False, {}
+
+
+def carriage(kind: str) -> tuple[LinearMPC, Any]:
+    names: Any = {"state_names": ["place", "speed"], "units": ["m", "m/s", "N"]}
+    mpc = LinearMPC(LinearModel(A, B, dt=0.2, **names), **COMMON, **KINDS[kind])
+    return mpc, lambda: TimeLimit(StageCost(Carriage(), mpc), 12)
+
+
+def hasty(theta: Any) -> Any:
+    """Reach a speed of half as much again as the limit."""
+    wanted = np.clip(-1.2 * theta[0], -1.5 * LIMIT, 1.5 * LIMIT)
+    return np.clip([(wanted - theta[1]) / 0.2], -2, 2)
+
+
+@pytest.mark.parametrize("kind", ["hard states", "hard outputs"])
+def test_a_policy_that_costs_less_beyond_a_hard_bound_is_refused(kind: str) -> None:
+    mpc, make = carriage(kind)
+    law = mpc.law()
+    played = [evaluate(each, make, range(4)) for each in (law, hasty)]
+    assert played[1].costs.mean() < played[0].costs.mean()
+    found = [excess_of_episodes(mpc, zip(p.observations, p.actions, strict=True)) for p in played]
+    unsafe = [unsafe_columns(0, 0, 0, each) for each in found]
+    mpc_scores, scores = (Scores(p.costs, u) for p, u in zip(played, unsafe, strict=True))
+    tolerance = Tolerance(1e9, bounds=BoundNames.of(mpc))
+    reason = no_worse(scores, mpc_scores, mpc_scores, tolerance).reason
+    assert "a larger excess over the problem's bounds" in reason
+    over = np.abs(played[1].observations[0][:, 1]).max() - LIMIT
+    name, unit = ("speed", " m/s") if kind == "hard states" else ("y[0]", "")
+    assert reason.endswith(f"{name} exceeds its bound by {over:.3g}{unit}")
+    assert not less_safe(unsafe[0], unsafe[0]).any()
+    assert found[0].largest.max() < 1e-3
+
+
+def test_a_soft_bound_costs_what_the_mpc_says_and_is_no_excess() -> None:
+    mpc, make = carriage("soft states")
+    played = [evaluate(each, make, range(4)) for each in (mpc.law(), hasty)]
+    found = [excess_of_episodes(mpc, zip(p.observations, p.actions, strict=True)) for p in played]
+    assert played[1].costs.mean() < played[0].costs.mean()  # without the penalty
+    totals = [(p.costs + each.penalty).mean() for p, each in zip(played, found, strict=True)]
+    assert totals[1] > totals[0]
+    assert not found[1].largest.any()
+
+
+@th.no_grad()
+def push(policy: Any) -> None:
+    """Add to the MPC's input against the position: it drives faster, which costs less."""
+    first_layer(policy).zero_()
+    last_layer(policy).zero_()
+    first_layer(policy)[0, 0, :, 0] = 2.0
+    last_layer(policy)[0, 0, :64] = 2.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) -> None:
+    mpc, make = carriage(kind)
+    options = {"problem": mpc, "networks": "shared", "keep_bounds": False}
+    model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0,
+                 learning_starts=10**6)  # fmt: skip
+    own = evaluate(model, make, range(20, 24))
+    push(model.policy)
+    pushed = evaluate(model, make, range(20, 24))
+    assert pushed.costs.mean() < own.costs.mean()
+    assert max(np.abs(each[:, 1]).max() for each in pushed.observations) > 1.1 * LIMIT
+    model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0,
+                 learning_starts=10**6)  # fmt: skip
+    rule = {"backtrack": False, "by_region": False}
+    guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=4, n_final_starts=4, rule=rule)
+    model.learn(24, callback=[NoActionNoise(), At([6], push), guard])
+    log = evaluate(model, make, range(20, 24))
+    assert guard.decisions[0].verdict == "rejected"
+    named = {"hard states": "speed exceeds its bound by", "hard outputs": "y[0] exceeds its bound"}
+    named["soft states"] = "more than with the MPC: speed exceeds its soft bound by"
+    reason = guard.decisions[0].reason
+    assert named[kind] in reason and (kind == "hard outputs") != ("m/s" in reason)
+    assert max(np.abs(each[:, 1]).max() for each in log.observations) < LIMIT * 1.01
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_page_to_sign_fails_and_names_the_bound_its_excess_and_the_unit(
+    kind: str, tmp_path: Path
+) -> None:
+    mpc, make = carriage(kind)
+    options = {"problem": mpc, "networks": "shared", "keep_bounds": False}
+    model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0)
+    push(model.policy)
+    page = report(model, tmp_path / "page.html", env=make, seeds=range(20, 24)).read_text()
+    failed = [row for row in re.findall("<tr>.*?</tr>", page, re.DOTALL) if ">failed<" in row]
+    says = {"hard outputs": r"y\[0\] exceeds its bound by [\d.]+ with",
+            "hard states": r"speed exceeds its bound by [\d.]+ m/s with",
+            "soft states": r"speed exceeds its soft bound by [\d.]+ m/s with"}  # fmt: skip
+    assert any(re.search(says[kind], row) for row in failed)
+
+
+OHM = 1.0
+BACK = 0.1
+HENRY = 0.25
+DT = 0.05
+
+
+def drive_matrices(ohm: float) -> tuple[Any, Any]:
+    """Return A and B of a motor's speed and current, for a resistance of the winding."""
+    return np.array([[1, DT], [-BACK * DT / HENRY, 1 - ohm * DT / HENRY]]), np.array(
+        [[0], [DT / HENRY]]
+    )
+
+
+class Drive(Carriage):
+    """A DC motor whose winding has 8 % less resistance than the model's: 1.6 % more current."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begin at a speed from which the current goes to its limit."""
+        gym.Env.reset(self, seed=seed)
+        self.x = np.array([self.np_random.uniform(1.0, 1.5), 0.0])
+        return self.x.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        """Turn."""
+        a, b = drive_matrices(0.92 * OHM)
+        self.x = a @ self.x + b @ np.clip(action, -6, 6)
+        return self.x.copy(), 0.0, False, False, {}
+
+
+def drive_mpc(limit: float = 1.0, weight: float = 0.0) -> LinearMPC:
+    return LinearMPC(
+        LinearModel(*drive_matrices(OHM), dt=DT), Q=np.diag([1, weight]), R=[[1e-3]], horizon=3,
+        u_min=-6, u_max=6, x_min=[-9, -limit], x_max=[9, limit],
+        theta_min=[-3, -1.5], theta_max=[3, 1.5],
+    )  # fmt: skip
+
+
+def test_an_mpc_that_rides_its_bound_is_no_veto_and_no_excuse() -> None:
+    mpc = drive_mpc()
+
+    def scores(problem: LinearMPC) -> Scores:
+        played = evaluate(problem.law(), lambda: TimeLimit(StageCost(Drive(), mpc), 50), range(4))
+        excess = excess_of_episodes(mpc, played.pairs)
+        return Scores(played.costs, replace(played, excess=excess).unsafe())
+
+    # Without a weight of the current it stays at its limit for one more step, and costs less.
+    own, cheaper, beyond = map(scores, (drive_mpc(weight=0.01), mpc, drive_mpc(1.02)))
+    assert beyond.costs.mean() < cheaper.costs.mean() < own.costs.mean()
+    steps = own.unsafe[:, 0]
+    largest = own.unsafe[:, 4]
+    np.testing.assert_array_equal(cheaper.unsafe[:, 0] - steps, [1, 1, 0, 1])
+    np.testing.assert_allclose(cheaper.unsafe[:, 4], largest, rtol=1e-3)
+    assert 0.005 < largest.min() <= largest.max() < 0.02
+    tolerance = AcceptanceRule().tolerance(own.costs)
+    assert no_worse(cheaper, own, own, tolerance).accepted
+    assert no_worse(beyond, own, own, tolerance).breaks_limit
+
+
+@pytest.mark.parametrize("weight", [0.05, 0.4])
+def test_a_guard_s_env_that_pays_another_cost_than_training_is_reported(weight: float) -> None:
+    mpc, make = carriage("hard states")
+    paid = replace(mpc, R=[[weight]])
+    model = DDPG("YannPolicy", make(), policy_kwargs={"problem": mpc}, device="cpu", seed=0,
+                 learning_starts=10**6)  # fmt: skip
+    other = {"n_eval_episodes": 4, "n_final_starts": 2}
+    guard = ImprovementGuard(lambda: TimeLimit(StageCost(Carriage(), paid), 12), **other)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        model.learn(120, callback=[NoActionNoise(), guard])
+    told = [each for each in found if "pays something else" in str(each.message)]
+    assert len(told) == (weight != mpc.R[0, 0])

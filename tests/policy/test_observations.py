@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
+from gymnasium import spaces, wrappers
 from gymnasium.wrappers import RescaleObservation, TimeLimit
 from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from observation_samples import FAR, HIGH, LOW, MPC, RANDOM, STEADY, Seen, build, error, law, states
 from sample_plants import LinearPlant
@@ -18,9 +19,14 @@ from sb3_yann import (
     AffineObservation,
     ControlDiagnostics,
     CriticOptions,
+    ImprovementGuard,
     NoActionNoise,
     YannPolicy,
+    headroom,
 )
+from sb3_yann.commissioning.plant import Plant
+from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.evaluation import evaluate
 
 # What an env may show of x = theta, and the map that undoes it.
 SHOWN = {
@@ -247,3 +253,250 @@ def test_a_map_that_does_not_fit_is_named(observation, error, message) -> None:
 def test_a_map_that_means_nothing_is_named(make, error, message) -> None:
     with pytest.raises(error, match=message):
         make()
+
+
+def normalize(frozen: bool = True, n_envs: int = 1, **kwargs) -> VecNormalize:
+    """Return an env of absolute values, normalized by the statistics of a few steps."""
+    plants = [lambda: Seen(lambda x: x + STEADY, 3)] * n_envs
+    env = VecNormalize(DummyVecEnv(plants), **{"norm_reward": False, "clip_obs": np.inf} | kwargs)
+    env.seed(0)
+    env.reset()
+    for _ in range(30):
+        env.step(np.array([env.action_space.sample() for _ in range(n_envs)]))
+    env.training = not frozen
+    return env
+
+
+ABSOLUTE = AffineObservation.deviation(STEADY)
+
+
+@pytest.mark.slow
+def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> None:
+    env = normalize(n_envs=2)
+    model = build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env))
+    obs = env.normalize_obs((states() + STEADY).astype(np.float32))
+    assert error(model, obs, states()) < 1e-5
+    # The guard's own env is one without a VecNormalize, as the training env is below its own.
+    guard = ImprovementGuard(lambda: Seen(lambda x: x + STEADY, 3), n_eval_episodes=5)
+    model.learn(120, callback=[NoActionNoise(), ControlDiagnostics(), guard])
+    seen = law().locate(model.policy.theta(env.normalize_obs(env.get_original_obs())).numpy())
+    assert guard.state.evidence.scores.visits[:, seen].any()
+    evidence = guard.state.evidence
+    assert evidence.starts.mpc.costs == pytest.approx(mpc_costs(evidence.starts.seeds))
+    model.save(tmp_path / "model")
+    loaded = DDPG.load(tmp_path / "model", env=env)
+    np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])
+
+
+def test_statistics_that_change_after_the_model_was_made_are_refused(tmp_path) -> None:
+    env = normalize()
+    model = build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env))
+    model.learn(2, callback=NoActionNoise())
+    kept = copy.deepcopy(env.obs_rms)
+    env.training = True
+    with pytest.raises(ValueError, match="still moves its statistics"):
+        model.learn(2, callback=NoActionNoise())  # the reset has moved them already
+    env.training = False
+    for guard in (NoActionNoise(), ImprovementGuard(lambda: Seen(lambda x: x + STEADY, 3))):
+        with pytest.raises(ValueError, match="others than when the model was made"):
+            model.learn(2, callback=guard)
+    env.obs_rms = kept
+    model.learn(2, callback=NoActionNoise())
+    model.save(tmp_path / "model")
+    DDPG.load(tmp_path / "model", env=env).learn(2, callback=NoActionNoise())
+    env.obs_rms.mean = env.obs_rms.mean + 0.1
+    with pytest.raises(ValueError, match="others than when the model was made"):
+        DDPG.load(tmp_path / "model", env=env).learn(2, callback=NoActionNoise())
+
+
+def test_a_loaded_model_whose_statistics_are_lost_is_named(tmp_path) -> None:
+    env = normalize()
+    plain = Seen(lambda x: x + STEADY, 3)
+    build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env)).save(tmp_path / "model")
+    env.save(tmp_path / "statistics")
+    with pytest.warns(UserWarning, match=r"its env has none.*VecNormalize\.load"):
+        DDPG.load(tmp_path / "model", env=plain)
+    loaded = DDPG.load(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"its env has none.*VecNormalize\.load"):
+        Plant(plain, loaded)
+    venv = VecNormalize.load(tmp_path / "statistics", DummyVecEnv([lambda: plain]))
+    whole = DDPG.load(tmp_path / "model", env=venv)
+    obs = env.normalize_obs((states() + STEADY).astype(np.float32))
+    assert error(whole, obs, states()) < 1e-5
+    theta = Plant(plain, whole)._theta((states()[0] + STEADY).astype(np.float32))
+    np.testing.assert_allclose(theta, states()[0], atol=1e-4)
+    whole.save(tmp_path / "again")
+    with pytest.warns(UserWarning, match="its env has none"):
+        DDPG.load(tmp_path / "again", env=plain)
+
+
+def mpc_costs(seeds) -> list[float]:
+    """Return the cost of the explicit law itself, in float64."""
+    costs = []
+    for seed in seeds:
+        plant = LinearPlant(MPC)
+        cost = 0.0
+        plant.reset(seed=seed)
+        for _ in range(20):
+            cost -= plant.step(law()(plant.x))[1]
+        costs.append(cost)
+    return costs
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: normalize(frozen=False), "still moves its statistics"),
+        (lambda: normalize(norm_reward=True), "normalizes rewards"),
+        (lambda: VecFrameStack(normalize(), 2), "Make VecNormalize the last wrapper"),
+        (lambda: DummyVecEnv([lambda: LinearPlant(MPC)]), "holds no VecNormalize"),
+    ],
+)
+def test_a_vec_normalize_that_cannot_be_undone_is_refused(make, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        AffineObservation.from_vec_normalize(make())
+
+
+def plant(wrap=lambda env: env) -> gym.Env:
+    return wrap(wrappers.TimeLimit(LinearPlant(MPC, 2.0), 20))
+
+
+def built(env, **policy) -> DDPG:
+    options = {"problem": MPC, **policy}
+    return DDPG("YannPolicy", env, policy_kwargs=options, device="cpu", buffer_size=100)
+
+
+class Welford(gym.ObservationWrapper):
+    """Keeps a running mean and variance in arrays of its own."""
+
+    def __init__(self, env) -> None:
+        super().__init__(env)
+        self.mean = np.zeros(3)
+        self.m2 = np.ones(3)
+        self.count = 1
+
+    def observation(self, observation):
+        self.count += 1
+        before = observation - self.mean
+        self.mean = self.mean + before / self.count
+        self.m2 = self.m2 + before * (observation - self.mean)
+        shown = (observation - self.mean) / np.sqrt(self.m2 / self.count)
+        return shown.astype(self.observation_space.dtype)
+
+
+class ScaledActions(gym.ActionWrapper):
+    """Divides actions by their own running size."""
+
+    def __init__(self, env) -> None:
+        super().__init__(env)
+        self.running_size = np.ones(env.action_space.shape)
+
+    def action(self, action):
+        self.running_size = 0.9 * self.running_size + 0.1 * np.abs(action)
+        return action / self.running_size
+
+
+class Fixed(gym.ObservationWrapper):
+    """Shows normalized observations by fixed numbers, and counts its steps."""
+
+    def __init__(self, env) -> None:
+        super().__init__(env)
+        self.mean = np.array([0.5, 0, -1])
+        self.std = np.array([2.0, 1, 3])
+        self.steps = 0
+
+    def observation(self, observation):
+        self.steps += 1
+        return ((observation - self.mean) / self.std).astype(np.float32)
+
+
+MOVING = [wrappers.NormalizeObservation, Welford, ScaledActions]
+
+
+def below_another(env):
+    return wrappers.TransformReward(wrappers.NormalizeObservation(env), lambda reward: reward)
+
+
+@pytest.mark.parametrize("wrap", [*MOVING, below_another])
+def test_statistics_that_move_are_refused_wherever_an_env_is_met(wrap) -> None:
+    match = "by statistics of its own"
+    for env in (plant(wrap), DummyVecEnv([lambda: plant(wrap)] * 2)):
+        with pytest.raises(ValueError, match=match):
+            built(env)
+        with pytest.raises(ValueError, match=match):
+            built(env, observation=AffineObservation.identity(3))
+    model = built(plant())
+    law = MPC.explicit()
+    for policy in (model, model.policy, law, law.plant_input):
+        with pytest.raises(ValueError, match=match):
+            evaluate(policy, lambda: plant(wrap), [0])
+        with pytest.raises(ValueError, match=match):
+            evaluate(policy, plant(wrap), [0])
+    evaluate(lambda observation: np.zeros(2), plant(wrap), [0])  # others may act on what they like
+    with pytest.raises(ValueError, match=match):
+        headroom(MPC, lambda: plant(wrap))
+    with pytest.raises(ValueError, match=match):
+        model.learn(1, callback=[NoActionNoise(), ImprovementGuard(lambda: plant(wrap))])
+
+
+def test_an_env_that_is_set_later_is_looked_at_before_the_policy_acts_on_it() -> None:
+    model = built(plant())
+    model.set_env(plant())
+    model.predict(np.zeros(3, np.float32))
+    other = plant(Welford)
+    model.set_env(other)
+    with pytest.raises(ValueError, match="Welford scales"):
+        model.learn(5, callback=NoActionNoise())
+
+
+def boxed() -> gym.Env:
+    env = LinearPlant(MPC, 2.0)
+    env.observation_space = gym.spaces.Box(np.float32([-4, -5, -6]), np.float32([4, 7, 8]))
+    return wrappers.TimeLimit(env, 20)
+
+
+def test_fixed_scales_are_refused_with_the_map_that_undoes_them() -> None:
+    def rescaled() -> gym.Env:
+        return wrappers.RescaleObservation(boxed(), np.float32(0), np.float32(1))
+
+    with pytest.raises(ValueError, match="policy_kwargs=") as refused:
+        built(rescaled())
+    undo = str(refused.value).split("'observation': ")[1].split("}")[0]
+    undo = eval(undo, {"AffineObservation": AffineObservation})
+    model = built(rescaled(), observation=undo)
+    theta = model.policy.theta(rescaled().reset(seed=3)[0][None]).ravel()
+    np.testing.assert_allclose(theta, boxed().reset(seed=3)[0], atol=1e-5)
+    assert np.isclose(
+        evaluate(model, rescaled, [3]).costs, evaluate(MPC.explicit(), boxed, [3]).costs, rtol=1e-4
+    )
+    with pytest.raises(ValueError, match="RescaleObservation shows other numbers"):
+        evaluate(built(boxed()), rescaled, [3])
+
+
+def test_a_frozen_normalization_is_refused_with_the_map_that_undoes_it() -> None:
+    env = wrappers.NormalizeObservation(plant())
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(env.action_space.sample())
+    env.update_running_mean = False
+    with pytest.raises(ValueError, match=r"AffineObservation\.normalized\(\["):
+        built(env)
+    built(env, observation=AffineObservation.identity(3))
+
+
+def test_stacked_and_late_observations_are_named_unless_they_are_meant() -> None:
+    stacked = VecFrameStack(DummyVecEnv([plant]), 3)
+    with pytest.raises(ValueError, match=r"newest_frame\(3, 3\)"):
+        require_state_shown(stacked, observation_given=False)
+    require_state_shown(stacked, observation_given=True)
+    require_state_shown(VecFrameStack(DummyVecEnv([plant]), 1), observation_given=False)
+    with pytest.warns(UserWarning, match="DelayObservation shows past states"):
+        built(wrappers.DelayObservation(plant(), 2))
+    with pytest.warns(UserWarning, match="StickyAction repeats past inputs"):
+        built(wrappers.StickyAction(plant(), 0.1))
+
+
+def test_wrappers_of_rewards_and_of_fixed_numbers_pass() -> None:
+    require_state_shown(wrappers.NormalizeReward(plant()), observation_given=False)
+    require_state_shown(wrappers.RecordEpisodeStatistics(plant()), observation_given=False)
+    require_state_shown(Fixed(plant()), observation_given=False)

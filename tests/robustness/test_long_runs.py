@@ -1,7 +1,6 @@
 """A long training under the guard holds no more memory, files or threads as it goes on.
 
-``LONG_STEPS`` says how many steps it takes (40,000 by default).
-"""
+``LONG_STEPS`` says how many steps it takes (40,000 by default)."""
 
 from __future__ import annotations
 
@@ -14,6 +13,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_yann import ImprovementGuard, NoActionNoise
+from sparse_qp import FEATURES, worst_difference
 
 STEPS = int(os.environ.get("LONG_STEPS", 40_000))
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -48,3 +48,22 @@ def test_nothing_grows(tmp_path) -> None:
     assert memory[-5:].mean() < 1.05 * memory[8:12].mean()
     assert files[-1] <= files[10]
     assert threads[-1] <= threads[10]
+
+
+CASES = [*(((name,), 200) for name in FEATURES), (FEATURES, 100)]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("features", "count"), CASES, ids=lambda each: str(each))
+def test_random_problems_agree_with_sparse_programs(
+    features: tuple[str, ...], count: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = [worst_difference(features, seed, points=4) for seed in range(count)]
+    worst = max(range(count), key=lambda seed: found[seed][0])
+    points = sum(each[1] for each in found)
+    with capsys.disabled():
+        print(
+            f"\n{' + '.join(features)}: {count} problems, {points} points, worst "
+            f"{found[worst][0]:.1e} half-ranges (seed {worst})"
+        )
+    assert points > 2 * count and found[worst][0] < 1e-8
