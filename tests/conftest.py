@@ -1,7 +1,5 @@
 """What every test runs with, and the problems that several of them go through."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 

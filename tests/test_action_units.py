@@ -1,7 +1,5 @@
 """Plant units and deviations: what an env takes follows from its bounds; deviations are named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """No circle of files, no import against the direction of the house, walls that hold at run time."""
 
-from __future__ import annotations
-
 import ast
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Files of arrays: what was written comes back to the bit, all else is refused in little memory."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """No action noise, ever; and the scalars that tensorboard shows."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import gymnasium as gym

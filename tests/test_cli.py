@@ -1,7 +1,5 @@
 """The command `sb3-yann`: what it prints and writes, and what its exit codes say."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What counts as no worse: less safe episodes, the worst starts, the mean cost."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is installed: the wheel's contents, its metadata, and how the packages import."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The examples in the docstrings run; what is public has one, and names its parameters."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """An episode that ends sooner is worse, unless its end is a success."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

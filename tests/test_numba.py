@@ -1,7 +1,5 @@
 """The stamp of kept machine code covers every file with compiled functions."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plans are optimal, within bounds, from every start of a batch."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Logs are cut where time is missing, and nothing else is lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

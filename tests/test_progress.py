@@ -1,7 +1,5 @@
 """What takes long is shown on stderr: a bar for a person, few lines in a file, else nothing."""
 
-from __future__ import annotations
-
 import io
 import sys
 from typing import Any

@@ -1,7 +1,5 @@
 """The Python of the README and of the pages runs as it stands, and their links lead somewhere."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

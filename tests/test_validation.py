@@ -1,7 +1,5 @@
 """Checks of numbers, flags and choices: what they take, what they refuse, and what they say."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is given wrongly is named at the door: what it was, what was expected, what to do."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

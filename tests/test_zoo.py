@@ -1,7 +1,5 @@
 """RL Zoo trains, continues and replays our policy from the hyperparameters that are shipped."""
 
-from __future__ import annotations
-
 import csv
 import os
 import subprocess

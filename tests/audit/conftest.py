@@ -1,7 +1,5 @@
 """What `headroom` and `improve` say of an env does not depend on how long they fit models."""
 
-from __future__ import annotations
-
 import pytest
 
 from improvement_samples import quick

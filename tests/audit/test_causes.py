@@ -1,7 +1,5 @@
 """The audit against every wrapper that changes what rewards mean, and when it speaks."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import warnings

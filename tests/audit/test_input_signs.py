@@ -1,7 +1,5 @@
 """An input that moves the env against the model is reported, and nothing else is."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -1,7 +1,5 @@
 """States that an env shows in another order than the model has are told, and nothing else is."""
 
-from __future__ import annotations
-
 import warnings
 
 import gymnasium as gym

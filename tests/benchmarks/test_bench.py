@@ -1,7 +1,5 @@
 """The quick form of the benchmark: the command itself, from its sections to its report."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Twins here are of polynomials, and improvements short: every batch makes both."""
 
-from __future__ import annotations
-
 import pytest
 
 from improvement_samples import quickest

@@ -1,7 +1,5 @@
 """On a plant only accepted policies act; a kill loses nothing; faults give the plant to the MPC."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from types import SimpleNamespace

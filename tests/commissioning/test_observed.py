@@ -1,7 +1,5 @@
 """Twins with an observer of the disturbance: the policy, the watchdog and the plant's batches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG

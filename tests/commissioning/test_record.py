@@ -1,7 +1,5 @@
 """A record that was changed is refused; one that a kill cut off goes on."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """The watchdog is quiet on the plant that its twin describes, and barks at another."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The discounted linear-quadratic formulas satisfy the equations they stand for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The disturbance observer estimates what nobody measures, and forgets it at a reset."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

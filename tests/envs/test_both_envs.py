@@ -1,7 +1,5 @@
 """What the reactor and the pendulum have in common: starts, seeds, the problem they stand for."""
 
-from __future__ import annotations
-
 import copy
 import os
 import random

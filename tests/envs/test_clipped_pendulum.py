@@ -1,7 +1,5 @@
 """The clipped pendulum: Gymnasium's simulator, observed as a state and started near upright."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import control

@@ -1,7 +1,5 @@
 """The reactor: its equations, its model, its limit, and how an episode starts and ends."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import control

@@ -1,7 +1,5 @@
 """PC-Gym's plants: its own steps and metric, without the traps of its episodes."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 

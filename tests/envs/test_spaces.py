@@ -1,7 +1,5 @@
 """A ProblemBox is a Box that hands its problem to whoever asks, wherever it has traveled."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import pickle

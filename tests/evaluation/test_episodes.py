@@ -1,7 +1,5 @@
 """Seeded, paired episodes, and what is printed and drawn of them."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Tables, closed loops, surfaces, and what a policy does in each region: what is drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

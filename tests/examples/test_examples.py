@@ -1,7 +1,5 @@
 """The examples run from any folder, print their table and save their picture; their plants."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """The learning tables hold what their runs do, and every plant shows the theta of its MPC."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

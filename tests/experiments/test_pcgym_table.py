@@ -1,7 +1,5 @@
 """The table of PC-Gym's plants: its cells by hand, and what the controllers do, if it is there."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np

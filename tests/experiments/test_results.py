@@ -1,7 +1,5 @@
 """The figures of the tables by hand, and the report as a whole."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re

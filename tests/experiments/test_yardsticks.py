@@ -1,7 +1,5 @@
 """The yardsticks start where they claim to, and learn."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import gymnasium

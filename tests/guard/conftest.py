@@ -1,7 +1,5 @@
 """The guard's plants pay another reward than the MPC's cost, of which its audit warns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

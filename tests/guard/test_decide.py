@@ -1,7 +1,5 @@
 """What becomes of a candidate: whole, in part, on new starts, at the end, or not at all."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whatever happens to the actor, what does not improve is taken back, bit for bit."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The guard changes the actor and nothing else, and goes on after a stop bit for bit."""
 
-from __future__ import annotations
-
 import signal
 from contextlib import suppress
 from functools import partial

@@ -1,7 +1,5 @@
 """Bad input, a simulator or a training that does not fit: an error that names it, or a warning."""
 
-from __future__ import annotations
-
 import warnings
 from functools import partial
 from typing import Any

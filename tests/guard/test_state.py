@@ -1,7 +1,5 @@
 """What was decided can be read, saved, drawn and shown, and a stopped run goes on from there."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 from functools import partial

@@ -1,7 +1,5 @@
 """Actor and critic in SB3: their networks, rates and optimizers, and the critic's warm-up."""
 
-from __future__ import annotations
-
 import copy
 
 import cloudpickle

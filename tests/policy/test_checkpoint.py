@@ -1,7 +1,5 @@
 """Checkpoints of an actor: copies, mixtures, shares, and when one has diverged."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from typing import Any

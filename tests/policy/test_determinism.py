@@ -1,7 +1,5 @@
 """Trainings with the same seed are the same, bit for bit, in whatever process they run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """SAC, TQC and PPO: the most likely action is the MPC's, and what is drawn around it is small."""
 
-from __future__ import annotations
-
 import warnings
 from importlib.resources import files
 

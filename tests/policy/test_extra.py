@@ -1,7 +1,5 @@
 """Extra signals: what networks see, and neither the law nor its value."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from typing import Any

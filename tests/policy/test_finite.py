@@ -1,7 +1,5 @@
 """What is no finite number: named at once, not learnt from, and met by the law."""
 
-from __future__ import annotations
-
 import copy
 import warnings
 from typing import Any

@@ -1,7 +1,5 @@
 """Policies of problems with each feature start exactly, with a critic that is theirs."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Maps from observations to theta: exact through SB3, saved with a model, refused where wrong."""
 
-from __future__ import annotations
-
 import copy
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """A policy on an env in plant units is the MPC, exactly, and names deviations."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The policy in SB3: exact at the start, fed by problems of every kind, saved and loaded."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import subprocess

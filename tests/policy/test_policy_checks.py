@@ -1,7 +1,5 @@
 """Spaces, environments and policy_kwargs that mean nothing are refused by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any

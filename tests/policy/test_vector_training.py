@@ -1,7 +1,5 @@
 """Several envs at once, in this process or in others: callbacks, time limits, ends of episodes."""
 
-from __future__ import annotations
-
 import copy
 
 import gymnasium as gym

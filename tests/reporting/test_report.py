@@ -1,7 +1,5 @@
 """The report: what it says is so, what it cannot say it leaves out, and it loads nothing."""
 
-from __future__ import annotations
-
 import copy
 import re
 from dataclasses import replace

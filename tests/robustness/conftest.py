@@ -1,7 +1,5 @@
 """Fuzzers, faults and endurance: `make test-all` runs them, `make test` leaves them out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

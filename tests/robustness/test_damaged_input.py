@@ -5,8 +5,6 @@ more. Anything else than a documented error, or exactly what was written, is a f
 exception, another law, more than ten seconds, or numbers that are not finite.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

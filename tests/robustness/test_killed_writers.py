@@ -4,8 +4,6 @@ The writer goes on and on in a process of its own, in turn with one of two conte
 random moment, ``KILLS=200`` times (10 by default). Needs a system that forks.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal

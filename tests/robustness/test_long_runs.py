@@ -2,8 +2,6 @@
 
 ``LONG_STEPS`` says how many steps it takes (40,000 by default)."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

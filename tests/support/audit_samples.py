@@ -1,7 +1,5 @@
 """Rewards and observations that do not mean what the problem says, and what an audit finds."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 

@@ -1,7 +1,5 @@
 """Policies to export, and their C code compiled and called."""
 
-from __future__ import annotations
-
 import copy
 import ctypes
 import shutil

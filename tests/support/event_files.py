@@ -1,7 +1,5 @@
 """Reads what a run has written for tensorboard."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator

@@ -1,7 +1,5 @@
 """Runs lines or a module in a Python process of their own, with the import path of this one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

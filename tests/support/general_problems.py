@@ -1,7 +1,5 @@
 """Problems with references, disturbances, rates, soft bounds and invariant terminal sets."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """A plant whose best input in each region is known, and what the guard's tests do to its actor."""
 
-from __future__ import annotations
-
 import copy
 import random
 from collections.abc import Callable

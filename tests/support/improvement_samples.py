@@ -1,7 +1,5 @@
 """Small plants that a policy can be improved on, and settings that make it quick."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 from typing import Any
 

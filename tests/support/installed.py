@@ -3,8 +3,6 @@
 python tests/support/installed.py
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from importlib.resources import files
 

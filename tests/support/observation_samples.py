@@ -1,7 +1,5 @@
 """An env that shows functions of theta, and models that are told how to read them."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import gymnasium as gym

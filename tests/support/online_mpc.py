@@ -6,8 +6,6 @@ input ranges and of the box. Nothing but the fields of `LinearMPC` is used; the 
 of the optimality conditions of its own small program.
 """
 
-from __future__ import annotations
-
 import daqp
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The regions of a law: what lies in them, on their facets, and the same ones in another order."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

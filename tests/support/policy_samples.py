@@ -1,7 +1,5 @@
 """Small policies, and what the tests of them do to their models."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

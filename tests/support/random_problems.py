@@ -1,7 +1,5 @@
 """Random problems with all parts in and out, and what a general-purpose solver says of them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What an online QP answers, and how far from it another answer is."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from online_mpc import OnlineMPC

@@ -6,8 +6,6 @@ stopped. It lies between two steps: callbacks see a step before its transition i
 from.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import sys

@@ -1,7 +1,5 @@
 """Laws to build networks from, and points to try them at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

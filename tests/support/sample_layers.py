@@ -1,7 +1,5 @@
 """YANN layers with random weights, and a few steps of training."""
 
-from __future__ import annotations
-
 import pytest
 import torch as th
 

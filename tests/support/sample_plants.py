@@ -1,7 +1,5 @@
 """Linear plants with the problems they stand for, feasible states, and a record of an episode."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Small MPC problems that stress one thing each, and points to try their laws at."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from functools import cache

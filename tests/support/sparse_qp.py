@@ -4,8 +4,6 @@ Nothing here asks the package for a matrix: predictions, targets, terminal cost 
 from the numbers that the constructor of the problem gets.
 """
 
-from __future__ import annotations
-
 import contextlib
 import warnings
 from dataclasses import dataclass, field

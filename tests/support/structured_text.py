@@ -1,7 +1,5 @@
 """Runs the subset of Structured Text that an export writes, as Python."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """A small plant that its linear model does not describe, its MPC, and logs of it."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

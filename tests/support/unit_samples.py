@@ -1,7 +1,5 @@
 """A linear plant in its own units, or in others, and the MPC of it."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import TimeLimit

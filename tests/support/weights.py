@@ -1,7 +1,5 @@
 """Where the weights are that an actor or a critic learns: tests ask here, and nowhere else."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch as th

@@ -1,7 +1,5 @@
 """A simulator is linearized where it rests; what cannot be is refused with the reason."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

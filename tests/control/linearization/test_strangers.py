@@ -1,7 +1,5 @@
 """Simulators of strangers: adaptive integrators, MuJoCo's interface, plants that forget."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

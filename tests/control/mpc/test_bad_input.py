@@ -1,7 +1,5 @@
 """Bad input is an error that names the argument; what arguments mean together is told."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Blocks, previews, mixed bounds, prices and bounds that change at run time."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """No closed loop leaves an invariant terminal set; hard bounds can be kept in the kept set."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import linprog

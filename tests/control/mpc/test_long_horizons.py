@@ -1,7 +1,5 @@
 """Unstable plants over long horizons lose no digits, and where they would, an error says so."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A problem in plant units solves the same problem as its deviations, about zero."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import pickle

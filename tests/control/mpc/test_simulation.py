@@ -1,7 +1,5 @@
 """An MPC from a simulator alone, and the closed loop on a model."""
 
-from __future__ import annotations
-
 import itertools
 import pickle
 import warnings
