@@ -10,7 +10,7 @@ chosen here, once, by hand.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -176,8 +176,14 @@ def ph() -> TextbookPlant:
     return TextbookPlant(advance, model, *boxes, (1.0,), weights, (0,), ((5.0,), (9.0,)))
 
 
-def van_de_vusse() -> TextbookPlant:
-    """Return a reactor whose product first falls when it is to rise."""
+def van_de_vusse(
+    x: Sequence[float] = (2.1402, 1.0903, 387.34, 386.06), flow: float = 14.19
+) -> TextbookPlant:
+    """Return a reactor whose product first falls when it is to rise.
+
+    Its model is that of the state x, where it rests at a ``flow`` per hour: by default the peak of
+    the product, where no input moves it for long.
+    """
 
     def slope(x: Array, u: Array) -> Array:
         a, b, T, jacket = x.tolist()
@@ -195,9 +201,7 @@ def van_de_vusse() -> TextbookPlant:
         )
 
     dt = 1 / 60  # h
-    x = [2.1402, 1.0903, 387.34, 386.06]
-    u = [14.19, -1113.5]
-    model = LinearModel.from_dynamics(slope, x, u, dt)
+    model = LinearModel.from_dynamics(slope, [*x], [flow, -1113.5], dt)
     weights = {"Q": np.diag([0, 100, 0, 0]), "R": np.diag([1e-3, 1e-7]), "horizon": 2}
     boxes = (0.5, 0.3, 370.0, 365.0), (4.5, 1.5, 405.0, 405.0), (3.0, -9000.0), (35.0, 0.0)
     spread = (0.2, 0.05, 1.0, 1.0)

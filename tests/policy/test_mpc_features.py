@@ -216,6 +216,18 @@ def test_what_is_asked_for_beyond_its_range_counts_as_at_its_end_in_every_form(
             np.testing.assert_array_equal(found, np.asarray(answer(ends)), form)
 
 
+def test_set_points_need_not_lie_about_the_operating_point() -> None:
+    model = LinearModel([[0.9]], [[0.5]], 1, [10], [3])
+    weights = {"Q": [[1]], "R": [[1]], "horizon": 3}
+    box = {"u_min": 1, "u_max": 6, "theta_min": 5, "theta_max": 15}
+    mpc = LinearMPC(model, **weights, **box, tracking=Tracking([0], 11, 12))
+    policy = disturbed(mpc, 0.0, law="online")
+    at = np.array([[10.5, 12.0]])
+    np.testing.assert_allclose(policy.predict(at)[0], mpc.law("online").plant_input(at), atol=1e-6)
+    further = mpc.law("online").plant_input(at + np.array([0, 5]))
+    np.testing.assert_array_equal(further, mpc.law("online").plant_input(at))
+
+
 SHAPES = pytest.mark.parametrize(
     "options", [{"law": "online"}, {"networks": "shared"}, {"law": "online", "networks": "shared"}]
 )

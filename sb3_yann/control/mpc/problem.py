@@ -201,12 +201,15 @@ class MPCProblem(ReadOnlyArrays):
     def clamped(self) -> Array | None:
         """The range (2, n_theta) of what theta asks for, in deviations; None where that is nothing.
 
-        It is finite for references and for bounds that change at run time. Laws and policies take
-        what lies beyond as at its end. States and disturbances are what they are: they go on.
+        It is finite for references and for bounds that change at run time, and holds the operating
+        point, at which the law has a value. Laws and policies take what lies beyond as at its end.
+        States and disturbances are what they are: they go on.
         """
         asked = np.r_[self.layout.reference, self.layout.limits]
         found = np.full((2, self.n_theta), np.inf) * [[-1.0], [1.0]]
-        found[:, asked] = self.deviations.theta_min[asked], self.deviations.theta_max[asked]
+        rest = self.theta_rest[asked]
+        found[0, asked] = np.minimum(self.deviations.theta_min[asked], rest)
+        found[1, asked] = np.maximum(self.deviations.theta_max[asked], rest)
         return found if np.any(np.isfinite(found)) else None
 
     @cached_property
