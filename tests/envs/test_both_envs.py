@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from numpy.typing import NDArray
 
 import sb3_yann_envs
-from sb3_yann_envs import ProblemBox
+from sb3_yann_envs import ProblemBox, clipped_pendulum, cstr
 from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
 from sb3_yann_envs.cstr import CSTREnv
 
@@ -66,6 +66,87 @@ def test_the_global_random_states_are_untouched(name: str) -> None:
 def test_a_step_before_the_first_reset_is_refused(name: str) -> None:
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"env.reset\(\) before env.step\(\)"):
         ENVS[name]().step(act(0.0))
+
+
+@pytest.mark.parametrize(
+    ("plant", "bound", "tried", "rel"),
+    [
+        (cstr, 55.0, (-20.0, 33.0, 500.0, -np.inf), 1e-12),
+        (clipped_pendulum, 2.0, (0.5, -1.3, 10.0, -np.inf), 1e-6),
+    ],
+)
+def test_the_cost_is_that_of_the_state_before_the_step_and_the_clipped_input(
+    plant: Any, bound: float, tried: tuple[float, ...], rel: float
+) -> None:
+    env = ENVS[plant.__name__.split(".")[-1]]()
+    _, info = env.reset(seed=3)
+    for u in tried:
+        before = info["state"]
+        applied = np.clip([u], -bound, bound)
+        _, reward, terminated, truncated, info = env.step(act(u))
+        expected = before @ plant.Q @ before + applied @ plant.R @ applied
+        assert info["cost"] == pytest.approx(expected, rel=rel)
+        assert reward == -info["cost"] and isinstance(reward, float)
+        assert (terminated, truncated, info["violation"]) == (False, False, False)
+
+
+REACH = np.array([clipped_pendulum.START_ANGLE, clipped_pendulum.START_SPEED])
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("cstr", cstr.START_LOW, cstr.START_HIGH), ("clipped_pendulum", -REACH, REACH)],
+)
+def test_random_starts_fill_their_box(name: str, low: Any, high: Any) -> None:
+    env = ENVS[name]()
+    starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(500)])
+    assert (starts >= low).all() and (starts <= high).all()
+    assert (np.ptp(starts, axis=0) / (high - low) > 0.97).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("cstr", {"state": [0.0, 0.0, 0.0]}, r"must have shape \(4,\)"),
+        ("cstr", {"state": [[0.0, 0.0, 0.0, 0.0]]}, r"must have shape \(4,\)"),
+        ("cstr", {"state": [0.0, np.nan, 0.0, 0.0]}, "C_B deviation must be in .* got nan"),
+        ("cstr", {"state": [0.0, 0.0, 0.0, np.inf]}, "T deviation must be in"),
+        ("cstr", {"state": [0.0, 0.0, 0.0, 5.1]}, r"T deviation must be in \[-70, 5\], got 5.1"),
+        ("cstr", {"state": [-0.09, 0.0, 0.0, 0.0]}, "C_A deviation must be in"),
+        ("cstr", {"start": [0.0, 0.0, 0.0, 0.0]}, r"unknown keys \['start'\]"),
+        ("clipped_pendulum", {"state": 0.0}, r"must have shape \(2,\)"),
+        ("clipped_pendulum", {"state": [0.0, 0.0, 0.0]}, r"must have shape \(2,\)"),
+        ("clipped_pendulum", {"state": [np.nan, 0.0]}, "theta must be in .* got nan"),
+        ("clipped_pendulum", {"state": [3.2, 0.0]}, "theta must be in"),
+        ("clipped_pendulum", {"state": [0.0, -8.1]}, r"theta_dot must be in \[-8, 8\], got -8.1"),
+    ],
+)
+def test_a_bad_start_is_refused_with_its_reason(name: str, options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ENVS[name]().reset(options=options)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (act(np.nan), "got array.*nan"),
+        (np.zeros(2), r"shape \(1,\)"),
+        (np.zeros((1, 1)), r"shape \(1,\)"),
+        (0.0, r"shape \(1,\)"),
+        ([], r"shape \(1,\)"),
+    ],
+)
+def test_a_bad_action_is_refused_and_leaves_the_state_alone(
+    name: str, action: Any, message: str
+) -> None:
+    env = ENVS[name]()
+    twin = ENVS[name]()
+    for each in (env, twin):
+        each.reset(seed=4)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    np.testing.assert_array_equal(env.step(act(1.0))[0], twin.step(act(1.0))[0])
 
 
 # ---- Both environment checkers accept both environments, but for one recommendation each ----
