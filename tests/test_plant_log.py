@@ -294,6 +294,9 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(
         Log.from_csv(path, ["T [C]"], ["valve"], dt=10)
     with pytest.raises(TypeError, match="time_unit = 3 must be a str"):
         model.named(time_unit=3)
+    assert model.named(["T"], ["valve"], time_unit="s") == model
+    with pytest.raises(ValueError, match=r"time_unit = 'min', but dt is 10 s"):
+        model.named(time_unit="min")
 
 
 @pytest.mark.parametrize(("dt", "unit", "found"), [(120, "", "s"), (2, "min", "min")])

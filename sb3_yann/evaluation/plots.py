@@ -626,24 +626,31 @@ def plot_gains(runs: Runs, axes: Axes | None = None) -> Axes:
 
 
 def plot_decisions(decisions: Sequence[Any], axes: Axes | None = None) -> Axes:
-    """Draw each candidate's mean cost by the verdict on it, the accepted policy's and the MPC's.
+    """Draw what each candidate changes of the MPC's mean cost, and what the accepted policy does.
 
-    A candidate far beyond the accepted policies, or without a cost, is drawn at the edge. Of no
-    decisions a note says so.
+    The verdict is the mark; pale ones are estimated from a part of the starts. The line is what
+    an accepted policy costs on all of them. A candidate far beyond the accepted policies, or
+    without a cost, is drawn at the edge. Of no decisions a note says so.
     """
     axes = axes_or_new(axes, 8.0, 3.8)
-    axes.set(xlabel="training episodes", ylabel="mean cost")
+    axes.set(xlabel="training episodes", ylabel="change of the mean cost\nagainst the MPC (%)")
     if not decisions:
         axes.text(0.5, 0.5, "no candidate was tried", ha="center", transform=axes.transAxes)
         return axes
     episodes = np.array([each.episode for each in decisions])
-    costs, accepted, mpc = (
-        np.array([getattr(each, name) for each in decisions], np.float64)
-        for name in ("candidate_cost", "accepted_cost", "mpc_cost")
+    mpc = np.array([each.mpc_cost for each in decisions], np.float64)
+    costs, accepted = (
+        100 * (np.array([getattr(each, name) for each in decisions]) - mpc) / (np.abs(mpc) + 1e-300)
+        for name in ("candidate_cost", "accepted_cost")
     )
-    bottom, top = _range_of_costs(costs, accepted, mpc)
-    axes.step(episodes, accepted, where="post", color=COLORS[0], label="accepted policy")
-    axes.plot(episodes, mpc, color="black", linestyle="--", linewidth=1.2, label="MPC")
+    in_part = np.array([each.played[0] < each.played[2] for each in decisions])
+    bottom, top = _range_of_costs(costs, accepted)
+    whole = [i if each.played[1] >= each.played[2] else -1 for i, each in enumerate(decisions)]
+    latest = np.maximum.accumulate(whole)
+    known = np.where(latest >= 0, accepted[latest], np.nan)
+    axes.step(episodes, known, where="post", color=COLORS[0], label="accepted policy")
+    axes.axhline(0, color="black", linestyle="--", linewidth=1.2, label="MPC")
+    shown = np.clip(np.nan_to_num(costs, nan=np.inf), bottom, top)
     kinds = np.array(
         [
             each.verdict if each.verdict != "rejected" else f"rejected{each.restored:d}"
@@ -658,9 +665,12 @@ def plot_decisions(decisions: Sequence[Any], axes: Axes | None = None) -> Axes:
     ):
         own = kinds == kind
         if own.any():
-            shown = np.clip(np.nan_to_num(costs[own], nan=np.inf), bottom, top)
             style: dict[str, Any] = {"color": color, "markersize": 6, "clip_on": False}
-            axes.plot(episodes[own], shown, marker, label=label, **style)
+            for which, alpha in ((own & ~in_part, 1.0), (own & in_part, 0.35)):
+                name = label if alpha == 1 else "_nolegend_"
+                axes.plot(episodes[which], shown[which], marker, label=name, alpha=alpha, **style)
+    if in_part.any():
+        axes.plot([], [], "o", color="0.2", alpha=0.35, label="pale: from a part\nof the starts")
     if beyond := int(np.sum(~((costs >= bottom) & (costs <= top)))):
         axes.plot([], [], " ", label=f"({beyond} beyond the scale,\ndrawn at its edge)")
     axes.set_ylim(bottom, top)
@@ -670,12 +680,9 @@ def plot_decisions(decisions: Sequence[Any], axes: Axes | None = None) -> Axes:
     return axes
 
 
-def _range_of_costs(costs: Array, accepted: Array, mpc: Array) -> tuple[float, float]:
-    """Return the range of what was accepted, and of the candidates within two widths of it."""
-    known = np.concatenate([accepted, mpc])
-    known = known[np.isfinite(known)]
-    if not known.size:
-        known = costs[np.isfinite(costs)] if np.isfinite(costs).any() else np.zeros(1)
+def _range_of_costs(costs: Array, accepted: Array) -> tuple[float, float]:
+    """Return the range of 0 and what was accepted, and of the candidates within two widths."""
+    known = np.append(accepted[np.isfinite(accepted)], 0.0)
     low = float(known.min())
     high = float(known.max())
     width = max(high - low, 0.02 * max(abs(low), abs(high)), 1e-12)

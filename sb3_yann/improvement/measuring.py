@@ -470,6 +470,9 @@ class _Search:
     def figures(self, note: str) -> Headroom:
         """Return the figures."""
         base = self.base.costs
+        if ended := int(self.base.terminated.sum()):
+            which = f"{ended} of {len(base)} episodes of the MPC are ended by the env"
+            note = f"{which}: their costs are those of fewer steps. {note}".strip()
         observer, model = (_whole(self.fair.get(name), base) for name in ("observer", "model"))
         best = self.best
         total, offset, known = (gain(base, each) for each in (best, observer, model))

@@ -132,6 +132,18 @@ def refuse_another_gamma(algorithm: BaseAlgorithm, gamma: float) -> NoReturn:
     )
 
 
+def warn_of_another_gamma(algorithm: BaseAlgorithm, gamma: float) -> None:
+    """Warn where a model is loaded with another discount than it was saved with."""
+    saved = vars(algorithm).get("critic_gamma", gamma)
+    vars(algorithm)["critic_gamma"] = gamma
+    if saved != gamma:
+        warn(
+            f"gamma = {gamma:g}, but the critic of this file is the value for {saved:g}: learning "
+            "goes on from it, and it is wrong at first. A new model with the problem and this "
+            "gamma has the exact one."
+        )
+
+
 def require_sb3_kwargs(given: dict[str, Any], own: list[str], theirs: tuple[str, ...]) -> None:
     """Raise unless all keywords that are not the policy's ``own`` are SB3's, and make sense.
 

@@ -138,6 +138,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         self.first_obs_checked = False  # at the first observation
         self.gamma = check_discount(checks.as_gamma(gamma, algorithm))
         self.gamma_given = gamma is not None
+        if algorithm is not None:
+            checks.warn_of_another_gamma(algorithm, self.gamma)
         self.lr_mult = {
             "actor": check_range("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
             "critic": check_range("critic_lr_mult", critic_lr_mult, 0, np.inf, "[)"),

@@ -369,8 +369,8 @@ def guard_part(subject: Subject) -> Part:
     ]
     if state.decisions:
         caption = (
-            "Mean cost of each candidate by the verdict on it, of the accepted policy and of the "
-            f"MPC, over the guard's {len(state.settings['seeds'])} starts."
+            "What each candidate, by the verdict on it, and the accepted policy change of the "
+            f"MPC's mean cost on the same starts, of the guard's {len(state.settings['seeds'])}."
         )
         parts += [picture(partial(plot_decisions, state.decisions), caption)]
         parts += _decisions(state.decisions)

@@ -334,10 +334,16 @@ def drawn(axes) -> dict[str, tuple[list[float], list[float]]]:
 
 def test_each_candidate_is_drawn_by_its_verdict() -> None:
     seen = drawn(plot_decisions(DECISIONS))
-    assert seen["accepted policy"] == ([1, 2, 3, 4, 5], [9.5, 9.4, 9.4, 9.4, 9.4])
-    assert seen["MPC"][1] == [10.0] * 5
-    assert seen["accepted"] == ([1], [9.5]) and seen["accepted in part"] == ([2], [9.6])
-    assert seen["refused, plays on"] == ([3], [9.7])
+    assert seen["accepted policy"][0] == [1, 2, 3, 4, 5]
+    np.testing.assert_allclose(seen["accepted policy"][1], [-5, -6, -6, -6, -6])
+    assert seen["MPC"][1] == [0, 0]
+    for name, episode, change in (
+        ("accepted", 1, -5), ("accepted in part", 2, -4), ("refused, plays on", 3, -3)
+    ):  # fmt: skip
+        np.testing.assert_allclose(seen[name], ([episode], [change]))
+    assert not any(name.startswith("pale") for name in seen)
+    estimated = dataclasses.replace(DECISIONS[0], played=(5, 5, 40))
+    assert any(name.startswith("pale") for name in drawn(plot_decisions([estimated])))
 
 
 def test_a_candidate_far_beyond_is_drawn_at_the_edge_and_counted() -> None:

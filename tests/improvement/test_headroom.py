@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from functools import cache, partial
 
 import gymnasium as gym
@@ -123,6 +124,19 @@ def test_it_takes_no_step_more_than_it_may() -> None:
     assert found.observer_played is not None and "were too few to go on" in found.report()
     with pytest.raises(ValueError, match="max_steps = 100 are too few for 5 episodes of the MPC"):
         headroom(heater(), Counted, n_starts=5, max_steps=100)
+
+
+class Ending(Heater):
+    """Ends some of its episodes, as a plant that trips."""
+
+    def step(self, action):
+        shown, reward, _, over, info = super().step(action)
+        return shown, reward, bool(self.t == 20 and self.later > 0), over, info
+
+
+def test_episodes_that_the_env_ends_are_counted() -> None:
+    said = headroom(heater(), Ending, n_starts=6, max_steps=NO_PLANS).report()
+    assert re.search("[1-5] of 6 episodes of the MPC are ended by the env", said)
 
 
 def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:

@@ -175,9 +175,11 @@ def test_a_discount_that_is_set_after_the_policy_was_built_is_refused(tmp_path) 
     for act in (lambda: model.learn(2), lambda: model.predict(observation)):
         with pytest.raises(ValueError, match=r"gamma of the DDPG was set to 0\.8 after its policy"):
             act()
-    loaded = DDPG.load(tmp_path / "model", custom_objects={"gamma": 0.8})
-    assert loaded.policy.gamma == 0.8
-    loaded.predict(observation)
+    for given in ({"custom_objects": {"gamma": 0.8}}, {"gamma": 0.8}):
+        with pytest.warns(UserWarning, match=r"gamma = 0\.8, but the critic .* for 0\.95"):
+            loaded = DDPG.load(tmp_path / "model", **given)
+        assert loaded.policy.gamma == 0.8
+        loaded.predict(observation)
     own = DDPG("YannPolicy", "CSTR-v0", policy_kwargs={"gamma": 0.9}, device="cpu")
     own.gamma = 0.8  # the policy's own was chosen
     own.predict(observation)

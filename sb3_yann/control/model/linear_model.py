@@ -380,7 +380,7 @@ class LinearModel(LinearSystem):
         units : mapping of name to unit, or sequence of str
             Of states and inputs.
         time_unit : str, optional
-            Of ``dt``.
+            Of ``dt``, where it has none yet: ValueError for another one.
         """
         if past := past_inputs(self):
             state_names, units = completed(self, past, state_names, input_names, units)
@@ -391,7 +391,13 @@ class LinearModel(LinearSystem):
         }
         if time_unit is not None:
             given["time_unit"] = time_unit
-        return type(self)(**{**vars(self), **given})
+        found = type(self)(**{**vars(self), **given})
+        if self.time_unit not in ("", found.time_unit):
+            raise ValueError(
+                f"time_unit = {time_unit!r}, but dt is {self.step_length}: another unit would need "
+                "another dt. Make the model, or the Log it is identified from, with both of them."
+            )
+        return found
 
     def about_zero(self) -> Self:
         """Return the model without an operating point: what it describes are deviations."""

@@ -74,9 +74,19 @@ def _preview(name: str, value: int) -> int:
 
 def _outputs(name: str, C: Outputs, symbol: str, lower: Given, upper: Given) -> dict[str, Array]:
     """Return the fields of a group of outputs ``C x`` with bounds."""
-    rows = check.check_output_rows(name, C)
+    named = isinstance(C, list | tuple) and bool(C) and all(isinstance(each, str) for each in C)
+    rows = np.array(C) if named else check.check_output_rows(name, C)
     low, high = _bounds(symbol, lower, upper, len(rows), f"output in {name}")
     return {"C": rows, f"{symbol}_min": low, f"{symbol}_max": high}
+
+
+def _rows(name: str, C: Array, n_states: int, names: Sequence[str]) -> Array:
+    """Return outputs as a matrix (q, n): they may be names of states, or indices."""
+    if C.dtype.kind == "U":
+        if missing := [each for each in C.tolist() if each not in names]:
+            raise ValueError(f"{name} has {missing}, but the model's states are {[*names]}.")
+        C = np.array([names.index(each) for each in C.tolist()])
+    return check.check_outputs(name, C, n_states)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -85,10 +95,11 @@ class Tracking(ReadOnlyArrays):
 
     Parameters
     ----------
-    C : array_like, shape (p, n), or list of int
-        The matrix of the tracked outputs, or the indices of the tracked states.
+    C : array_like, shape (p, n), or list of int or str
+        The matrix of the tracked outputs, or the indices or the names of the tracked states.
     r_min, r_max : array_like, shape (p,), or float, optional
-        The box of references. The explicit law needs it bounded.
+        The box of references. The explicit law needs it bounded, and takes a reference beyond it as
+        at its end.
     preview : int, default 0
         How many samples ahead the reference is known. Theta holds it for the present sample and for
         each of these; the last one stays.
@@ -110,9 +121,9 @@ class Tracking(ReadOnlyArrays):
         ahead = _preview("Tracking", preview)
         self._store(**_outputs("Tracking.C", C, "r", r_min, r_max), preview=ahead)
 
-    def sized(self, n_states: int) -> Tracking:
+    def sized(self, n_states: int, names: Sequence[str] = ()) -> Tracking:
         """Return it with C as a matrix (p, n)."""
-        C = check.check_outputs("Tracking.C", self.C, n_states)
+        C = _rows("Tracking.C", self.C, n_states, names)
         return Tracking(C, self.r_min, self.r_max, self.preview if len(C) else 0)
 
 
@@ -122,8 +133,8 @@ class OutputBounds(ReadOnlyArrays):
 
     Parameters
     ----------
-    C : array_like, shape (q, n), or list of int
-        The matrix of the bounded outputs, or indices of states.
+    C : array_like, shape (q, n), or list of int or str
+        The matrix of the bounded outputs, or indices or names of states.
     y_min, y_max : array_like, shape (q,), or float, optional
         Their bounds.
 
@@ -140,9 +151,9 @@ class OutputBounds(ReadOnlyArrays):
     def __init__(self, C: Outputs = (), y_min: Given = None, y_max: Given = None) -> None:
         self._store(**_outputs("OutputBounds.C", C, "y", y_min, y_max))
 
-    def sized(self, n_states: int) -> OutputBounds:
+    def sized(self, n_states: int, names: Sequence[str] = ()) -> OutputBounds:
         """Return it with C as a matrix (q, n)."""
-        C = check.check_outputs("OutputBounds.C", self.C, n_states)
+        C = _rows("OutputBounds.C", self.C, n_states, names)
         return OutputBounds(C, self.y_min, self.y_max)
 
 

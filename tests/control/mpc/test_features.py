@@ -44,6 +44,16 @@ def cart(model: LinearModel = CART, **changes: Any) -> LinearMPC:
     return LinearMPC(model, **{**values, **changes})
 
 
+def test_outputs_may_be_called_by_the_names_of_their_states() -> None:
+    model = CART.named(["position", "speed"], ["force"])
+    by_index = cart(model, tracking=Tracking([0], -1, 1), outputs=OutputBounds([0, 1], -2, 2))
+    names = {"tracking": Tracking(["position"], -1, 1)}
+    names["outputs"] = OutputBounds(["position", "speed"], -2, 2)
+    assert cart(model, **names) == by_index
+    with pytest.raises(ValueError, match=r"Tracking\.C has \['T'\], but .* 'speed'"):
+        cart(model, tracking=Tracking(["T"], -1, 1))
+
+
 @pytest.mark.parametrize("features", [*((name,) for name in FEATURES), FEATURES])
 def test_laws_are_those_of_a_sparse_program_of_another_solver(features: tuple[str, ...]) -> None:
     found = [worst_difference(features, seed, points=4) for seed in (1, 2)]
