@@ -1,7 +1,5 @@
 """The C code of an export is the controller, step by step, for compilers at their strictest."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

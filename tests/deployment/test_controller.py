@@ -1,7 +1,5 @@
 """The numpy-only controller is what the model predicts, and falls back when a reading fails."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

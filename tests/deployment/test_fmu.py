@@ -1,7 +1,5 @@
 """The FMU of an export is the controller, step by step, as an importer calls it."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import platform

@@ -1,7 +1,5 @@
 """Online laws as C: the same answers, within bounded steps, without memory of the heap."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any
@@ -9,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deployed import Compiled, disturbed, needs_compiler, self_test
+from benchmarks.cortex_m import emulate, missing
+from deployed import Compiled, disturbed, needs_compiler, policy_of, self_test
 from sb3_yann import LinearModel, LinearMPC, MixedBounds, RateLimits, SoftBounds, Terminal, export
 from sb3_yann.deployment.controller import Controller, Status
 
@@ -113,3 +112,27 @@ def test_a_large_program_is_solved_as_by_daqp(
             f"median {1e6 * np.median(daqp):.0f} us"
         )
     assert worst < 1e-8
+
+
+pytestmark = pytest.mark.skipif(bool(missing()), reason=f"no {', '.join(missing())}")
+
+
+@pytest.mark.parametrize(("name", "flash"), [("reactor", 32_000), ("reactor, shared", 32_000)])
+def test_in_single_precision_it_fits_32_kb(name, flash, tmp_path):
+    found = emulate(policy_of(name), tmp_path)
+    assert found.wrong == 0
+    assert found.flash < flash and found.memory < 2_000
+    assert 0 < found.mean <= found.worst
+
+
+def test_a_wrong_answer_is_seen(tmp_path, monkeypatch):
+    from benchmarks import cortex_m
+
+    kept = cortex_m.table
+
+    def broken(kind, name, values, precision):
+        off = values + 1 if name == "answers" else values
+        return kept(kind, name, off, precision)
+
+    monkeypatch.setattr(cortex_m, "table", broken)
+    assert emulate(policy_of("reactor"), tmp_path).wrong > 100

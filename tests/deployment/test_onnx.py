@@ -1,7 +1,5 @@
 """An ONNX graph of an export is the controller, under onnxruntime."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What an export puts out lies in the action space of the env, whatever the bounds are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

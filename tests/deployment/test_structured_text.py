@@ -1,7 +1,5 @@
 """The Structured Text of an export is the controller, step by step, faults included."""
 
-from __future__ import annotations
-
 import re
 from xml.etree import ElementTree
 

@@ -1,7 +1,5 @@
 """A controller is exported with its estimator: outputs in, inputs out, in every format."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pairs of episodes decide: what is no better is hardly ever accepted, what harms never."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

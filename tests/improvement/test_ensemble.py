@@ -1,7 +1,5 @@
 """An ensemble of networks learns what a linear model leaves of a plant's steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

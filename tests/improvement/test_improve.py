@@ -1,7 +1,5 @@
 """A policy that is improved is better on the plant, or stays what it was."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import pickle

@@ -1,7 +1,5 @@
 """Episodes in a learnt model are those of its steps; members that disagree have a price."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import replace
 from functools import cache, partial

@@ -1,7 +1,5 @@
 """Compiled code does what the operations of torch do, forward and backward."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

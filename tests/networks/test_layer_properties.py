@@ -1,7 +1,5 @@
 """What holds for the layers around the law of any problem, with any weights."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

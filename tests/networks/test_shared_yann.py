@@ -1,7 +1,5 @@
 """One network beside a law: the law at first, bounded, pinned, continuous, and it trains."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from functools import cache

@@ -1,7 +1,5 @@
 """The critics: exactly the value of the law on the linear plant at first, and they learn."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

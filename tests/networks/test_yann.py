@@ -1,7 +1,5 @@
 """The YANN layer: the explicit law, exactly, and a network for each region, which trains."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch as th

@@ -1,7 +1,5 @@
 """Networks that are exactly zero at first and train all the same (Theorems 1 and 2)."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Twins here are of polynomials, where a test asks for nothing else: networks take seconds."""
 
-from __future__ import annotations
-
 import pytest
 
 from sb3_yann.twin import plant_twin

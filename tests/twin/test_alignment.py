@@ -1,7 +1,5 @@
 """Logs whose inputs are not those that acted: rows, columns, signs, units; and frozen sensors."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The twin as an env: Gymnasium's, with the plant's spaces, and good for the learner and guard."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import gymnasium as gym
@@ -10,10 +8,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import DDPG
 
-from general_problems import solved
-from sb3_yann import ImprovementGuard, NoActionNoise, PlantTwin, YannPolicy
+from general_problems import servo, solved
+from sb3_yann import ImprovementGuard, LinearMPC, NoActionNoise, PlantTwin, SoftBounds, YannPolicy
+from sb3_yann.twin.dynamics import Coordinates
+from sb3_yann.twin.env import Limits, Starts
 from sb3_yann.twin.log import Episode
-from twin_samples import Cart, problem, random_episode, twin
+from sb3_yann.twin.row_layout import RowLayout
+from twin_samples import Cart, log, problem, random_episode, twin
 
 
 def test_it_is_an_env_with_the_plant_s_spaces() -> None:
@@ -123,3 +124,121 @@ def test_an_episode_may_begin_where_it_is_asked_to() -> None:
             env.reset(options={"state": given})
     with pytest.raises(gym.error.ResetNeeded):
         found.env().step(np.zeros(1))
+
+
+def test_the_box_of_starts_is_on_average_that_of_the_plant() -> None:
+    widths = []
+    for k in range(40):
+        starts = PlantTwin.fit(problem(), log(5, first=10 * k), residuals=["none"]).starts
+        widths.append(starts.high - starts.low)
+    np.testing.assert_allclose(np.mean(widths, axis=0), [3.0, 1.0], rtol=0.1)
+
+
+def test_draws_lie_where_they_should_and_have_the_log_s_rest() -> None:
+    starts = twin().starts
+    rng = np.random.default_rng(0)
+    drawn = starts.draw(200, rng)
+    assert np.all((drawn >= starts.low) & (drawn <= starts.high))
+    around = starts.draw_around(2000, rng)
+    assert np.ptp(around[:, 0]) > 1.5 * (starts.high - starts.low)[0]
+    assert np.all((around >= problem().theta_min) & (around <= problem().theta_max))
+    logged = {row.tobytes() for each in twin().episodes for row in each.thetas}
+    assert all(row.tobytes() in logged for row in starts.draw_logged(50, rng))
+
+
+def test_the_log_and_the_starts_lie_within_the_limits_and_nan_does_not() -> None:
+    found = twin()
+    for episode in found.episodes:
+        assert not found.limits.violated(episode.thetas).any()
+    rng = np.random.default_rng(0)
+    assert not found.limits.violated(found.starts.draw(500, rng)).any()
+    assert found.limits.violated(np.array([[np.nan, 0.0], [100.0, 0.0]])).all()
+
+
+def test_a_start_is_the_rarer_the_farther_it_lies_outside_the_range_of_the_log() -> None:
+    starts = twin().starts
+    rng = np.random.default_rng(0)
+    k = len(twin().episodes)
+    middle = (starts.high + starts.low) / 2
+    half = np.ptp(starts.first[:, :2], axis=0) / 2
+    at = middle + half * np.array([[0.0, 0.0], [0.9, -1.0], [0.0, 2.0], [-3.0, 0.5]])
+    expected = 2 / (k + 1) * np.array([1, 1, 1.5 ** (1 - k), 2.0 ** (1 - k)])
+    np.testing.assert_allclose(starts.chance_beyond(at), expected)
+    # That is how often it happens, in each coordinate alone.
+    drawn = rng.uniform(-1, 1, (20_000, k + 1))
+    seen = drawn[:, :k]
+    new = drawn[:, k]
+    middle = (seen.max(1) + seen.min(1)) / 2
+    half = np.ptp(seen, axis=1) / 2
+    for rho in (1.0, 1.5, 2.0):
+        often = np.mean(np.abs(new - middle) > rho * half)
+        assert abs(often - 2 / (k + 1) * ((1 + rho) / 2) ** (1.0 - k)) < 0.01
+
+
+def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
+    mpc = solved("servo with rates")
+    rng = np.random.default_rng(0)
+    held = mpc.layout.reference
+    thetas = 0.2 * mpc.theta_half * rng.uniform(-1, 1, (4, mpc.n_theta))
+    episodes = (
+        Episode(np.tile(each, (7, 1)), np.zeros((6, mpc.model.n_inputs))) for each in thetas
+    )
+    starts = Starts.of(RowLayout(mpc), tuple(episodes))
+    low, high = starts.shown
+    for draw in (starts.draw_between, starts.draw_around):
+        drawn = draw(200, rng)[:, held]
+        assert np.all((drawn >= low[held]) & (drawn <= high[held]))
+        logged = np.isin(drawn, thetas[:, held]).all(axis=1)
+        assert 0.4 < logged.mean() < 0.7
+    assert np.isin(starts.draw(200, rng)[:, held], thetas[:, held]).all()
+    never_moved = Starts(RowLayout(mpc), starts.low, starts.high, thetas[:1], thetas[:1])
+    assert np.isin(never_moved.draw_between(50, rng)[:, held], thetas[0, held]).all()
+
+
+def limits_of(mpc: LinearMPC, **box: np.ndarray) -> Limits:
+    """Return the limits of a box of data and of starts."""
+    k = mpc.model.n_states + mpc.model.n_inputs
+    low = np.full(k, -0.5)
+    high = np.full(k, 0.7)
+    coordinates = Coordinates(low, high, np.ones(k), np.ones(2), RowLayout(mpc))
+    given = {"low": np.array([-1.0, -0.1]), "high": np.array([0.2, 1.5])} | box
+    row = np.zeros((2, mpc.n_theta))
+    return Limits.of(coordinates, Starts(RowLayout(mpc), given["low"], given["high"], row, row))
+
+
+def test_the_limits_hold_the_data_and_the_starts_with_a_quarter_of_their_width() -> None:
+    found = limits_of(problem())
+    np.testing.assert_allclose(found.low, [-1.0 - 0.3, -0.5], atol=1e-8)
+    np.testing.assert_allclose(found.high, [0.7, 1.5 + 0.4], atol=1e-8)
+    assert np.all(found.low < [-1.3, -0.5]) and np.all(found.high > [0.7, 1.9])  # by rounding
+    for at, beyond in (([-1.31, 0.0], True), ([-1.29, 1.89], False), ([0.0, 1.91], True)):
+        assert found.violated(np.array(at)) == beyond
+
+
+def test_hard_bounds_cut_the_limits_and_soft_ones_do_not() -> None:
+    own = {"tracking": None, "x_min": [-0.4, -0.3], "x_max": [0.3, 0.6], "theta_min": -5,
+           "theta_max": 5}  # fmt: skip
+    hard = servo(**own)
+    soft = servo(**own, soft=SoftBounds([0.0, 1.0], penalty=300))
+    np.testing.assert_allclose(limits_of(hard).low, [-0.4, -0.3], atol=1e-7)
+    np.testing.assert_allclose(limits_of(hard).high, [0.3, 0.6], atol=1e-7)
+    found = limits_of(soft)
+    np.testing.assert_allclose(found.low, [-0.4, -0.5], atol=1e-7)
+    np.testing.assert_allclose(found.high, [0.3, 1.9], atol=1e-7)
+
+
+def test_with_set_points_the_limits_hold_what_the_mpc_plans() -> None:
+    mpc = solved("servo")
+    row = np.array([[0.0, 0.0, 1.0]])
+    rows = np.tile(row, (30, 1))
+    k = np.full(3, 0.01)
+    coordinates = Coordinates(-k, k, np.ones(3), np.ones(2), RowLayout(mpc))
+    zero = np.zeros(2)
+    found = Limits.of(coordinates, Starts(RowLayout(mpc), zero, zero, row, rows))
+    thetas, _ = mpc.simulate(row[0], 30)
+    low = thetas[:, :2].min(0)
+    high = thetas[:, :2].max(0)
+    width = 0.25 * (high - low)
+    np.testing.assert_allclose(found.high, np.maximum(high + width, k[:2]), atol=1e-6)
+    np.testing.assert_allclose(found.low, np.minimum(low - width, -k[:2]), atol=1e-6)
+    assert found.high[0] > 1.2

@@ -1,7 +1,5 @@
 """What a policy changes on the plant: intervals over all twins that a log does not refute."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

@@ -1,13 +1,13 @@
 """A twin predicts what it has not seen, and says what it is worth."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from stable_baselines3 import DDPG
 
+from general_problems import solved
 from sb3_yann import (
     AffineObservation,
     ImprovementGuard,
@@ -20,7 +20,12 @@ from sb3_yann import (
     UntrustedTwinError,
     YannPolicy,
 )
-from twin_samples import DT, POLYNOMIALS, Cart, log, problem, twin
+from sb3_yann.evaluation.plots import plot_twin
+from sb3_yann.twin import trust as trusts
+from sb3_yann.twin.log import Episode, as_episodes, more_of
+from sb3_yann.twin.selection import FreeRuns
+from sb3_yann.twin.trust import report
+from twin_samples import DT, POLYNOMIALS, Cart, log, problem, random_episode, twin
 
 
 def test_it_predicts_episodes_that_it_has_not_seen() -> None:
@@ -142,3 +147,155 @@ def test_of_a_log_with_gaps_pieces_of_five_steps_are_kept_and_the_rest_is_said()
     assert [len(each) for each in found.episodes] == [60, 20, 36, 60]
     np.testing.assert_array_equal(found.episodes[2].thetas, states[1, 24:])
     assert "Left out 1 pieces of less than 5 steps; 2 steps were gaps." in found.report()
+
+
+def runs(*errors: list[float]) -> FreeRuns:
+    """Return errors 1 and 10 steps ahead, of the given model first."""
+    return FreeRuns(np.array([1, 10]), np.array(errors, float)[:, None])
+
+
+def judged(found: FreeRuns, standing=(1.0, 1.0), **changes):
+    """Return problems and advice on a log with nothing against it, but for the changes."""
+    given = {
+        "costs": (np.array([10.0, 20.0]), np.array([10.0, 20.0])),
+        "inputs": (np.array([0.5]), np.array([0.5])),
+        "n_episodes": 5,
+        "beyond": (0.0, "x[0]"),
+    }
+    problems, advice = trusts.judge(found, np.array(standing), **(given | changes))
+    return " ".join(problems), " ".join(advice)
+
+
+GOOD = [0.1, 0.2]
+
+
+def test_of_one_record_what_is_lacking_are_rows_and_hours() -> None:
+    log = as_episodes(problem(), [(np.arange(0, 0.9, 0.01)[:, None] * [1, 0], np.zeros((89, 1)))])
+    pieces = (*log, Episode(log[0].thetas[-1:].repeat(12, 0), log[0].actions[:11]))
+    unit = dataclasses.replace(problem(), model=problem().model.named(time_unit="min"))
+    assert more_of(unit, pieces, 3) == f"300 rows ({300 * problem().model.dt / 60:.3g} h)"
+    assert more_of(unit, (*pieces, *log), 3) == more_of(unit, log, 3) == "3 episodes"
+
+
+def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (401, 2))
+    own = 0.1 * rng.standard_normal((400, 1))
+    feedback = 0.2 * x[:-1, :1] - 0.1 * x[:-1, 1:]
+    (episode,) = as_episodes(problem(), [(x, feedback + own)])
+    share, moves = trusts.excitation(problem(), (episode,))
+    assert share == pytest.approx(np.var(own) / np.var(feedback + own), rel=0.05)
+    assert moves == pytest.approx([np.std(feedback + own)])  # half the range is 1
+    (still,) = as_episodes(problem(), [(x, 0 * own + 0.25)])
+    assert [each.tolist() for each in trusts.excitation(problem(), (still,))] == [[0.0], [0.0]]
+    (closed,) = as_episodes(problem(), [(x, feedback)])
+    assert trusts.excitation(problem(), (closed,))[0] < 1e-20
+
+
+@pytest.mark.parametrize(
+    ("ratio", "n", "problem", "advice"),
+    [(1.9, 5, "", ""), (2.1, 5, "", "worse than 'nothing moves'"), (2.1, 1, "one episode", "Log"),
+     (9.9, 5, "", "order of the columns"), (10.1, 5, "far worse than", "operating point")],
+)  # fmt: skip
+def test_a_model_of_another_plant_is_told_by_what_moves(ratio, n, problem, advice) -> None:
+    found = judged(runs([ratio * 0.3, 0.1]), standing=(0.3, 50.0), n_episodes=n)
+    assert problem in found[0] and advice in found[1]
+    assert bool(problem) == bool(found[0]) and bool(advice) == bool(found[1])
+    if ratio > 2 and n > 1:
+        assert f"({0.3 * ratio:.3g} against 0.3 standard deviations)" in " ".join(found)
+
+
+def test_the_edges_of_what_is_trusted() -> None:
+    assert judged(runs(GOOD), beyond=(0.049, "x[0]")) == ("", "")
+    assert "6 % of the logged x[0] lie beyond" in judged(runs(GOOD), beyond=(0.06, "x[0]"))[0]
+    for error, refused in ((0.24, False), (0.26, True)):
+        costs = np.array([10.0, 10.0]) * (1 + error), np.array([10.0, 10.0])
+        said = judged(runs(GOOD), costs=costs)[0]
+        assert bool(said) == refused
+    assert said.endswith("held-out episodes err by 26 % of the mean; 25 % are the most.")
+    assert "Log 5 episodes more" in judged(runs(GOOD), costs=costs)[1]
+    inputs = np.array([0.019, 0.021, 0.0]), np.array([0.1, 0.1, 0.9e-4])
+    problems, advice = judged(runs(GOOD), inputs=inputs)
+    assert problems == "u[2] never moves: what it does is not in the log."
+    assert "u[0] follows the MPC (1.90 % of its variance is its own)" in advice
+    assert "u[1]" not in advice
+    named = judged(runs(GOOD), inputs=inputs, names=["steam", "feed", "reflux"])
+    assert "reflux never moves" in named[0] and "step test on reflux" in named[1]
+
+
+def test_the_noise_of_the_sensors_is_what_one_step_s_errors_amount_to() -> None:
+    """Noise e of the states leaves e+ - A e of a step."""
+    mpc = problem()
+    rng = np.random.default_rng(0)
+    sizes = np.array([0.02, 0.005])
+    logs = []
+    for seed in range(4):
+        x = np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
+        rows = []
+        u = 0.3 * rng.uniform(-1, 1, (400, 1))
+        for each in u:
+            rows.append(x)
+            x = mpc.model.step(x, each)
+        rows.append(x)
+        logs.append((np.array(rows) + sizes * rng.standard_normal((401, 2)), u))
+    found = PlantTwin.fit(mpc, logs, residuals=["none"], n_members=1)
+    np.testing.assert_allclose(found.trust.noise, sizes, rtol=0.1)
+
+
+def test_the_report_counts_what_it_leaves_out_and_says_what_the_log_does_not_show() -> None:
+    mpc = solved("servo")
+    still = tuple(random_episode(mpc, 10, seed) for seed in range(12))
+    for each in still:
+        each.thetas[:, 2] = 0.25
+    given = dataclasses.replace(
+        twin().trust, predicted=np.arange(12.0), actual=np.arange(12.0) + 0.5
+    )
+    said = report(mpc, still, "linear", given).splitlines()
+    assert said[1] == "The log shows one value alone of r[0]: elsewhere the MPC will act."
+    at = said.index("Cost of held-out episodes (or pieces of them), predicted and actual:")
+    rows = [tuple(map(float, each.split())) for each in said[at + 1 : at + 11]]
+    assert rows == [(i, i + 0.5) for i in range(10)] and said[at + 11] == "  ... and 2 more"
+    still[3].thetas[2, 2] = 0.3
+    ten = dataclasses.replace(given, predicted=np.arange(10.0), actual=np.arange(10.0) + 0.5)
+    text = report(mpc, still, "linear", ten)
+    assert "one value alone" not in text and "more" not in text.split("error")[0]
+    table = [each.split() for each in text.splitlines() if each.startswith("  nothing moves")]
+    assert [float(each) for each in table[0][2:]] == pytest.approx(given.standing, rel=1e-2)
+    rows = {each[:17].strip(): each[19:].split() for each in text.splitlines()}
+    chosen = given.chosen
+    errors = given.runs.errors
+    assert [float(e) for e in rows["linear model"]] == pytest.approx(errors[0], rel=1e-2)
+    assert [float(e) for e in rows["twin"]] == pytest.approx(errors[chosen], rel=1e-2)
+    none = dataclasses.replace(given, predicted=np.zeros(0), actual=np.zeros(0))
+    for part in ("Error of free runs", "Cost of held-out"):
+        assert part in text and part not in report(mpc, still, "linear", none)
+
+
+def lines(axes: Axes) -> dict[str, np.ndarray]:
+    """Return what is drawn, by its label or its colour."""
+    return {str(each.get_label()): np.array(each.get_data()) for each in axes.lines}
+
+
+def test_the_picture_of_costs_has_a_band_of_a_quarter_of_the_mean() -> None:
+    predicted = np.array([8.0, 18.0, 1e6])
+    actual = np.array([10.0, 20.0, 30.0])
+    given = dataclasses.replace(twin().trust, predicted=predicted, actual=actual)
+    costs, runs = plot_twin(given)
+    drawn = lines(costs)
+    ends = np.array([8 - 0.08 * 22, 30 + 0.08 * 22])  # without the run that blew up
+    np.testing.assert_allclose(drawn["as predicted"], [ends, ends])
+    np.testing.assert_allclose(drawn["25 % of the mean off"], [ends, ends - 5])
+    (above,) = (each for each in costs.lines if str(each.get_label()).startswith("_"))
+    np.testing.assert_allclose(np.array(above.get_data()), [ends, ends + 5])
+    np.testing.assert_allclose(drawn["held-out episode"], [predicted, actual])
+    np.testing.assert_allclose([costs.get_xlim(), costs.get_ylim()], [ends, ends])
+    assert runs.get_xscale() == runs.get_yscale() == "log"
+    assert runs.get_xticks().tolist() == given.runs.horizons.tolist()
+    np.testing.assert_allclose(lines(runs)["nothing moves"], [given.runs.horizons, given.standing])
+
+
+def test_without_a_second_episode_the_pictures_are_empty() -> None:
+    none = dataclasses.replace(twin().trust, predicted=np.zeros(0), actual=np.zeros(0))
+    costs, runs = plot_twin(none)
+    assert not costs.lines and not runs.lines and runs.get_xscale() == "linear"
+    assert (costs.get_xlabel(), runs.get_xlabel()) == ("predicted cost", "steps ahead")

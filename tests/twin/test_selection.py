@@ -1,13 +1,14 @@
 """Which residual is chosen: candidates, what they are fitted to, and their free runs."""
 
-from __future__ import annotations
-
+import dataclasses
 from itertools import combinations_with_replacement
 
 import numpy as np
 import pytest
 
 from general_problems import solved
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, UntrustedTwinError
+from sb3_yann.control import OutputBounds, Terminal
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import (
@@ -17,6 +18,7 @@ from sb3_yann.twin.selection import (
     held_out,
     ridge,
 )
+from twin_samples import log, mean_cost, problem, twin
 from twin_samples import random_episode as episode
 
 
@@ -95,3 +97,98 @@ def test_a_true_model_is_kept_and_a_single_piece_is_compared_with_nothing() -> N
     runs_of = held_out(box, log, some)
     assert runs_of.choose() == 0 and runs_of.choose(1) >= 1
     assert np.isinf(held_out(box, log[:1], some).errors).all()
+
+
+PUMP = 0.07
+LEAK = 0.02
+"""What a level gains by the pump, and loses, in a step; the model says 0.1 and nothing."""
+
+
+def tank() -> LinearMPC:
+    return LinearMPC(
+        LinearModel([[0.9]], [[0.1]], dt=1.0, x_ss=[5.0], u_ss=[3.0]),
+        Q=[[1.0]], R=[[0.1]], horizon=3, u_min=1, u_max=5, theta_min=2, theta_max=8,
+        tracking=Tracking([0], 4, 6), outputs=OutputBounds([[2.0]], 5, 15),
+        terminal=Terminal(set="invariant"),
+    )  # fmt: skip
+
+
+def worn_log(
+    mpc: LinearMPC, pump: float = PUMP, leak: float = LEAK, noise: float = 1e-3
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return episodes of a tracking MPC on the tank."""
+    rng = np.random.default_rng(0)
+    found = []
+    law = mpc.explicit().plant_input
+    for _ in range(6):
+        theta = [5 + np.array([rng.uniform(-1, 1), rng.uniform(-1, 1)])]
+        inputs = []
+        for _ in range(40):
+            x, r = theta[-1]
+            inputs.append(law([x, r]))
+            moved = pump * (inputs[-1][0] - 3) - leak + noise * rng.standard_normal()
+            x = 5 + 0.9 * (x - 5) + moved
+            theta.append(np.array([x, r]))
+        found.append((np.array(theta), np.array(inputs)))
+    return found
+
+
+def test_a_log_of_the_cart_corrects_its_model_and_keeps_all_else() -> None:
+    found = twin(10).reidentified()
+    for states, actions in log(3, first=50):
+        given, today = (
+            np.square(mpc.predict(states[:-1], actions) - states[1:]).mean()
+            for mpc in (problem(), found)
+        )
+        assert today < 0.8 * given
+    old, new = (mean_cost(each.explicit()) for each in (problem(), found))
+    assert np.median(new) < 0.99 * np.median(old)  # a few run away with either
+    for name in ("horizon", "gamma", "layout"):
+        assert getattr(found, name) == getattr(problem(), name)
+    for name in ("Q", "R", "u_min", "u_max", "theta_min", "theta_max"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(problem(), name))
+
+
+def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() -> None:
+    mpc = dataclasses.replace(tank(), model=tank().model.named(["level"], units={"level": "cm"}))
+    found = PlantTwin.fit(mpc, worn_log(mpc)).reidentified()
+    assert (found.model.state_names, found.model.units) == (("level",), ("cm", ""))
+    np.testing.assert_allclose(found.model.B, [[PUMP]], rtol=0.05)
+    np.testing.assert_allclose(found.model.x_ss, [5.0], atol=1e-9)  # so that r stays what it is
+    moved = found.model.u_ss - mpc.model.u_ss
+    np.testing.assert_allclose(moved, [LEAK / PUMP], rtol=0.05)
+    np.testing.assert_allclose(found.deviations.u_max, 2 - moved)
+    assert found.layout == mpc.layout
+    assert len(found.terminal.set[1]) > 0
+    for (old, _), (new, _) in zip(worn_log(mpc), worn_log(found), strict=True):
+        x, r = new[-10:].T
+        assert np.abs(x.mean() - r[0]) < 0.01 < np.abs(old[-10:, 0].mean() - r[0])
+
+
+def test_bounds_that_were_given_as_the_plant_shows_them_are_shown_so() -> None:
+    mpc = LinearMPC(
+        tank().model, Q=[[1.0]], R=[[0.1]], horizon=3, u_min=1, u_max=5, theta_min=2, theta_max=8,
+        tracking=Tracking([0], 4, 6),
+    )  # fmt: skip
+    found = PlantTwin.fit(mpc, worn_log(mpc)).reidentified()
+    assert "u_min=[1], u_max=[5], r_min=[4], r_max=[6]" in repr(found)
+
+
+def test_where_the_model_is_right_the_mpc_is_the_given_one() -> None:
+    mpc = tank()
+    assert PlantTwin.fit(mpc, worn_log(mpc, pump=0.1, leak=0.0)).reidentified() is mpc
+
+
+def test_a_twin_that_is_not_trusted_identifies_nothing() -> None:
+    with pytest.raises(UntrustedTwinError, match="There is one episode"):
+        PlantTwin.fit(problem(), log(1)).reidentified()
+
+
+def test_a_worn_plant_s_set_points_lie_within_the_limits_of_its_twin() -> None:
+    mpc = tank()
+    rows = worn_log(mpc, pump=0.03)
+    reached, asked = (np.array([theta[:, k] for theta, _ in rows]) for k in (0, 1))
+    assert asked.max() > reached.max() + 0.25 * np.ptp(reached)  # the log alone does not show it
+    found = PlantTwin.fit(mpc, rows)
+    at = mpc.units.to_deviations(np.column_stack([asked[:, 0], asked[:, 0]]))
+    assert not found.limits.violated(at).any()

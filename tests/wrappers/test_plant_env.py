@@ -1,7 +1,5 @@
 """An env from equations is a plant in its own units, with all that the MPC's theta holds."""
 
-from __future__ import annotations
-
 import random
 import warnings
 from typing import Any

@@ -1,7 +1,5 @@
 """Wrappers that complete an observation to theta: what they append, and when."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """The choice of a solver and limits of `LinearMPC.explicit`."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The walk from facet to facet finds the regions that ppopt finds, and that QPs say are there."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import re

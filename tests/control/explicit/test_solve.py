@@ -1,7 +1,5 @@
 """The explicit law is the MPC: the input of an online QP, everywhere; solving leaves no trace."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import pickle

@@ -1,7 +1,5 @@
 """Dead time is found, and held as states of the model; curvature is not taken for it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

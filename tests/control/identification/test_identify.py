@@ -1,7 +1,5 @@
 """Data give the model back, with honest errors, and data that cannot are refused by name."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 from typing import Any

@@ -1,7 +1,5 @@
 """A mask says that an entry is no reading: it is never read as the number under it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Models from outputs have the order, dead time and predictions of the plant."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from typing import Any

@@ -1,7 +1,5 @@
 """A walk along a line finds the region that a scan of all regions finds."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import subprocess

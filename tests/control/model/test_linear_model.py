@@ -1,7 +1,5 @@
 """A LinearModel is sampled exactly, linearized rightly, named, and cannot be changed."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import pickle

@@ -1,7 +1,5 @@
 """The report of a model says in words what its matrices mean, with numbers that are right."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

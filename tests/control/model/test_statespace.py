@@ -1,7 +1,5 @@
 """A control.StateSpace becomes a LinearModel with its states, and what is lost is said."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import control

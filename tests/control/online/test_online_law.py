@@ -1,7 +1,5 @@
 """The law that is solved at each point: right, total, the same whatever was asked before."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from dataclasses import replace
