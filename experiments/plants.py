@@ -278,6 +278,24 @@ def of_paper(problem: Callable[[], LinearMPC], env_id: str) -> Case:
     return Case(problem(), partial(gym.make, env_id))
 
 
+def gymnasium_pendulum() -> Case:
+    """Return Gymnasium's pendulum from its own starts, most of which hang; it shows its angle."""
+    top = np.array([np.pi, 8.0])
+    space = gym.spaces.Box(-top, top, dtype=np.float64)
+
+    def angle(observation: Array) -> Array:
+        cosine, sine, speed = np.asarray(observation, np.float64)
+        return np.array([np.arctan2(sine, cosine), speed])
+
+    def make() -> gym.Env[Any, Any]:
+        return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), angle, space)
+
+    limits = {"u_min": -2, "u_max": 2, "theta_min": -top, "theta_max": top}
+    model = LinearModel.from_env(make, x_ss=[0, 0], u_ss=[0])
+    weights = {"Q": np.diag([1.0, 0.1]), "R": [[0.001]], "horizon": 2}
+    return Case(LinearMPC(model, **weights, **limits), make)
+
+
 def worn_tank() -> Case:
     """Return a quadruple tank whose pumps lost a tenth since its model was made."""
     model = LinearModel.from_dynamics(
@@ -327,6 +345,7 @@ CASES: dict[str, Callable[[], Case]] = {
         of_paper, problems.clipped_pendulum, "ClippedPendulum-v0"
     ),
     "pendulum, Q = I": partial(of_paper, printed_pendulum, "ClippedPendulum-v0"),
+    "Gymnasium's pendulum, any start": gymnasium_pendulum,
     "worn tank, set-points": worn_tank,
     "worn tank, an observer": partial(with_observer, worn_tank),
     "worn tank, waves, a measured flow": measured_tank,

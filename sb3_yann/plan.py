@@ -32,6 +32,7 @@ SETTLED = 1e-5  # A start is done when a correction saves less than this part of
 # corrections at most; after how many the best of several guesses goes on
 SWEEPS = 40
 RACE = 4
+TIE = 0.1  # by which part of its cost a guess of the caller's may cost more than the best
 SOFT = 1e-2  # bounds count so much less at first: stiff ones would end a search where it meets them
 DAMPED = 10.0
 PATIENCE = 5
@@ -252,7 +253,13 @@ def follow(plans: Plans, t: int, theta: Array) -> Array:
 
 
 def planned(
-    plant: TwinPlant, task: Task, policies: list[Policy], starts: Array, steps: int, rows: Rows
+    plant: TwinPlant,
+    task: Task,
+    policies: list[Policy],
+    starts: Array,
+    steps: int,
+    rows: Rows,
+    preferred: bool = False,
 ) -> Plans:
     """Return the best plan of each start that the policies' trajectories lead to.
 
@@ -267,7 +274,10 @@ def planned(
         gains = np.zeros((*inputs.shape, starts.shape[1]))
         first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs), turn)
         found.append(improved(plant, soft, first, rows, RACE if len(policies) > 1 else SWEEPS))
-    best = np.argmin([each.costs for each in found], axis=0)
+    ranked = np.array([each.costs for each in found])
+    if preferred:
+        ranked[-1] -= TIE * np.abs(ranked[-1])
+    best = np.argmin(ranked, axis=0)
     names = "thetas", "inputs", "gains"
     kept = {k: np.stack([getattr(each, k) for each in found], 1)[:, best, every] for k in names}
     costs = np.array([each.costs for each in found])[best, every]
@@ -485,8 +495,9 @@ class Planning:
     Nothing is known of changes before they come. Feedback keeps the plant on its plan. For
     ``pause`` steps after a plan a disturbance makes no new one: an observer's estimate moves at
     every step until it has settled. At ``room`` half-widths from its plan a law, by default the
-    MPC, takes over until there is a new one. ``plans`` holds the present one of each episode, the
-    step at which it was made, and theta of then.
+    MPC, takes over until there is a new one. ``guess`` is another law whose trajectories plans may
+    begin with. ``plans`` holds the present one of each episode, the step at which it was made, and
+    theta of then.
     """
 
     remembers = True
@@ -499,6 +510,7 @@ class Planning:
         pause: int = 0,
         room: float = np.inf,
         law: Feedback | None = None,
+        guess: Feedback | None = None,
     ) -> None:
         self.plant = plant
         self.task = task
@@ -508,6 +520,7 @@ class Planning:
         self.plans: dict[int, tuple[int, Plans, Array]] = {}
         # who has left its plan
         self.law = law or law_of(task.problem)
+        self.guess = guess
         self.lost = set[int]()
         self._kept: dict[int, float] = {}  # what plans that are over have promised
 
@@ -546,10 +559,14 @@ class Planning:
 
     def _plan(self, t: int, starts: Array, rows: Rows) -> None:
         left = self.steps - t
+        guess = self.guess
         policies: list[Policy] = [lambda _, at: self.law(at)]
         if rows[0] not in self.plans:
             policies = initial_guesses(self.plant, self.task, starts, left, rows)
-        found = planned(self.plant, self.task, policies, starts, left, rows)
+            if guess is not None:
+                policies = [*policies, lambda _, at: guess(at)]
+        preferred = guess is not None and len(policies) > 1
+        found = planned(self.plant, self.task, policies, starts, left, rows, preferred)
         for k, row in enumerate(rows):
             self._kept[row] = self._promised(row, t)
             self.lost.discard(row)

@@ -11,7 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array, Feedback
+from sb3_yann._validation import Array, Feedback, Mask
 from sb3_yann.compare import RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
 from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
@@ -31,7 +31,7 @@ HUBER = 0.1
 """Errors of an action, in half-ranges, from which they count by their size rather than its square:
 where plans go one way or the other, their mean goes nowhere. Labels on a bound lie as far beyond
 it, so that the slope does not vanish on the way."""
-VAIN_FITS = 3  # fits in a row that may bring no better policy
+VAIN_FITS = 3  # fits in a row that may bring no policy that is better by half of `NEAR`
 FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
 HARDEST = 40  # scenarios that are planned anew after a fit or a check, at most
 NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
@@ -47,12 +47,20 @@ class Teacher:
     Plans are those of :func:`headroom`: differential dynamic programming, which knows neither
     changes of references nor disturbances before they come. ``best`` (k,) is the least cost that a
     plan or the MPC had in each scenario. The first ``n_planned`` are planned, by default all; the
-    others where a policy turns out to cost more than the MPC.
+    others where a policy turns out to lack much. Policies promise what they save in the first
+    ``n_usual`` ones.
     """
 
-    def __init__(self, scenarios: Scenarios, seed: int, n_planned: int | None = None) -> None:
+    def __init__(
+        self,
+        scenarios: Scenarios,
+        seed: int,
+        n_planned: int | None = None,
+        n_usual: int | None = None,
+    ) -> None:
         self.scenarios = scenarios
         self.planned = slice(n_planned)
+        self.usual = slice(n_usual)
         self.rng = np.random.default_rng([seed, 4])
         model = scenarios.model
         problem = scenarios.model.problem
@@ -66,15 +74,15 @@ class Teacher:
         finite = self.mpc.costs[np.isfinite(self.mpc.costs)]
         unit = max(float(np.median(np.abs(finite))) / self.steps, 1e-300) if len(finite) else 1.0
         self.task = task_of(model, unit, priced=scenarios.members is None)
-        self.thetas: list[Array] = []
-        self.inputs: list[Array] = []
+        self.earlier: list[tuple[Array, Array]] = []  # theta and inputs that others have shown
+        self.taught: dict[tuple[int, int], tuple[Array, Array]] = {}  # by scenario and first step
 
     @property
     def gain(self) -> float:
         """What plans gain on average: see :meth:`saved`."""
         return self.saved(self.best, self.planned)
 
-    def saved(self, costs: Array, part: slice = slice(None)) -> float:
+    def saved(self, costs: Array, part: slice | Mask = slice(None)) -> float:
         """Return what costs (k,) are below the MPC's on average, relative to those."""
         finite = np.isfinite(self.mpc.costs[part])
         mpc = self.mpc.costs[part][finite]
@@ -94,71 +102,83 @@ class Teacher:
     def show(self, act: Feedback | None = None, played: Imagined | None = None) -> None:
         """Plan the scenarios; those that a policy ``played``, from where it had got to.
 
-        Where plans cost more than the MPC, or break a bound by more, the MPC is shown.
+        Where plans cost more than the MPC, or break a bound by more, the MPC is shown. A scenario
+        that is planned again is shown anew: what the policy does is a guess that plans prefer, so
+        that in the end neighbors do alike.
         """
-        model = self.scenarios.model
-        pause = PAUSE if model.dynamics.row.observer is not None else 0
+        pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
+        chosen: NDArray[np.intp] = np.arange(len(self.scenarios))[self.planned]
+        begins = np.zeros(len(chosen), dtype=np.int64)
         if played:
             chosen, begins = self.hardest(played)
-        else:
-            chosen = np.arange(len(self.scenarios))[self.planned]
-            begins = np.zeros(len(chosen), dtype=np.int64)
         self.known[chosen] = True
         scenarios = self.scenarios.of(chosen)
-        planning = Planning(scenarios.plant, self.task, self.steps, pause)
-        before = controller_of(act or self.problem.law())
+        mpc = self.mpc.of(chosen)
+        if played:
+            scenarios = scenarios.later(played.rows[:, chosen], begins)
+            mpc = scenarios.play(of_law(self.problem))
+        planning = Planning(scenarios.plant, self.task, self.steps, pause, guess=act)
         plans: list[dict[int, tuple[int, Plans, Array]]] = []  # at each step
 
-        def switched(t: int, theta: Array, rows: Rows) -> Array:
-            u = np.array(before(t, theta, rows), np.float64)
-            begun = begins[rows] <= t
-            if np.any(begun):
-                u[begun] = planning(t, theta[begun], rows[begun])
+        def planned(t: int, theta: Array, rows: Rows) -> Array:
+            u = planning(t, theta, rows)
             plans.append({**planning.plans})
             return u
 
-        shown = scenarios.play(switched)
-        better = shown.costs <= self.mpc.costs[chosen]
-        better &= ~less_safe(shown.unsafe, self.mpc.unsafe[chosen]).any(axis=1)
-        for i, scenario in enumerate(chosen):
-            begun = begins[i]
+        shown = scenarios.play(planned)
+        better = shown.costs <= mpc.costs
+        better &= ~less_safe(shown.unsafe, mpc.unsafe).any(axis=1)
+        first = better & (begins == 0)
+        self.best[chosen[first]] = np.fmin(self.best[chosen[first]], shown.costs[first])
+        for i in range(len(chosen)):
+            key = int(chosen[i]), int(begins[i])
             if better[i]:
-                self.best[scenario] = np.fmin(self.best[scenario], shown.costs[i])
-                acting = [plans[t][i] for t in range(begun, self.steps)]
+                acting = [each[i] for each in plans]
 
-                def answers(near: Array, begun: int = begun, acting: Any = acting) -> Array:
-                    each = enumerate(zip(acting, near, strict=True), start=begun)
+                def answers(near: Array, acting: Any = acting) -> Array:
+                    each = enumerate(zip(acting, near, strict=True))
                     return np.array([follow(plan, t - at, x) for t, ((at, plan, _), x) in each])
 
-                self._keep(shown.thetas[begun:-1, i], shown.inputs[begun:, i], answers)
-            elif not begun:
-                taught = self.mpc.thetas[:-1, scenario], self.mpc.inputs[:, scenario]
-                self._keep(*taught, lambda near: self.law(near.reshape(-1, near.shape[-1])))
+                self._keep(key, shown.thetas[:-1, i], shown.inputs[:, i], answers)
+            elif not begins[i]:
+                taught = mpc.thetas[:-1, i], mpc.inputs[:, i]
+                self._keep(key, *taught, lambda near: self.law(near.reshape(-1, near.shape[-1])))
 
-    def _keep(self, thetas: Array, inputs: Array, answers: Feedback) -> None:
+    def _keep(self, key: tuple[int, int], thetas: Array, inputs: Array, answers: Feedback) -> None:
         """Keep inputs (T, m) at thetas (T, n_theta), and the answers to states near each."""
         near = np.repeat(thetas[:, None], NEARBY, axis=1)
         states = near[..., self.problem.layout.state]
         states += SPREAD * self.units * self.rng.standard_normal(states.shape)
         rows = near.reshape(-1, near.shape[-1])
-        answered = answers(near).reshape(len(rows), -1)
-        self.inputs += [inputs, np.clip(answered, *self.task.limits(rows))]
+        answered = np.clip(answers(near).reshape(len(rows), -1), *self.task.limits(rows))
         self.scenarios.model.dynamics.coordinates.wrap(rows)
-        self.thetas += [thetas, rows]
+        self.taught[key] = np.concatenate([thetas, rows]), np.concatenate([inputs, answered])
+
+    def suffices(self, costs: Array) -> bool:
+        """Return whether a policy's costs (k,) are nearly those of all plans so far."""
+        gain = self.saved(self.best, self.known)
+        return self.saved(costs, self.known) >= (1 - NEAR) * gain
 
     def teach(self, layer: LawLayer, updates: int) -> None:
         """Fit a layer to all that was shown."""
-        thetas = np.concatenate(self.thetas)
-        inputs = np.concatenate(self.inputs)
+        shown = zip(*self.earlier, *self.taught.values(), strict=True)
+        thetas, inputs = (np.concatenate(each) for each in shown)
         fit_layer(layer, self.problem, thetas, inputs, self.rng, updates)
 
     def hardest(self, played: Imagined) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Return the scenarios in which a policy lacks most, and the steps to plan from next.
 
-        Those that were not planned before begin at their start, as half of the others do; the rest
-        amid the episode.
+        In one that was not planned plans are taken to gain what they do in the one where the MPC's
+        cost is nearest. Those begin at their start, as half of the others do; the rest amid the
+        episode.
         """
-        behind = np.where(np.isfinite(played.costs), played.costs - self.best, np.inf)
+        mpc = np.nan_to_num(self.mpc.costs)
+        known = np.flatnonzero(self.known)
+        nearest = known[np.abs(mpc[:, None] - mpc[known]).argmin(axis=1)]
+        best = np.where(
+            self.known, self.best, mpc + np.nan_to_num(self.best)[nearest] - mpc[nearest]
+        )
+        behind = np.where(np.isfinite(played.costs), played.costs - best, np.inf)
         unsafe = np.any(less_safe(played.unsafe, self.mpc.unsafe), axis=1)
         chosen = np.lexsort((-behind, ~unsafe))[:HARDEST]
         chosen = chosen[unsafe[chosen] | (behind[chosen] > 0) | ~self.known[chosen]]
@@ -169,10 +189,8 @@ class Teacher:
 
     def objection(self, played: Imagined) -> str:
         """Return what the rule of acceptance says against a policy, empty for nothing."""
-        finite = np.isfinite(self.mpc.costs)
-        mpc, policy = (
-            Scores(each.costs[finite], each.unsafe[finite]) for each in (self.mpc, played)
-        )
+        part = np.flatnonzero(np.isfinite(self.mpc.costs[self.usual]))
+        mpc, policy = (Scores(each.costs[part], each.unsafe[part]) for each in (self.mpc, played))
         return no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
 
 
@@ -198,22 +216,24 @@ def imitate(
         teacher.teach(layer, updates)
         act = policy_of(layer, teacher.problem)
         played = teacher.scenarios.play(controller_of(act))
-        saved = teacher.saved(played.costs, teacher.planned)
+        saved = teacher.saved(played.costs, teacher.usual)
         score = teacher.score(played.costs)
         objection = teacher.objection(played)
         say(
             f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model"
             f"{'; ' * bool(objection)}{objection}"
         )
-        if score > most:
+        if score > most + NEAR / 2 * teacher.gain:
             since = fit
+        if score > most:
             most = score
             promised = saved
             best = copy.deepcopy(layer.state_dict())
-        done = saved >= (1 - NEAR) * teacher.gain and not objection
-        if done or fit == FITS - 1 or fit - since == VAIN_FITS:
+        if fit == FITS - 1 or fit - since == VAIN_FITS:
             break
-        teacher.show(act, played)
+        teacher.show(act, played)  # before it is judged: it must do as well where none was planned
+        if teacher.suffices(played.costs) and not objection:
+            break
     layer.load_state_dict(best)
     return promised
 

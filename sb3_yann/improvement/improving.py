@@ -452,8 +452,7 @@ class _Work:
             if shown is None and not teacher.gain > RULE.least_gain / 10:
                 return improvement(False, f"plans gain {gain} in the twin, too little to teach")
             if shown is not None:
-                teacher.thetas += shown.thetas
-                teacher.inputs += shown.inputs
+                teacher.earlier = [*shown.earlier, *shown.taught.values()]
             gained = imitate(self.layer, teacher, self.updates, self.say)
             shown = teacher
             self.say.end_of_round()
@@ -572,8 +571,10 @@ class _Work:
         chosen = [*chosen, *(simulator.episodes[i] for i in order)][: self.n_starts]
         drawn = self.rng.integers(len(order), size=OTHERS * self.n_starts)
         others = [simulator.episodes[i] for i in drawn]
-        scenarios = Scenarios.like(model, chosen + others, self.rng)
-        teacher = Teacher(scenarios, self.seed + number, len(chosen))
+        midway = len(others) // 2
+        scenarios = Scenarios.like(model, chosen + others, self.rng, midway)
+        usual = len(scenarios) - midway
+        teacher = Teacher(scenarios, self.seed + number, len(chosen), usual)
         teacher.show()
         return model, teacher
 

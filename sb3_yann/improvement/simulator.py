@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -434,6 +434,11 @@ class Imagined:
     costs: Array
     unsafe: Array
 
+    def of(self, chosen: NDArray[np.intp]) -> Imagined:
+        """Return some of them."""
+        rows, thetas, inputs = (a[:, chosen] for a in (self.rows, self.thetas, self.inputs))
+        return Imagined(rows, thetas, inputs, self.costs[chosen], self.unsafe[chosen])
+
 
 @dataclass(frozen=True, eq=False)
 class Scenarios:
@@ -449,19 +454,31 @@ class Scenarios:
 
     @classmethod
     def like(
-        cls, model: LearntModel, episodes: Sequence[Episode], rng: np.random.Generator
+        cls,
+        model: LearntModel,
+        episodes: Sequence[Episode],
+        rng: np.random.Generator,
+        midway: int = 0,
     ) -> Scenarios:
         """Return scenarios like some episodes, with their references and disturbances.
 
-        Every other one begins as its episode did, the others in the box of all first states.
+        Every other one begins as its episode did, the others in the box of all first states; the
+        last ``midway`` ones where their episode had got to.
         """
         row = model.dynamics.row
         steps = max(map(len, episodes))
         n = model.problem.model.n_states
-        thetas = row.shown(np.array([each.thetas[0] for each in episodes])).copy()
-        moved = thetas[1::2, :n]
-        thetas[1::2, :n] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
-        given = [e.thetas[np.minimum(np.arange(steps), len(e)), row.given] for e in episodes]
+        first = np.zeros(len(episodes), dtype=np.int64)
+        last = first[len(first) - midway :]
+        last[:] = rng.integers([len(each) for each in episodes[len(first) - midway :]])
+        thetas = row.shown(np.array([e.thetas[t] for e, t in zip(episodes, first, strict=True)]))
+        thetas = thetas.copy()
+        moved = thetas[1 : len(first) - midway : 2, :n]
+        moved[:] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
+        given = [
+            e.thetas[np.minimum(t + np.arange(steps), len(e)), row.given]
+            for e, t in zip(episodes, first, strict=True)
+        ]
         return cls(model, None, row.begin(thetas), np.stack(given, axis=1))
 
     @cached_property
@@ -473,6 +490,12 @@ class Scenarios:
         """Return some of them."""
         members = None if self.members is None else self.members[chosen]
         return Scenarios(self.model, members, self.starts[chosen], self.given[:, chosen])
+
+    def later(self, rows: Array, steps: NDArray[np.int64]) -> Scenarios:
+        """Return scenarios that begin at some steps (k,) of episodes of rows (T + 1, k, size)."""
+        every = np.arange(len(self))
+        at = np.minimum(np.arange(len(self.given))[:, None] + steps, len(self.given) - 1)
+        return replace(self, starts=rows[steps, every], given=self.given[at, every])
 
     def __len__(self) -> int:
         """Return how many there are."""

@@ -11,6 +11,7 @@ from stable_baselines3 import DDPG
 from sb3_yann import PlantTwin, YannPolicy
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.improvement import simulator as module
+from sb3_yann.improvement.imitation import Teacher, controller_of, policy_of
 from sb3_yann.improvement.improving import _Progress, _Work
 from sb3_yann.improvement.simulator import (
     Disagreement,
@@ -84,6 +85,46 @@ def test_an_episode_is_a_loop_of_the_members_steps(make, each) -> None:
     costs = mpc.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
     np.testing.assert_allclose(played.costs, costs)
     assert played.unsafe.shape == (len(found), 9) and not played.unsafe[:, :4].any()
+
+
+@pytest.mark.parametrize("make", [learnt, observed])
+def test_scenarios_go_on_from_where_an_episode_had_got_to(make) -> None:
+    found = scenarios(make())
+    law = of_law(found.model.problem)
+    played = found.play(law)
+    begins = np.array([0, 3, 7, 12])
+    later = found.later(played.rows, begins).play(law)
+    for i, begin in enumerate(begins):
+        end = len(played.inputs) - begin
+        np.testing.assert_allclose(later.thetas[:end, i], played.thetas[begin:-1, i], atol=1e-12)
+
+
+def test_some_scenarios_begin_where_logged_episodes_had_got_to() -> None:
+    found = learnt()
+    rng = np.random.default_rng(0)
+    like = Scenarios.like(found, found.episodes[:4], rng, midway=2)
+    parts = found.dynamics.row
+    for i in (2, 3):
+        state = parts.shown(like.starts)[i, : found.problem.model.n_states]
+        logged = found.episodes[i].thetas[:, parts.state]
+        assert np.abs(logged - state).max(axis=1).min() < 1e-12
+        assert not np.allclose(logged[0], state)
+
+
+def test_a_scenario_that_is_planned_again_is_shown_anew() -> None:
+    found = scenarios(learnt())
+    teacher = Teacher(found, 0)
+    teacher.show()
+    first = {key: rows[0].copy() for key, rows in teacher.taught.items()}
+    assert {*first} <= {(i, 0) for i in range(4)}
+    act = policy_of(
+        DDPG(YannPolicy, Cart(), policy_kwargs={"problem": problem()}).actor.mu, problem()
+    )
+    played = found.play(controller_of(act))
+    teacher.known[2:] = False  # these begin at their start again
+    teacher.show(act, played)
+    for key in ((2, 0), (3, 0)):
+        assert not np.array_equal(first[key], teacher.taught[key][0])
 
 
 def test_what_is_not_finite_is_lost_and_has_no_cost() -> None:
