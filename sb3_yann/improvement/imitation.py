@@ -108,7 +108,7 @@ class Teacher:
         """
         pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
         chosen: NDArray[np.intp] = np.arange(len(self.scenarios))[self.planned]
-        begins = np.zeros(len(chosen), dtype=np.int64)
+        begins: NDArray[np.int64] = np.zeros(len(chosen), dtype=np.int64)
         if played:
             chosen, begins = self.hardest(played)
         self.known[chosen] = True
