@@ -154,10 +154,18 @@ class Teacher:
         self.scenarios.model.dynamics.coordinates.wrap(rows)
         self.taught[key] = np.concatenate([thetas, rows]), np.concatenate([inputs, answered])
 
-    def suffices(self, costs: Array) -> bool:
-        """Return whether a policy's costs (k,) are nearly those of all plans so far."""
-        gain = self.saved(self.best, self.known)
-        return self.saved(costs, self.known) >= (1 - NEAR) * gain
+    @property
+    def attainable(self) -> Array:
+        """What plans cost in each scenario (k,).
+
+        In one that was not planned they are taken to gain what they do in the one where the MPC's
+        cost is nearest.
+        """
+        mpc = np.nan_to_num(self.mpc.costs)
+        known = np.flatnonzero(self.known)
+        nearest = known[np.abs(mpc[:, None] - mpc[known]).argmin(axis=1)]
+        guessed = self.mpc.costs + np.nan_to_num(self.best)[nearest] - mpc[nearest]
+        return np.where(self.known, self.best, guessed)
 
     def teach(self, layer: LawLayer, updates: int) -> None:
         """Fit a layer to all that was shown."""
@@ -168,17 +176,10 @@ class Teacher:
     def hardest(self, played: Imagined) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Return the scenarios in which a policy lacks most, and the steps to plan from next.
 
-        In one that was not planned plans are taken to gain what they do in the one where the MPC's
-        cost is nearest. Those begin at their start, as half of the others do; the rest amid the
-        episode.
+        Those that were not planned before begin at their start, as half of the others do; the rest
+        amid the episode.
         """
-        mpc = np.nan_to_num(self.mpc.costs)
-        known = np.flatnonzero(self.known)
-        nearest = known[np.abs(mpc[:, None] - mpc[known]).argmin(axis=1)]
-        best = np.where(
-            self.known, self.best, mpc + np.nan_to_num(self.best)[nearest] - mpc[nearest]
-        )
-        behind = np.where(np.isfinite(played.costs), played.costs - best, np.inf)
+        behind = np.where(np.isfinite(played.costs), played.costs - self.attainable, np.inf)
         unsafe = np.any(less_safe(played.unsafe, self.mpc.unsafe), axis=1)
         chosen = np.lexsort((-behind, ~unsafe))[:HARDEST]
         chosen = chosen[unsafe[chosen] | (behind[chosen] > 0) | ~self.known[chosen]]
@@ -229,11 +230,10 @@ def imitate(
             most = score
             promised = saved
             best = copy.deepcopy(layer.state_dict())
-        if fit == FITS - 1 or fit - since == VAIN_FITS:
+        done = teacher.saved(played.costs) >= (1 - NEAR) * teacher.saved(teacher.attainable)
+        if (done and not objection) or fit == FITS - 1 or fit - since == VAIN_FITS:
             break
-        teacher.show(act, played)  # before it is judged: it must do as well where none was planned
-        if teacher.suffices(played.costs) and not objection:
-            break
+        teacher.show(act, played)
     layer.load_state_dict(best)
     return promised
 
