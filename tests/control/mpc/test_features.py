@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import linalg
-from stable_baselines3 import DDPG
 
 from general_problems import PROBLEMS, THERMAL, servo, solved
 from reference_answers import online_answers, relative_error
@@ -26,7 +25,6 @@ from sb3_yann import (
     SoftBounds,
     Terminal,
     Tracking,
-    YannPolicy,
     export,
 )
 from sb3_yann.control import lqr
@@ -174,7 +172,8 @@ def test_a_bound_that_moves_in_is_reached_as_fast_as_the_rate_allows(
     np.testing.assert_allclose(low[contradicts], high[contradicts])
     np.testing.assert_allclose(high[contradicts, 0], theta[contradicts, 3] - 0.2)
     env = PlantEnv(lambda x, u: mpc.model.B @ u, mpc)
-    model = DDPG(YannPolicy, env, policy_kwargs={"problem": mpc}, device="cpu")
+    sb3 = pytest.importorskip("stable_baselines3")
+    model = sb3.DDPG("YannPolicy", env, policy_kwargs={"problem": mpc}, device="cpu")
     wanted = np.clip(mpc.online()(theta), low, high)
     mpc.explicit()
     export(mpc, tmp_path / "law.npz")
