@@ -333,6 +333,8 @@ def in_deviations(
     with closing(make()) as env:
         space = require_vector(env, "action_space")
         require_state_shown(env, observation is not None)
+        if observation is None:
+            require_spaces(problem, env)
     units = ActionUnits.of(problem, space.low, space.high)
     if units is not None and units.kind == "normalized":
         raise ValueError(
@@ -350,6 +352,19 @@ def in_deviations(
     if observation is None and not problem.units.shifted:
         return make
     return partial(InDeviations.around, make, problem.units, observation)
+
+
+def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
+    """Raise unless an env shows theta and takes the inputs."""
+    shape = env.observation_space.shape
+    actions = env.action_space.shape
+    if shape != (problem.n_theta,) or actions != (problem.model.n_inputs,):
+        raise ValueError(
+            f"The env shows {shape} and takes {actions}; theta of the MPC has {problem.n_theta} "
+            f"entries {problem.layout.names}, and there are {problem.model.n_inputs} inputs. Wrap "
+            "the env so that it shows theta: see PastInputs and ObserveDisturbance in "
+            "sb3_yann.wrappers."
+        )
 
 
 def require_theta_shown(problem: LinearMPC, theta: Array) -> None:

@@ -167,6 +167,7 @@ class Improvement:
             rows["change"] += f"; on the plant {low:+.2f} to {high:+.2f} % (90 %)"
         if last is not None:
             rows["worst_start"] = f"{change_in_percent(last.worst)} of the MPC's mean cost"
+            rows["worst_start"] += " in the twin: the plant's may be worse" * (source == "twin")
             rows["violations"] = "no more than the MPC's" if last.safe else "more than the MPC's"
         which = "twin=twin" if source == "twin" else "env=env"
         more = f'report(result.model, "report.html", {which}), then '

@@ -43,7 +43,7 @@ CURE = (
     "mpc.disturbances.d_min, mpc.disturbances.d_max)."
 )
 ADVICE = {
-    "keep the MPC": "there is little to gain over the MPC.",
+    "keep the MPC": f"there is little to gain over the MPC, less than {WORTH:.0%}.",
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
     "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
     "headroom(...).reidentified.",

@@ -19,6 +19,7 @@ from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import (
     below_set_points,
     in_deviations,
+    require_spaces,
     require_theta_shown,
     warn_of_box,
     warn_of_order,
@@ -253,19 +254,6 @@ class Simulator:
     def close(self) -> None:
         """Close all envs."""
         self.envs.close()
-
-
-def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
-    """Raise unless an env shows theta and takes the inputs."""
-    shape = env.observation_space.shape
-    actions = env.action_space.shape
-    if shape != (problem.n_theta,) or actions != (problem.model.n_inputs,):
-        raise ValueError(
-            f"The env shows {shape} and takes {actions}; theta of the MPC has {problem.n_theta} "
-            f"entries {problem.layout.names}, and there are {problem.model.n_inputs} inputs. Wrap "
-            "the env so that it shows theta: see PastInputs and ObserveDisturbance in "
-            "sb3_yann.wrappers."
-        )
 
 
 def require_repeated(problem: LinearMPC, env: Source | EnvPool, seed: int, cost: float) -> None:

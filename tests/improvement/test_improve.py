@@ -535,7 +535,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     assert found.report().splitlines()[:5] == [
         "Accepted: a better policy.",
         "  change       -2.10 % of the MPC's mean cost in the twin",
-        "  worst start  +0.04 % of the MPC's mean cost",
+        "  worst start  +0.04 % of the MPC's mean cost in the twin: the plant's may be worse",
         "  violations   no more than the MPC's",
         "  steps        2 candidates tried",
     ]

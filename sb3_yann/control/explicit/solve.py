@@ -319,8 +319,9 @@ def _require_feasible(program: ParametricQP, timer: BudgetTimer) -> None:
     if ball.status != 0 or ball.x[-1] < 1e-9:
         raise ValueError(
             "The MPC problem is infeasible: no theta in its box has inputs that keep every bound "
-            "with room to spare. Widen x_min/x_max, u_min/u_max or the terminal set, or lengthen "
-            "the horizon. Where only a line or a plane of theta is feasible, use online()."
+            "with room to spare. Have bounds and operating point the same units? "
+            "Widen x_min/x_max, u_min/u_max or the terminal set, or lengthen the horizon. Where "
+            "only a line or a plane of theta is feasible, use online()."
         )
 
 
