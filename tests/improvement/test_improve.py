@@ -23,6 +23,7 @@ from sb3_yann import (
     Tracking,
     UntrustedTwinError,
     YannPolicy,
+    headroom,
     improve,
 )
 from sb3_yann.audit.reward import CostMismatchWarning
@@ -329,6 +330,12 @@ def test_a_simulator_that_will_not_do_is_named(make, what) -> None:
     with pytest.raises(ValueError, match=what):
         improve(model, make, **FEW)
     assert bits(model) == before
+
+
+def test_an_env_that_does_not_show_theta_is_named_in_plant_units_too() -> None:
+    shifted = replace(problem(), model=replace(problem().model, x_ss=[1.0, 2.0], u_ss=[0.0]))
+    with pytest.raises(ValueError, match=r"The env shows \(3,\) and takes \(1,\); theta of the"):
+        headroom(shifted, Strange, n_starts=2)
 
 
 class Rare(Spring):
