@@ -238,6 +238,7 @@ class LinearMPC(MPCProblem):
         }
         _warn_of_misread_bounds(model, ranges, layout.has_constants)
         _warn_of_unused_softness(soft.x, x, states)
+        _warn_of_unreachable(tracking, x)
         _warn_of_drift(model, *states)
         checked = (
             model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
@@ -633,6 +634,23 @@ def _warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> No
             f"SoftBounds.x softens the bounds {lower[i]:g} to {upper[i]:g} of x[{i}], but theta_min"
             f" = {low[i]:g} and theta_max = {high[i]:g} do not exceed them: the law ends there. "
             "Give theta_min and theta_max the states from which it is to come back.",
+        )
+
+
+def _warn_of_unreachable(tracking: Tracking, bounds: Bounds) -> None:
+    """Warn where the bounds of the states leave a tracked output no set-point of its range."""
+    C = tracking.C[..., None]
+    with np.errstate(invalid="ignore"):  # 0 times an open side
+        ends = np.where(C != 0, C * np.stack(bounds, axis=-1), 0.0)
+    low = ends.min(axis=-1).sum(axis=-1)
+    high = ends.max(axis=-1).sum(axis=-1)
+    beyond = np.flatnonzero((tracking.r_min > high) | (tracking.r_max < low))
+    if len(beyond):
+        i = beyond[0]
+        warn(
+            f"x_min and x_max keep r[{i}] between {low[i]:g} and {high[i]:g}, and its set-points "
+            f"are {tracking.r_min[i]:g} to {tracking.r_max[i]:g}: none can be reached. Have they "
+            "the same units?"
         )
 
 

@@ -8,7 +8,15 @@ import pytest
 
 from general_problems import servo
 from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only, small_mpc
-from sb3_yann import LinearModel, LinearMPC, OutputBounds, RateLimits, SoftBounds, Terminal
+from sb3_yann import (
+    LinearModel,
+    LinearMPC,
+    OutputBounds,
+    RateLimits,
+    SoftBounds,
+    Terminal,
+    Tracking,
+)
 
 NAN = np.nan
 INF = np.inf
@@ -252,6 +260,26 @@ def test_a_soft_bound_reaches_half_its_width_beyond_and_a_hard_one_nowhere() -> 
     one_sided = {"x_min": [-1, -4], "x_max": [np.inf, 4], "theta_max": [9, 4]}
     (note,) = said(**one_sided, theta_min=None, soft=SoftBounds([1, 0], penalty=10))
     assert "theta_min = -1 and theta_max = 9 do not exceed them" in note
+
+
+@pytest.mark.parametrize(("r_min", "warns"), [(15, True), (9.9, False)])
+def test_set_points_that_the_states_bounds_leave_out_are_named(r_min, warns) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        LinearMPC(
+            LinearModel([[0.9]], [[0.5]], dt=1),
+            Q=[[1]],
+            R=[[1]],
+            horizon=3,
+            x_min=-10,
+            x_max=10,
+            u_min=-5,
+            u_max=5,
+            tracking=Tracking([0], r_min, 30),
+        )
+    found = [str(each.message) for each in caught if "none can be reached" in str(each.message)]
+    assert bool(found) == warns
+    assert all("r[0] between -10 and 10" in each and "15 to 30" in each for each in found)
 
 
 def test_softness_of_a_single_number_is_for_all_that_have_a_bound() -> None:
