@@ -229,6 +229,7 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
     # What chance squares to is not there on rows that were held out.
     share = np.where(left.may_bend[:n] | (not known), share, 0.0)
     explained = 100 * (1 - left.lags[:n] / np.where(left.linear[:n] > 0, left.linear[:n], np.inf))
+    explained = np.maximum(explained, 0.0)  # what errs more on rows held out explains nothing
     if np.any(share > 0):
         curved = (
             f"Curvature: squares and products of states and inputs explain {listed(100 * share)} % "
