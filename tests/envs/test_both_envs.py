@@ -186,20 +186,6 @@ def test_stable_baselines3_only_recommends_normalized_actions(env_id: str, wrapp
     assert NORMALIZE in message
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
-def test_gymnasiums_wrappers_find_nothing_in_an_episode(env_id: str) -> None:
-    def play() -> None:
-        env = gymnasium.make(env_id)
-        env.action_space.seed(0)
-        env.reset(seed=0)
-        over = False
-        while not over:
-            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-            over = terminated or truncated
-
-    assert messages(play) == []
-
-
 # ---- Importing sb3_yann_envs registers two environments, and does nothing else ----
 
 
@@ -239,14 +225,6 @@ def test_making_and_stepping_an_environment_stays_light(env_id: str) -> None:
 @pytest.mark.parametrize(("env_id", "steps"), [("CSTR-v0", 400), ("ClippedPendulum-v0", 200)])
 def test_an_episode_is_truncated_at_its_length(env_id: str, steps: int) -> None:
     assert gymnasium.spec(env_id).max_episode_steps == steps
-
-
-def test_registering_again_is_harmless(recwarn: pytest.WarningsRecorder) -> None:
-    before = {env_id: gymnasium.spec(env_id) for env_id in ENV_IDS}
-    sb3_yann_envs.register_envs()
-    assert not recwarn.list
-    for env_id, spec in before.items():
-        assert gymnasium.spec(env_id) is spec
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)

@@ -12,7 +12,7 @@ from stable_baselines3 import DDPG
 import general_problems
 import sample_problems
 from general_problems import solved
-from sample_layers import by_loops_and_by_torch, scrambled
+from sample_laws import by_loops_and_by_torch, scrambled
 from sb3_yann import LinearModel, LinearMPC, OutputBounds, Tracking
 from sb3_yann.control.mpc.bound_excess import Bounds
 from sb3_yann.networks import SharedYannLayer, YannLayer

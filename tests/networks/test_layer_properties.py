@@ -3,13 +3,11 @@
 from typing import Any
 
 import numpy as np
-import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from partitions import as_range, edges, mixture, steepest
-from random_problems import examples, problems
+from random_problems import as_range, edges, examples, mixture, problems, steepest
 from sb3_yann import LinearMPC
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from sb3_yann.networks.yann import LawLayer
@@ -86,24 +84,6 @@ def test_shared_network_leaves_no_jump_whatever_its_weights(
         assert np.all(np.abs(change.double().numpy()) <= most)
 
 
-@pytest.mark.slow
-@examples(20)
-@given(problems(), SEEDS, KINDS, HIDDEN, st.sampled_from([None, 0.1]))
-def test_size_and_order_of_a_batch_change_nothing(
-    mpc: LinearMPC, seed: int, kind: str, hidden: tuple[int, ...], bound: float | None
-) -> None:
-    layer = shaken(layer_of(mpc, kind, hidden, max_correction=bound), 0.3, seed)
-    theta = far_and_near(mpc, seed)
-    order = th.as_tensor(np.random.default_rng(seed).permutation(len(theta)))
-    with th.no_grad():
-        whole = layer(theta)[order]
-        others = [layer(theta[order]), th.cat([layer(row[None]) for row in theta[order]])]
-    for each in others:
-        if hidden == (4, 3):  # compiled: row by row
-            np.testing.assert_array_equal(each, whole)
-        th.testing.assert_close(each, whole, rtol=0, atol=2e-6, equal_nan=True)
-
-
 POISON = st.sampled_from([None, np.nan, np.inf, -np.inf, LARGEST])
 SIZES = st.sampled_from([0.0, 1e-3, 1.0, 1e6, 1e30, LARGEST])
 
@@ -137,17 +117,6 @@ def test_bounds_hold_for_any_weights(
     poison: float | None,
 ) -> None:
     layer = layer_of(mpc, kind, hidden, max_correction=bound)
-    bounds_hold(shaken(layer, size, seed, poison), far_and_near(mpc, seed), bound)
-
-
-@pytest.mark.slow
-@examples(10)
-@given(problems(n_regions=(33, 300)), SEEDS, st.sampled_from([0.05, None]), SIZES, POISON)
-def test_bounds_hold_for_any_weights_of_many_regions(
-    mpc: LinearMPC, seed: int, bound: float | None, size: float, poison: float | None
-) -> None:
-    layer = layer_of(mpc, "per region", (4, 3), max_correction=bound)
-    layer.row_gradients = True
     bounds_hold(shaken(layer, size, seed, poison), far_and_near(mpc, seed), bound)
 
 

@@ -9,8 +9,16 @@ import pytest
 import torch as th
 
 from general_problems import servo, solved
-from sample_laws import PROBLEMS, box_points, facet_points, law_of, smallest_slack
-from sample_layers import by_loops_and_by_torch, scrambled, train
+from sample_laws import (
+    EVERY_LAW,
+    box_points,
+    by_loops_and_by_torch,
+    facet_points,
+    law_of,
+    scrambled,
+    smallest_slack,
+    train,
+)
 from sb3_yann.control import LinearModel, LinearMPC, PiecewiseAffine
 from sb3_yann.networks import SharedYannLayer
 from sb3_yann.networks.paper_yann import PaperYann
@@ -117,9 +125,6 @@ def test_inputs_without_bounds_are_refused() -> None:
 
 
 # ---- The paper's own network, layer by layer ----
-
-
-EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
 
 
 @pytest.fixture

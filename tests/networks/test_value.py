@@ -213,21 +213,6 @@ def test_twenty_steps_of_adam_do_not_flip_the_sign_of_the_reactors_smallest_entr
 # --- the model ---------------------------------------------------------------------------------
 
 
-@EVERY_PROBLEM
-def test_model_sees_physical_units_in_float64(name: str) -> None:
-    seen: list[th.Tensor] = []
-
-    def model(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
-        seen[:] = [theta.detach(), u.detach()]
-        return theta + 0 * u[:, :1]
-
-    rows = random_rows(name, 50)
-    critic(name, model=model)(rows)
-    for got, expected in zip(seen, in_physical_units(name, rows), strict=True):
-        assert got.dtype == th.float64
-        np.testing.assert_allclose(got.numpy(), expected, rtol=1e-12, atol=1e-15)
-
-
 class Halving(th.nn.Module):
     """A model with a parameter, in a module of its own."""
 

@@ -35,7 +35,7 @@ from sb3_yann.wrappers import (
     SetPoint,
     StageCost,
 )
-from sparse_qp import FEATURES, draw, problem
+from sparse_qp import FEATURES, draw
 from structured_text import FunctionBlock
 from weights import is_mpc
 
@@ -63,7 +63,7 @@ CASES = [*((name,) for name in FEATURES), FEATURES]
 def test_a_policy_starts_as_the_law_and_its_critic_keeps_bellmans_equation(
     features: tuple[str, ...],
 ) -> None:
-    mpc = problem(draw(np.random.default_rng(11), features))
+    mpc = draw(np.random.default_rng(11), features)
     options = {"problem": mpc, "law": "online"}
     env = Shown(mpc)
     model = DDPG(YannPolicy, env, gamma=0.95, policy_kwargs=options, device="cpu")
@@ -97,7 +97,7 @@ def test_a_policy_starts_as_the_law_and_its_critic_keeps_bellmans_equation(
 
 
 def test_a_critic_with_prices_learns_compiled_and_not() -> None:
-    mpc = problem(draw(np.random.default_rng(11), ("price",)))
+    mpc = draw(np.random.default_rng(11), ("price",))
     for critic in ({}, {"kind": "state_action"}):
         options = {"problem": mpc, "law": "online", "critic": critic}
         env = Shown(mpc)
@@ -143,7 +143,7 @@ def test_wrappers_show_what_lies_ahead() -> None:
 
 @pytest.mark.slow
 def test_an_export_holds_theta_with_what_lies_ahead(tmp_path: Any) -> None:
-    mpc = problem(draw(np.random.default_rng(2), ("preview", "mixed", "price", "parametric")))
+    mpc = draw(np.random.default_rng(2), ("preview", "mixed", "price", "parametric"))
     mpc.explicit()
     export(mpc, tmp_path / "ahead.c")
     text = (tmp_path / "ahead.c").read_text()

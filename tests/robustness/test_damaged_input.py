@@ -214,17 +214,3 @@ def test_what_is_damaged_is_refused_or_read_as_it_was(name, tmp_path, monkeypatc
         except Exception as error:
             pytest.fail(f"{name}, seed (7, {k}): {error!r}")
     assert len(outcomes) > 1  # what is refused and what is taken are both met
-
-
-def test_damage_changes_what_is_damaged() -> None:
-    content = bytes(range(200))
-    rng = np.random.default_rng(0)
-    assert sum(damaged(content, rng) == content for _ in range(100)) < 5
-    assert damaged(b"", rng) == b""
-
-
-def test_a_reader_that_hangs_would_be_found(monkeypatch) -> None:
-    monkeypatch.setitem(globals(), "SECONDS", 1)
-    with pytest.raises(Wrong, match="more than 1 seconds"), _limited():
-        while True:
-            pass

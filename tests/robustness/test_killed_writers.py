@@ -78,20 +78,6 @@ def read_record(folder: Path) -> int:
     return int(found[-1])
 
 
-def write_careless(folder: Path, version: int) -> None:
-    with (folder / "file").open("w") as file:
-        for _ in range(200):
-            file.write(f"{version % 2}")
-            file.flush()
-            os.fsync(file.fileno())
-
-
-def read_careless(folder: Path) -> int:
-    text = (folder / "file").read_text()
-    assert len(text) == 200 and len(set(text)) == 1, "half"
-    return int(text[0])
-
-
 TARGETS = [
     Target("law.save", lambda path, k: law(k % 2).save(path / "law.npz"), read_law),
     Target(
@@ -106,7 +92,6 @@ TARGETS = [
     ),
     Target("record of Commissioning", write_record, read_record),
 ]
-CARELESS = Target("careless", write_careless, read_careless)
 
 
 def fork(work: Callable[[], None]) -> int:
@@ -160,15 +145,3 @@ def test_a_writer_that_is_hit_leaves_a_whole_file(target, sign, tmp_path) -> Non
         folder.mkdir()
         hit(target, folder, sign, rng)
         require_whole(target, folder)
-
-
-def test_a_writer_without_care_would_be_found(tmp_path) -> None:
-    rng = np.random.default_rng(3)
-    damaged = 0
-    for _ in range(12):
-        hit(CARELESS, tmp_path, signal.SIGKILL, rng)
-        try:
-            read_careless(tmp_path)
-        except AssertionError:
-            damaged += 1
-    assert damaged

@@ -1,4 +1,4 @@
-"""Random problems with all parts in and out, and what a general-purpose solver says of them."""
+"""Random problems with all parts in and out, and the regions of their laws."""
 
 from typing import Any
 
@@ -6,9 +6,8 @@ import numpy as np
 from hypothesis import assume, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy import optimize
 
-from online_mpc import EQUALITY, OnlineMPC
+from sample_problems import half_spaces
 from sb3_yann import (
     DisturbanceBounds,
     LinearModel,
@@ -19,7 +18,13 @@ from sb3_yann import (
     Terminal,
     Tracking,
 )
-from sb3_yann.control import ExplicitLimitError, ExplicitSolutionError
+from sb3_yann.control import (
+    ExplicitLimitError,
+    ExplicitSolutionError,
+    OnlineLaw,
+    PiecewiseAffine,
+)
+from sb3_yann.control.polyhedra import largest_ball
 
 Array = NDArray[np.float64]
 Matrices = tuple[Array, Array, Array]
@@ -144,26 +149,58 @@ def in_box(mpc: LinearMPC, count: int, stretch: float = 1.0, seed: int = 0) -> A
     return np.asarray(middle + stretch * half * drawn)
 
 
-def room(mpc: LinearMPC, theta: Array) -> float:
-    """How far all constraints can be kept at theta, by HiGHS: negative where it is infeasible.
+def unit_half(law: PiecewiseAffine) -> Array:
+    return np.asarray((law.theta_max - law.theta_min) / 2)
 
-    The unit is that of the half-widths of inputs and box.
-    """
-    qp = OnlineMPC(mpc)
-    lower, upper = qp.limits(theta)
-    equal = qp.sense == EQUALITY
-    A = np.vstack([np.eye(len(qp.unit)), qp.rows])
-    rows = []
-    values = []
-    for side, bound in ((1.0, upper), (-1.0, -lower)):
-        kept = ~equal & np.isfinite(bound)
-        rows.append(np.column_stack([side * A[kept], np.ones(kept.sum())]))
-        values.append(bound[kept])
-    held = np.column_stack([A[equal], np.zeros(equal.sum())])
-    cost = np.append(np.zeros(len(qp.unit)), -1.0)
-    free = [*[(None, None)] * len(qp.unit), (None, 1.0)]
-    found = optimize.linprog(
-        cost, np.vstack(rows), np.concatenate(values), held, lower[equal], free, method="highs"
-    )
-    assert found.status == 0, found.message
-    return float(found.x[-1])
+
+def balls(law: PiecewiseAffine) -> list[tuple[Array, float]]:
+    """Center and radius, in half-widths of the box, of a large ball in each region."""
+    half = unit_half(law)
+    found = []
+    for region in range(law.n_regions):
+        A, b = half_spaces(law, region)
+        center, radius = largest_ball(A * half, b.copy())
+        found.append((half * center, radius))
+    return found
+
+
+def slacks(law: PiecewiseAffine, points: Array) -> Array:
+    """How far each point lies inside each region, (count, p)."""
+    return np.asarray(np.minimum.reduceat(law.b - points @ law.A.T, law.starts, axis=1))
+
+
+def edges(law: PiecewiseAffine, seed: int, each: int = 4) -> tuple[Array, Array]:
+    """Points (count, n) on facets, and the directions in which the region ends there."""
+    half = unit_half(law)
+    rng = np.random.default_rng(seed)
+    points = []
+    ways = []
+    for region, (center, _) in enumerate(balls(law)):
+        A, b = half_spaces(law, region)
+        for way in half * rng.normal(size=(each, law.n_theta)):
+            speed = A @ way
+            reach = np.min((b - A @ center)[speed > 0] / speed[speed > 0])
+            points.append(center + reach * way)
+            ways.append(way / np.max(np.abs(way / half)))
+    return np.array(points), np.array(ways)
+
+
+def as_range(law: PiecewiseAffine | OnlineLaw, change: Array) -> Array:
+    """Changes of the input (..., m) as shares of its range."""
+    return np.asarray(np.abs(change) / (law.u_max - law.u_min))
+
+
+def steepest(law: PiecewiseAffine) -> Array:
+    """The most that an input moves, in ranges, where theta moves by a half-width each (m,)."""
+    slopes = (np.abs(law.gains) * unit_half(law)).sum(axis=2).max(axis=0)
+    return np.asarray(slopes / (law.u_max - law.u_min))
+
+
+def kinds(mpc: LinearMPC) -> list[PiecewiseAffine | OnlineLaw]:
+    return [mpc.explicit(), mpc.online()]
+
+
+def mixture(mpc: LinearMPC, seed: int) -> Array:
+    """Points in the box, beyond it, and on facets."""
+    inside, beyond = (in_box(mpc, 100, stretch, seed) for stretch in (1.0, 3.0))
+    return np.vstack([inside, beyond, edges(mpc.explicit(), seed, each=2)[0], 0 * inside[:1]])

@@ -1,55 +1,31 @@
-"""Laws to build networks from, and points to try them at."""
+"""Laws to build networks from, points to try them at, and a few steps of training."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann import LinearModel, LinearMPC
+import sample_problems
+from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
+from sb3_yann.networks import YannLayer
 from sb3_yann_envs import cstr, problems
 
 Array = NDArray[np.float64]
 
 
-def _asymmetric_bounds() -> LinearMPC:
-    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
-    # The middle of the inputs is 0.5 and the reach 1.5: u = 0 is the action -1/3.
-    return LinearMPC(
-        model,
-        Q=np.eye(2),
-        R=[[0.1]],
-        horizon=3,
-        x_min=[-3, -2],
-        x_max=[2, 3],
-        u_min=-1.0,
-        u_max=2.0,
-    )
-
-
-def _two_inputs() -> LinearMPC:
-    model = LinearModel([[1.1, 0.2], [-0.1, 0.9]], [[1, 0.1], [0.2, 0.8]], 0.1)
-    return LinearMPC(
-        model,
-        Q=np.eye(2),
-        R=np.diag([0.1, 0.5]),
-        horizon=2,
-        x_min=-4.0,
-        x_max=4.0,
-        u_min=[-1, -0.5],
-        u_max=[0.5, 2],
-    )
-
-
 PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "pendulum": problems.clipped_pendulum,
     "reactor": problems.cstr,
-    "asymmetric bounds": _asymmetric_bounds,
-    "two inputs": _two_inputs,
+    "asymmetric bounds": sample_problems.PROBLEMS["asymmetric input bounds"],
+    "two inputs": sample_problems.PROBLEMS["two inputs"],
 }
+EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
+INFEASIBLE = pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
 
 
 @cache
@@ -132,3 +108,36 @@ def facet_points(law: PiecewiseAffine, count: int = 4000) -> th.Tensor:
         a = np.where(same, middle, a)
         b = np.where(same, b, middle)
     return th.as_tensor(a, dtype=th.float32)
+
+
+def scrambled(layer: YannLayer, size: float = 1.0) -> YannLayer:
+    """The layer with random weights, as after much training."""
+    for parameter in layer.parameters():
+        th.nn.init.normal_(parameter, std=size)
+    return layer
+
+
+def region_of(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
+    return layer.locate(theta)[0]
+
+
+def train(layer: YannLayer, theta: th.Tensor, target: float, steps: int = 20) -> None:
+    optimizer = th.optim.Adam(layer.parameters(), 1e-2)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        (layer(theta) - target).square().mean().backward()
+        optimizer.step()
+
+
+def by_loops_and_by_torch(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
+    """Assert that compiled loops and torch give the same actions and gradients; return actions."""
+    found = []
+    for compiles in (True, False):
+        layer.network.has_loops = compiles
+        layer.zero_grad()
+        actions = layer(theta)
+        (actions - 0.3).square().sum().backward()
+        found.append([actions, *[each.grad.clone() for each in layer.network.weights()]])
+    for ours, theirs in zip(*found, strict=True):
+        th.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+    return found[0][0]

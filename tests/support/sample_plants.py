@@ -5,9 +5,40 @@ import dataclasses
 import gymnasium as gym
 import numpy as np
 
-from online_mpc import OnlineMPC
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann_envs import problems
+from sparse_qp import SparseQP
+
+
+class Plant(gym.Env):
+    """A plant whose step is given. It shows its state, and a reset puts it into another."""
+
+    dt = 0.1
+
+    def __init__(self, step=lambda x, u: 0.5 * x + u, x=(-5.0, 5.0), u=(-1.0, 1.0), start=0.0):
+        low, high = np.reshape(np.array(x, float), (2, -1))
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float64)
+        self.action_space = gym.spaces.Box(*np.reshape(np.array(u, float), (2, -1)), dtype=float)
+        self.advance = step
+        self.start = start + np.zeros(len(low))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.array((options or {}).get("state", self.start), dtype=float)
+        return self.x.copy(), {}
+
+    def step(self, action):
+        self.x = np.array(self.advance(self.x, np.asarray(action, float)), dtype=float)
+        return self.x.copy(), 0.0, False, False, {}
+
+
+class Settable(Plant):
+    """The same, but it is put into a state by ``env.unwrapped.state`` alone."""
+
+    state = property(lambda self: self.x, lambda self, x: setattr(self, "x", np.array(x)))
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)
 
 
 class LinearPlant(gym.Env):
@@ -57,7 +88,7 @@ def asymmetric_pendulum_mpc() -> LinearMPC:
 
 def feasible_states(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return ``count`` float32-exact states at which the online QP is feasible, and its inputs."""
-    online = OnlineMPC(mpc)
+    online = SparseQP(mpc)
     rng = np.random.default_rng(seed)
     states = []
     inputs = []

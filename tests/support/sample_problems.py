@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from sb3_yann import LinearModel, LinearMPC, Terminal
 from sb3_yann.control import PiecewiseAffine
@@ -161,29 +160,6 @@ def half_spaces(law: PiecewiseAffine, region: int) -> tuple[Array, Array]:
     ends = [*law.starts[1:], law.n_halfspaces]
     rows = slice(law.starts[region], ends[region])
     return law.A[rows], law.b[rows]
-
-
-def facet_points(law: PiecewiseAffine) -> Array:
-    """The middle of every facet of every region (count, n)."""
-    half = (law.theta_max - law.theta_min) / 2
-    points = []
-    for region in range(law.n_regions):
-        A, b = half_spaces(law, region)
-        A = A * half
-        cost = np.append(np.zeros(law.n_theta), -1)
-        for facet in range(len(b)):
-            others = np.arange(len(b)) != facet
-            ball = optimize.linprog(
-                cost,
-                A_ub=np.hstack([A[others], np.ones((others.sum(), 1))]),
-                b_ub=b[others],
-                A_eq=np.append(A[facet], 0)[None],
-                b_eq=b[[facet]],
-                bounds=[(None, None)] * len(cost),
-            )
-            if ball.status == 0 and ball.x[-1] > 1e-6:
-                points.append(ball.x[:-1] * half)
-    return np.array(points)
 
 
 def vertices(law: PiecewiseAffine) -> Array:

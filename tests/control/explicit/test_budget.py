@@ -13,12 +13,6 @@ from sb3_yann.control.explicit import certificate
 from sb3_yann.control.explicit.budget import SolveBudget
 
 
-def test_the_law_of_each_solver_is_kept() -> None:
-    mpc = benchmark()
-    assert mpc.explicit(solver="ppopt") is mpc.explicit("ppopt")
-    assert mpc.explicit() is mpc.explicit("walk")
-
-
 @pytest.mark.parametrize("solver", ["walk", "ppopt"])
 def test_too_many_regions_are_an_error_that_says_what_to_change(solver: str) -> None:
     message = "more than region_limit = 4 regions: .* were found in .* shorten the horizon"

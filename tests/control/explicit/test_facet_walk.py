@@ -13,9 +13,7 @@ from scipy import optimize
 
 import general_problems
 import sample_problems
-from online_mpc import OnlineMPC
 from random_problems import examples, problems
-from reference_answers import online_answers, relative_error
 from sample_problems import PROBLEMS, box_points, half_spaces, input_bounds_only, small_mpc, solved
 from sb3_yann import LinearModel, LinearMPC, RateLimits, Terminal
 from sb3_yann.control import ExplicitSolutionError, PiecewiseAffine
@@ -29,6 +27,7 @@ from sb3_yann.control.polyhedra import (
     farthest_points,
     largest_ball,
 )
+from sparse_qp import SparseQP, online_answers, relative_error
 
 # Those that ppopt solves in about a second.
 NAMES = [
@@ -76,14 +75,6 @@ def test_regions_are_those_of_ppopt(name: str) -> None:
 @given(problems(n_regions=(1, 40)))
 def test_regions_of_random_problems_are_those_of_ppopt(mpc: LinearMPC) -> None:
     assert_same_regions(mpc)
-
-
-@pytest.mark.parametrize("name", ["two inputs", "servo with all of it"])
-def test_every_half_space_of_a_region_bounds_it(name: str) -> None:
-    for region in regions_of(problem(name), "walk"):
-        np.testing.assert_allclose(np.linalg.norm(region.A, axis=1), 1)
-        for row in range(len(region.b)):
-            assert largest_ball(region.A, region.b, row)[1] > 1e-9
 
 
 def carts(**changes: Any) -> LinearMPC:
@@ -148,36 +139,6 @@ def test_a_region_thinner_than_a_millionth_of_the_box_is_found() -> None:
     inputs, feasible = online_answers(slim, points)
     assert feasible.all()
     assert relative_error(slim, law(points), inputs) <= 1e-9
-
-
-def test_regions_that_no_first_point_leads_to_are_found_from_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    from sb3_yann.control.explicit import facet_walk
-
-    explore = facet_walk._Walk.explore
-    calls = []
-
-    def late(self: Any, wave: Any) -> None:
-        calls.append(wave)
-        if len(calls) > 1:
-            explore(self, wave)
-
-    monkeypatch.setattr(facet_walk._Walk, "explore", late)
-    assert problem("two inputs").explicit().n_regions == 27
-
-
-@pytest.mark.parametrize("width", [1e-5, 1e-7])
-def test_facets_of_a_thin_polyhedron_are_those_of_the_same_one_made_round(width: float) -> None:
-    random = np.random.default_rng(0)
-    A = random.normal(size=(40, 3))
-    A /= np.linalg.norm(A, axis=1)[:, None]
-    b = random.uniform(0.5, 1.5, 40)
-    round_one = bounded_region(A, b, 0.0)[2]
-    thin = A @ np.linalg.inv(np.linalg.qr(random.normal(size=(3, 3)))[0] * [1, 1, width])
-    length = np.linalg.norm(thin, axis=1)
-    found = bounded_region(thin / length[:, None], b / length, 0.0)[2]
-    assert found.tolist() == round_one.tolist() and len(found) < 40
 
 
 """x, y >= 0 and 3 x + 4 y <= 12: corners at (0, 0), (4, 0) and (0, 3); the inner circle has 1."""
@@ -333,7 +294,7 @@ def test_a_thin_gap_between_two_regions_is_found(
 
     message, theta = error_of(monkeypatch, name, spoil)
     assert "no region covers a feasible parameter" in message
-    assert OnlineMPC(solved(name))(theta) is not None
+    assert SparseQP(solved(name))(theta) is not None
 
 
 @pytest.mark.parametrize("reach", [1e-2, 1e-5])
@@ -355,11 +316,6 @@ def test_the_regions_of_ppopt_are_checked_too(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(module, "critical_regions", lambda *args: find(*args)[1:])
     with pytest.raises(ExplicitSolutionError, match="no region covers a feasible parameter"):
         PROBLEMS["benchmark"]().explicit("ppopt")
-
-
-def test_finding_no_region_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    message, _ = error_of(monkeypatch, "benchmark", lambda regions: [])
-    assert "no region was found" in message
 
 
 def test_a_failed_check_is_not_kept_as_a_law(monkeypatch: pytest.MonkeyPatch) -> None:

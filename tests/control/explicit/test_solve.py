@@ -12,10 +12,8 @@ import pytest
 from scipy import optimize
 
 from benchmarks.suite import WRONG, Outcome, compare, examine, names
-from benchmarks.suite_problems import SUITE, chain, off_center, quietly
+from benchmarks.suite_problems import SUITE, off_center, quietly
 from fresh_process import run_python
-from online_mpc import OnlineMPC
-from reference_answers import online_answers, relative_error
 from sample_problems import (
     DOUBLE_INTEGRATOR,
     PROBLEMS,
@@ -28,7 +26,7 @@ from sample_problems import (
 )
 from sb3_yann import LinearModel, LinearMPC, SoftBounds, Terminal
 from sb3_yann.control import ExplicitLimitError, PiecewiseAffine, lqr
-from sb3_yann.control.explicit.solve import ProgramUnits
+from sparse_qp import SparseQP, online_answers, relative_error
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -54,7 +52,7 @@ def test_online_qp_itself_agrees_with_a_general_purpose_solver() -> None:
         return total + float(x @ mpc.terminal.cost @ x)
 
     best = optimize.minimize(cost, np.zeros(2), bounds=[(-1, 1)] * 2, tol=1e-14)
-    assert OnlineMPC(mpc)(theta)[0] == pytest.approx(best.x[0], abs=1e-6)
+    assert SparseQP(mpc)(theta)[0] == pytest.approx(best.x[0], abs=1e-6)
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.95, 0.8])
@@ -255,26 +253,6 @@ def test_a_small_feasible_set_far_from_the_center_of_the_box_is_found() -> None:
     law = off_center(-2, 20, 0.1, 1).explicit()
     assert law.n_regions == 3
     assert law.in_domain([[-0.21], [-0.19], [0.0], [0.19], [0.21]]).tolist() == [0, 1, 1, 1, 0]
-
-
-def test_a_bound_that_the_input_hardly_moves_bounds_theta_alone() -> None:
-    # One step of 0.01 s moves the second mass by 0.01^4 / 24: a law for its bound is not to be had.
-    mpc = chain(0.01, 2, 2.0)
-    plain = mpc.condensed().scaled(np.zeros(4), mpc.theta_max, np.ones(2))
-    units = ProgramUnits(mpc.condensed(), mpc.u_min, mpc.u_max)
-    faint = np.any(plain.G, axis=1) & ~np.any(units.scaled.G, axis=1)
-    assert 0 < np.count_nonzero(faint) < len(faint)
-    moved = np.abs(plain.G).sum(axis=1)
-    assert np.all(moved[faint] < 1e-7)
-    np.testing.assert_allclose(units.scaled.w[faint], (plain.w - moved)[faint], rtol=1e-15)
-    np.testing.assert_array_equal(units.scaled.w[~faint], plain.w[~faint])
-    assert mpc.explicit().n_regions > 9
-
-
-def test_a_bound_that_an_unbounded_input_moves_stays() -> None:
-    mpc = chain(0.01, 2, 2.0)
-    units = ProgramUnits(mpc.condensed(), np.array([-np.inf]), np.array([np.inf]))
-    assert np.all(np.any(units.scaled.G, axis=1))
 
 
 SLIDER = LinearModel([[1, 0.2], [0, 0.95]], [[0.02], [0.2]], dt=0.2)

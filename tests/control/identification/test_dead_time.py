@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC, identify
-from sb3_yann.control.identification.dead_time import with_memory
-from sb3_yann.log import Episode
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0, 0.5], [1.0, 0.0]])
@@ -22,15 +20,6 @@ def late(delays: tuple[int, int], noise: float, hold: int = 1, mean: float = 0.0
         acting = np.array([u[k - L, j] if k >= L else 0.0 for j, L in enumerate(delays)])
         x[k + 1] = A @ x[k] + B @ acting + noise * rng.normal(size=2)
     return x, u
-
-
-def test_an_episode_keeps_the_steps_before_which_all_inputs_on_their_way_are_known() -> None:
-    x = np.arange(10.0).reshape(5, 2)
-    u = np.arange(8.0).reshape(4, 2)
-    (one,) = with_memory([Episode(x, u)], [3, 1])
-    assert one.states.tolist() == [[6, 7, 4, 2, 0, 5], [8, 9, 6, 4, 2, 7]]
-    assert one.driven.tolist() == [[6, 7]]
-    assert with_memory([Episode(x, u)], [4, 0]) == []
 
 
 @pytest.mark.parametrize("delays", [(0, 0), (1, 0), (2, 5), (3, 3), (0, 8)])

@@ -4,7 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-import tempfile
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,20 +13,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from partitions import (
+from random_problems import (
     as_range,
     balls,
     edges,
+    examples,
+    in_box,
     kinds,
     mixture,
+    problems,
     slacks,
     steepest,
     unit_half,
 )
-from random_problems import examples, in_box, problems, room
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control import PiecewiseAffine
-from sb3_yann.control._kernels.law import walk_to
+from sparse_qp import room
 
 UNKNOWN = np.empty(0, np.int64)
 
@@ -88,13 +89,6 @@ def test_it_finds_the_region_of_a_scan_on_facets(make) -> None:
     assert np.array_equal(law.locate(points), scanned(law).locate(points))
 
 
-def test_no_point_is_left_to_a_scan() -> None:
-    law = chain()
-    points = around(law, 2000)
-    found = [walk_to(*law.packed, points, i) for i in range(len(points))]
-    assert np.array_equal(found, law.locate(points))
-
-
 def test_where_neighbors_are_unknown_or_wrong_the_scan_finds_it() -> None:
     law = chain()
     points = around(chain(), 500)
@@ -140,39 +134,6 @@ def test_regions_that_overlap_go_by_the_largest_slack() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 1))
     nearest = np.abs(points - middles).argmin(axis=1)
     assert np.array_equal(law.locate(points), nearest)
-
-
-def test_of_regions_that_tie_the_first_one_counts() -> None:
-    law = cart()
-    ends = np.append(law.starts, law.n_halfspaces)
-    rows = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in range(125) for _ in range(2)])
-    counts = np.repeat(np.diff(ends), 2)
-    twice = PiecewiseAffine(
-        np.repeat(law.gains, 2, axis=0), np.repeat(law.offsets, 2, axis=0), law.A[rows],
-        law.b[rows], np.append(0, np.cumsum(counts)[:-1]), law.u_min, law.u_max,
-        law.theta_min, law.theta_max,
-    )  # fmt: skip
-    points = around(law, 2000)
-    assert np.array_equal(twice.locate(points), 2 * law.locate(points))
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        [0.5, 0.1],
-        (0.5, 0.1),
-        np.array([0.5, 0.0, 0.1])[::2],
-        np.array([0, 0]),
-    ],
-)
-def test_theta_may_come_in_any_array_or_list(given) -> None:
-    law = cart()
-    expected = law(np.ascontiguousarray(given, dtype=float))
-    frozen = np.array(given, dtype=float)
-    frozen.setflags(write=False)
-    assert np.array_equal(law(given), expected)
-    assert np.array_equal(law(frozen), expected)
-    assert np.array_equal(law(np.array([given, given], dtype=float))[1], expected)
 
 
 @pytest.mark.slow
@@ -278,17 +239,3 @@ def test_every_number_has_an_input_within_its_bounds(mpc: LinearMPC, data, dtype
         u = law(points)
         assert np.all((law.u_min <= u) & (u <= law.u_max))
         np.testing.assert_array_equal(law(points[0]), u[0])
-
-
-@examples(8)
-@given(problems(), SEEDS)
-def test_law_is_saved_to_the_last_bit(mpc: LinearMPC, seed: int) -> None:
-    points = mixture(mpc, seed)[::5]
-    with tempfile.TemporaryDirectory() as folder:
-        for law in kinds(mpc):
-            law.save(Path(folder) / "law.npz")
-            loaded = type(law).load(Path(folder) / "law.npz")
-            assert (loaded, hash(loaded)) == (law, hash(law))
-            assert loaded.model == law.model
-            np.testing.assert_array_equal(loaded.theta_ss, law.theta_ss)
-            np.testing.assert_array_equal(loaded(points), law(points))

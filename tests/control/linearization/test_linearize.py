@@ -6,8 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sample_plants import Plant
 from sb3_yann import LinearModel
-from sb3_yann.control.simulator import sample_time, to_vector
+from sb3_yann.control.simulator import sample_time
 from sb3_yann_envs import cstr
 
 # theta+ = theta + dt speed+, speed+ = speed + dt (15 sin(theta) + 3 u), at dt = 0.05 (Gymnasium's
@@ -15,25 +16,6 @@ from sb3_yann_envs import cstr
 UPRIGHT_A = [[1.0375, 0.05], [0.75, 1.0]]
 UPRIGHT_B = [[0.0075], [0.15]]
 HANGING_A = [[0.9625, 0.05], [-0.75, 1.0]]
-
-
-class Plant(gym.Env):
-    """A plant of one state and one input whose step is given; reads the state it is set to."""
-
-    def __init__(self, step: Any = lambda x, u: 0.5 * x + u, low: float = -1.0) -> None:
-        self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float64)
-        self.action_space = gym.spaces.Box(low, 1, (1,), np.float64)
-        self.advance = step
-        self.dt = 0.1
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = np.array((options or {}).get("state", [0.0]), dtype=float)
-        return self.x.copy(), {}
-
-    def step(self, action):
-        self.x = np.array(self.advance(self.x, np.asarray(action)), dtype=float)
-        return self.x.copy(), 0.0, False, False, {}
 
 
 def test_reactor_is_linearized_as_its_equations_are() -> None:
@@ -231,10 +213,10 @@ class Delayed(Plant):
         self.delay = delay
         self.keeps = keeps
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, **given: Any) -> Any:
         if not self.keeps:
             self.line = [0.0] * self.delay
-        return super().reset(seed=seed, options=options)
+        return super().reset(**given)
 
     def step(self, action):
         self.line.append(float(action[0]))
@@ -247,20 +229,6 @@ class Delayed(Plant):
 def test_inputs_on_their_way_are_noticed(delay: int, keeps: bool, point: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="the plant has states besides these"):
         LinearModel.from_env(Delayed(delay, keeps), **point)
-
-
-def test_an_actuator_that_lags_is_noticed() -> None:
-    class Valve(Plant):
-        def reset(self, *, seed=None, options=None):
-            self.valve = 0.0
-            return super().reset(seed=seed, options=options)
-
-        def step(self, action):
-            self.valve += 0.3 * (float(action[0]) - self.valve)
-            return super().step(np.array([self.valve]))
-
-    with pytest.raises(ValueError, match=r"starts anew \(a delay of the input, an actuator"):
-        LinearModel.from_env(Valve())
 
 
 def test_hanging_pendulum_whose_angle_wraps_there_is_refused() -> None:
@@ -292,48 +260,24 @@ def test_what_is_no_environment_of_a_plant_is_named(env: Any, message: str) -> N
 # ---- How a simulator is set, read and scaled: what is tolerated, and where it ends ----
 
 
-def box(low: Any, high: Any) -> gym.spaces.Box:
-    return gym.spaces.Box(np.array(low, float), np.array(high, float), dtype=np.float64)
+def settling(u: Any = (-1.0, 1.0)) -> Plant:
+    return Plant(lambda x, u: 0.5 * x + 0.25 * u, (-4.0, 4.0), u)
 
 
-class Faulty(gym.Env[Any, Any]):
-    """A stable plant of one state, with a fault."""
-
-    dt = 0.5
-
-    def __init__(self, fault: str = "") -> None:
-        self.observation_space = box([-4], [4])
-        self.action_space = box([-1], [1])
-        self.fault = fault
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.x = np.array((options or {}).get("state", [0.0]), float)
-        return self._seen(), {}
-
-    def step(self, action: Any) -> Any:
-        self.x = 0.5 * self.x + 0.25 * np.asarray(action)
-        return self._seen(), 0.0, self.fault == "ends", False, {}
-
-    def _seen(self) -> Any:
-        return self.x + (self.fault == "shows another")
-
-
-class Clock(Faulty):
+class Clock(Plant):
     """A plant that is pushed at one sample after a reset."""
 
     def __init__(self, at: int) -> None:
-        super().__init__()
+        super().__init__(self.pushed)
         self.at = at
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.t = 0
-        return super().reset(seed=seed, options=options)
-
-    def step(self, action: Any) -> Any:
-        _, *rest = super().step(action)
-        self.x = self.x + 0.1 * (self.t == self.at)
+    def pushed(self, x: Any, u: Any) -> Any:
         self.t += 1
-        return self._seen(), *rest
+        return 0.5 * x + 0.25 * u + 0.1 * (self.t == self.at + 1)
+
+    def reset(self, **given: Any) -> Any:
+        self.t = 0
+        return super().reset(**given)
 
 
 @pytest.mark.parametrize("at", [1, 2, 19])
@@ -345,24 +289,22 @@ def test_a_clock_is_noticed_whichever_of_twenty_samples_it_strikes_at(at: int) -
     LinearModel.from_env(Clock(20), x_ss=[0.0], u_ss=[0.0])
 
 
-class Strict(Faulty):
+class Strict(Plant):
     """A plant that is cut, or ends, after each step, and takes none until it is reset."""
 
     def __init__(self, ends: bool) -> None:
-        super().__init__()
+        super().__init__(lambda x, u: 0.5 * x + 0.25 * u)
         self.ends = ends
-        self.done = False
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+    def reset(self, **given: Any) -> Any:
         self.done = False
-        return super().reset(seed=seed, options=options)
+        return super().reset(**given)
 
     def step(self, action: Any) -> Any:
         if self.done:
             raise RuntimeError("step after the end")
-        seen, reward, *_ = super().step(action)
         self.done = True
-        return seen, reward, self.ends, not self.ends, {}
+        return *super().step(action)[:2], self.ends, not self.ends, {}
 
 
 @pytest.mark.parametrize("ends", [True, False])
@@ -378,24 +320,17 @@ def test_an_episode_that_is_over_is_begun_anew_before_its_state_is_set(ends: boo
 
 
 def test_the_notes_tell_what_was_solved_for_and_what_is_observed() -> None:
-    model = LinearModel.from_env(Faulty(), x_ss=[np.nan], u_ss=[0.4])
+    model = LinearModel.from_env(settling(), x_ss=[np.nan], u_ss=[0.4])
     assert model.x_ss == pytest.approx([0.2])
     assert any(
         "Of the 2 entries of the operating point, 1 were solved for" in n for n in model.notes
     )
     assert not any("observation is not this state" in n or "terminates" in n for n in model.notes)
-    shown = LinearModel.from_env(
-        Faulty("shows another"), x_ss=[0.0], u_ss=[0.0], get_state=lambda env: env.x
-    )
-    assert any("The observation is not this state." in n for n in shown.notes)
-    ends = LinearModel.from_env(Faulty("ends"), x_ss=[0.0], u_ss=[0.0])
-    assert any("terminates the episode at the operating point" in n for n in ends.notes)
-    assert model.dt == 0.5 and model.n_disturbances == 0
+    assert model.dt == 0.1 and model.n_disturbances == 0
 
 
 def test_without_a_state_the_input_in_the_middle_is_held_and_with_one_that_which_holds_it() -> None:
-    plant = Faulty()
-    plant.action_space = box([-1], [3])
+    plant = settling((-1.0, 3.0))
     model = LinearModel.from_env(plant)
     assert model.u_ss == pytest.approx([1.0]) and model.x_ss == pytest.approx([0.5])
     held = LinearModel.from_env(plant, x_ss=[0.25])
@@ -403,17 +338,13 @@ def test_without_a_state_the_input_in_the_middle_is_held_and_with_one_that_which
 
 
 def test_the_time_of_a_step_is_given_or_the_plant_s_own() -> None:
-    assert sample_time(Faulty(), None) == 0.5 and sample_time(Faulty(), 2) == 2.0
+    assert sample_time(settling(), None) == 0.1 and sample_time(settling(), 2) == 2.0
     for name, value in (("tau", 0.25), ("DT", np.float32(0.125))):
-        plant = Faulty()
+        plant = settling()
         plant.dt = 0.0  # none
         setattr(plant, name, value)
         assert sample_time(plant, None) == value
-    plant = Faulty()
+    plant = settling()
     plant.dt = np.inf
-    with pytest.raises(ValueError, match="Faulty has no dt, tau or DT to take it from"):
+    with pytest.raises(ValueError, match="Plant has no dt, tau or DT to take it from"):
         sample_time(plant, None)
-
-
-def test_a_vector_of_numbers_is_a_state_and_words_are_none() -> None:
-    assert to_vector([1, 2]).tolist() == [1.0, 2.0] and to_vector(["a"]) is None

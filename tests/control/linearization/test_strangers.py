@@ -9,83 +9,54 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from sample_plants import Plant, Settable
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.control.linearization import Jacobian, jacobian, notes_of
-from sb3_yann.control.simulator import noise_of
+from sb3_yann.control.linearization import Jacobian, jacobian
 from sb3_yann.wrappers import TruncateAtTimeLimit
 from sb3_yann_envs import cstr
 
 
-class Adaptive(gym.Env):
+def adaptive(rtol: float, method: str) -> Plant:
     """The reactor of the package, stepped by an adaptive integrator with tolerances of its own."""
 
-    dt = cstr.DT
+    def step(x: Any, u: Any) -> Any:
+        options: Any = {"rtol": rtol, "atol": rtol, "method": method}
+        return solve_ivp(lambda t, x: cstr.dynamics(x, u), (0, cstr.DT), x, **options).y[:, -1]
 
-    def __init__(self, rtol: float, method: str) -> None:
-        half = 0.2 * np.abs(cstr.X_SS)
-        self.observation_space = gym.spaces.Box(cstr.X_SS - half, cstr.X_SS + half, dtype=float)
-        width = np.maximum(np.abs(cstr.U_SS), 1.0)
-        self.action_space = gym.spaces.Box(cstr.U_SS - width, cstr.U_SS + width, dtype=float)
-        self.options = {"rtol": rtol, "atol": rtol, "method": method}
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.array(cstr.X_SS, dtype=float)
-        return self.state.copy(), {}
-
-    def step(self, action):
-        u = np.asarray(action, dtype=float)
-        found = solve_ivp(
-            lambda t, x: cstr.dynamics(x, u), (0, self.dt), self.state, **self.options
-        )
-        self.state = found.y[:, -1]
-        return self.state.copy(), 0.0, False, False, {}
+    half = 0.2 * np.abs(cstr.X_SS)
+    width = np.maximum(np.abs(cstr.U_SS), 1.0)
+    box = cstr.X_SS - half, cstr.X_SS + half
+    plant = Settable(step, box, (cstr.U_SS - width, cstr.U_SS + width), cstr.X_SS)
+    plant.dt = cstr.DT
+    return plant
 
 
 @pytest.mark.parametrize(("rtol", "method"), [(1e-3, "RK45"), (1e-5, "LSODA")])
 def test_an_adaptive_integrator_is_linearized_through_its_noise(rtol: float, method: str) -> None:
     truth = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
-    model = LinearModel.from_env(Adaptive(rtol, method), u_ss=cstr.U_SS)
+    model = LinearModel.from_env(adaptive(rtol, method), u_ss=cstr.U_SS)
     for found, exact in ((model.A, truth.A), (model.B, truth.B)):
         assert np.abs(found - exact).max() < 0.01 * np.abs(exact).max()
 
 
-class Rough(gym.Env):
+def rough(grid: float) -> Plant:
     """A plant of two states whose result is rounded to a grid, as a loose tolerance does."""
 
-    dt = 0.1
+    def step(at: Any, u: Any) -> Any:
+        x, v = at
+        exact = np.array([x + 0.1 * v, 0.9 * v - 0.05 * np.sin(x) + 0.1 * u[0]])
+        phase = np.array([x + 2 * v + 3 * u[0] + 0.1, 5 * x + v + u[0] + 0.2])
+        return exact + grid * np.sin(1e9 * phase)
 
-    def __init__(self, grid: float) -> None:
-        self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float64)
-        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
-        self.grid = grid
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.zeros(2)
-        return self.state.copy(), {}
-
-    def step(self, action):
-        x, v = self.state
-        u = float(np.asarray(action)[0])
-        exact = np.array([x + 0.1 * v, 0.9 * v - 0.05 * np.sin(x) + 0.1 * u])
-        noise = self.grid * np.sin(1e9 * np.array([x + 2 * v + 3 * u + 0.1, 5 * x + v + u + 0.2]))
-        self.state = exact + noise
-        return self.state.copy(), 0.0, False, False, {}
+    return Settable(step, ([-1.0, -1.0], [1.0, 1.0]))
 
 
 @pytest.mark.parametrize("grid", [1e-7, 1e-5, 1e-4])
 def test_noise_of_a_simulator_is_measured_and_stepped_over(grid: float) -> None:
-    model = LinearModel.from_env(Rough(grid), u_ss=[0.0])
+    model = LinearModel.from_env(rough(grid), u_ss=[0.0])
     np.testing.assert_allclose(model.A, [[1, 0.1], [-0.05, 0.9]], atol=5 * grid / 0.1 + 1e-6)
     np.testing.assert_allclose(model.B, [[0], [0.1]], atol=5 * grid / 0.1 + 1e-6)
     assert "as adaptive integrators do" in model.report()
-
-
-def test_noise_is_told_from_a_kink() -> None:
-    point = np.array([0.3])
-    assert noise_of(lambda z: np.abs(z - 0.3001), point, np.ones(1))[0] == 0
-    assert noise_of(lambda z: np.sin(z), point, np.ones(1))[0] < 1e-14
 
 
 class Body(gym.Env):
@@ -132,84 +103,52 @@ def test_the_interface_of_mujoco_is_taken() -> None:
     assert "The observation is not this state" in model.report()
 
 
-class Forgets(gym.Env):
+def forgets(pole: float) -> Plant:
     """A plant whose next state does not depend on this one: it settles within a sample."""
-
-    dt = 1.0
-
-    def __init__(self, pole: float = 0.0) -> None:
-        self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float64)
-        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
-        self.pole = pole
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.zeros(1)
-        return self.state.copy(), {}
-
-    def step(self, action):
-        self.state = self.pole * self.state + 2 * np.asarray(action, dtype=float)
-        return self.state.copy(), 0.0, False, False, {}
+    return Settable(lambda x, u: pole * x + 2 * u)
 
 
 @pytest.mark.parametrize("pole", [0.0, 1e-9])
 def test_a_plant_that_forgets_within_a_sample_has_a_model_and_a_law(pole: float) -> None:
-    model = LinearModel.from_env(Forgets(pole))
+    model = LinearModel.from_env(forgets(pole))
     np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [pole, 2], atol=1e-10)
     assert "gone within one sample" in model.report()
     mpc = LinearMPC(model, Q=[[1]], R=[[1]], horizon=2, x_min=-5, x_max=5, u_min=-1, u_max=1)
     assert abs(mpc.explicit()([3.0])[0]) < 1e-6
 
 
-class Rounds(Forgets):
-    """Forgets too, but its next state is rounded as hundreds of operations round."""
-
-    def step(self, action):
-        settled = 2 * np.asarray(action, dtype=float) + 0.5
-        self.state = settled + 4e-16 * np.sin(1e6 * self.state)
-        return self.state.copy(), 0.0, False, False, {}
-
-
 def test_rounding_is_no_slope_of_a_state_that_is_forgotten() -> None:
-    model = LinearModel.from_env(Rounds(), [0.5], [0.0])
+    rounds = Settable(lambda x, u: 2 * u + 0.5 + 4e-16 * np.sin(1e6 * x))  # as many operations do
+    model = LinearModel.from_env(rounds, [0.5], [0.0])
     np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [0, 2], atol=1e-9)
 
 
-class Root(Forgets):
+def tank(x: Any, u: Any) -> Any:
     """A tank whose outflow has no value below the outlet."""
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.ones(1)
-        return self.state.copy(), {}
-
-    def step(self, action):
-        if self.state[0] < 0.1:
-            raise FloatingPointError("below the outlet")
-        self.state = self.state + 0.5 * (1 + np.asarray(action, float) - np.sqrt(self.state))
-        return self.state.copy(), 0.0, False, False, {}
+    if x[0] < 0.1:
+        raise FloatingPointError("below the outlet")
+    return x + 0.5 * (1 + u - np.sqrt(x))
 
 
 def test_a_plant_without_a_value_there_turns_the_search_for_a_steady_state_back() -> None:
-    model = LinearModel.from_env(Root(), u_ss=[-0.5])
+    model = LinearModel.from_env(Settable(tank, start=1.0), u_ss=[-0.5])
     np.testing.assert_allclose(model.x_ss, [0.25], atol=1e-6)
 
 
-class Careless(Forgets):
+class Careless(Settable):
     """Calls its time limit a termination."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(0.5)
+        super().__init__(lambda x, u: 0.5 * x + 2 * u)
         self.limit = limit
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, **given: Any) -> Any:
         self.steps = 0
-        return super().reset(seed=seed)
+        return super().reset(**given)
 
-    def step(self, action):
-        observation, *_ = super().step(action)
+    def step(self, action: Any) -> Any:
         self.steps += 1
-        return observation, 0.0, self.steps >= self.limit, False, {}
+        return *super().step(action)[:2], self.steps >= self.limit, False, {}
 
 
 def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
@@ -225,24 +164,14 @@ def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
     LinearModel.from_env(Earlier(limit=30))  # nor of an end that inputs bring about
 
 
-class Cone(gym.Env):
+def cone(h: Any, u: Any) -> Any:
     """A conical tank: the higher its level, the slower, so that a search may run away upwards."""
-
-    observation_space = gym.spaces.Box(0.0, 60.0, (1,), np.float64)
-    action_space = gym.spaces.Box(0.0, 400.0, (1,), np.float64)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.h = np.array(options["state"] if options else [35.0], np.float64)
-        return self.h.copy(), {}
-
-    def step(self, action: Any) -> Any:
-        flow = float(action[0]) - 45 * np.sqrt(self.h)
-        self.h = np.clip(self.h + 5 * flow / (np.pi * (0.4 * np.maximum(self.h, 2)) ** 2), 0, 60)
-        return self.h.copy(), 0.0, False, False, {}
+    flow = u - 45 * np.sqrt(h)
+    return np.clip(h + 5 * flow / (np.pi * (0.4 * np.maximum(h, 2)) ** 2), 0, 60)
 
 
 def test_a_plant_that_a_search_runs_away_from_is_left_to_settle() -> None:
-    model = LinearModel.from_env(Cone(), dt=5)
+    model = LinearModel.from_env(Plant(cone, (0.0, 60.0), (0.0, 400.0), 35.0), dt=5)
     assert model.u_ss == 200
     np.testing.assert_allclose(model.x_ss, (200 / 45) ** 2, rtol=1e-6)
 
@@ -333,13 +262,6 @@ def test_slopes_that_differ_by_a_hundredth_of_the_steepest_are_a_kink(k, smooth)
             of(lambda z: z + k * abs(z))
 
 
-def test_a_jump_has_no_slope() -> None:
-    with pytest.raises(ValueError, match="no limit for short steps"):
-        of(lambda z: z + 0.01 * np.sin(1e5 * z), at=0.3)
-    with pytest.raises(ValueError, match=r"differ|no limit"):
-        of(lambda z: z + (z > 0))
-
-
 def test_a_point_in_float32_is_differenced_between_what_is_evaluated() -> None:
     def single(z: np.ndarray) -> np.ndarray:
         return z.astype(np.float32).astype(np.float64)
@@ -348,21 +270,6 @@ def test_a_point_in_float32_is_differenced_between_what_is_evaluated() -> None:
     assert found.value[0, 0] == pytest.approx(2 * float(np.float32(1.1)), rel=1e-6)
     with pytest.raises(ValueError, match="no finite value"):  # steps that rounding swallows
         jacobian(lambda z: z**2, 1.1 * ONE, 1e-8 * ONE, EPS * ONE, ["z"], single)
-
-
-def test_the_notes_tell_what_is_dropped_what_bends_and_what_has_no_effect() -> None:
-    def notes(change: list[float], value: Any = ((1.0, 1.0),), dropped: float = 0.0) -> list[str]:
-        steps = np.array([0.5, 0.25])
-        found = Jacobian(np.array(value), dropped, steps, np.array(change), 0.0)
-        return notes_of(found, ["x[0]", "u[0]"])
-
-    assert notes([0.1, 0.0]) == []
-    bends = "The plant is not smooth within 0.25 of the operating point along u[0]: slopes differ"
-    assert notes([0.0, 0.101]) == [f"{bends} by 10%."]
-    (none,) = notes([np.nan, 0.0])
-    assert "within 0.5 of the operating point along x[0]: it has no value" in none
-    assert notes([0.0, 0.0], [[0.0, 1.0]]) == ["x[0] has no effect on the next state."]
-    assert "(at most 1.5e-09) were set to zero" in notes([0.0, 0.0], dropped=1.5e-9)[0]
 
 
 def test_steps_at_whose_ends_there_is_no_value_are_left_out() -> None:

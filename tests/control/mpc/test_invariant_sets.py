@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
 
 import general_problems
 import sample_problems
@@ -55,24 +54,6 @@ def test_without_it_some_do(name: str) -> None:
         theta = mpc.predict(theta, law(theta))
         theta = np.clip(theta, -100, 100)
     assert not law.in_domain(theta).all()
-
-
-@pytest.mark.parametrize("name", INVARIANT)
-def test_the_set_is_invariant_under_its_gain_which_keeps_the_bounds(name: str) -> None:
-    mpc = INVARIANT[name]()
-    F, g = mpc.terminal.set
-    rng = np.random.default_rng(0)
-    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (20_000, mpc.n_theta))
-    theta = theta[np.all(theta @ F.T <= g, axis=1)]
-    assert len(theta) > 50
-    law = mpc.explicit()
-    gain = law.gains[law.locate(np.zeros(mpc.n_theta))]  # there it is that of the terminal cost
-    u = theta @ gain.T
-    following = mpc.predict(theta, u)
-    assert np.all(following @ F.T <= g + 1e-9)
-    assert np.all((u <= mpc.u_max + 1e-9) & (u >= mpc.u_min - 1e-9))
-    x = following[:, mpc.layout.state]
-    assert np.all((x <= mpc.x_max + 1e-9) & (x >= mpc.x_min - 1e-9))
 
 
 def test_the_set_is_the_largest_one_on_a_plant_with_one_state() -> None:
@@ -149,47 +130,6 @@ def test_of_a_cart_it_leaves_room_to_brake():
 
     assert inside([5.49, 3.0]) and not inside([5.51, 3.0])  # 3 - 1/2 + 2 - 1/2 + 1 - 1/2 to stop
     assert inside([-10, 3]) and inside([9.49, 1.0]) and not inside([9.51, 1.0])
-
-
-@pytest.mark.parametrize(
-    "mpc",
-    [
-        general_problems.PROBLEMS["servo with all of it"](),
-        general_problems.PROBLEMS["two tanks, all parts"](),
-        general_problems.PROBLEMS["invariant with all of it"](),
-        sample_problems.PROBLEMS["unstable, part of the box infeasible"](),
-        sample_problems.PROBLEMS["two inputs"](),
-        sample_problems.PROBLEMS["one-sided state bounds"](),
-    ],
-)
-def test_from_each_corner_an_input_leads_back_into_it(mpc):
-    kept = mpc.kept_set
-    A, B = mpc.prediction
-    n = mpc.n_theta
-    m = mpc.model.n_inputs
-    parts = mpc.layout
-    low, high = np.full((2, n), None)
-    low[parts.state.stop :] = mpc.theta_min[parts.state.stop :]
-    high[parts.state.stop :] = mpc.theta_max[parts.state.stop :]
-    box = [*zip(low, high, strict=True)]
-    assert kept.for_ever
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        corner = linprog(rng.normal(size=n), A_ub=kept.F, b_ub=kept.g, bounds=box)
-        if corner.status == 3:  # a state without bounds
-            continue
-        theta = corner.x
-        last = theta[parts.previous] if parts.n_previous else np.zeros(m)
-        least = np.maximum(mpc.u_min, last + mpc.rate.du_min if parts.n_previous else -np.inf)
-        most = np.minimum(mpc.u_max, last + mpc.rate.du_max if parts.n_previous else np.inf)
-        rows = np.hstack([kept.F @ B, -np.ones((len(kept.g), 1))])
-        found = linprog(
-            np.eye(m + 1)[-1],
-            A_ub=rows,
-            b_ub=kept.g - kept.F @ A @ theta,
-            bounds=[*zip(least - 1e-9, most + 1e-9, strict=True), (None, None)],
-        )
-        assert found.fun < 1e-6
 
 
 def test_with_an_invariant_terminal_set_it_is_where_the_mpc_has_a_solution():

@@ -206,30 +206,6 @@ def test_a_column_is_not_taken_for_a_batch() -> None:
         law.plant_input([[12.0], [1.0]])
 
 
-def test_a_bound_at_the_operating_point_is_zero_and_no_minus_zero() -> None:
-    mpc = LinearMPC(
-        MODEL, **WEIGHTS, theta_min=[350, 0], theta_max=[400, 2], u_min=10, u_max=15,
-        x_min=[350, -np.inf], x_max=[np.inf, 2],
-        tracking=Tracking([0], 350, 355), disturbances=DisturbanceBounds(4, 5),
-    ).deviations  # fmt: skip
-    for ours, expected in (
-        (mpc.u_min, [0]), (mpc.u_max, [5]), (mpc.x_min, [0, -np.inf]), (mpc.x_max, [np.inf, 0]),
-        (mpc.theta_min[:2], [0, -2]), (mpc.theta_max[:2], [50, 0]),
-        (mpc.tracking.r_min, [0]), (mpc.tracking.r_max, [5]), (mpc.disturbances.d_max, [0]),
-    ):  # fmt: skip
-        assert ours.tolist() == expected and not np.any(np.signbit(ours[ours == 0]))
-
-
-def test_a_bound_that_is_not_given_stays_none_of_one_side_alone() -> None:
-    common = {"theta_min": [300, 0], "theta_max": [400, 4],
-              "disturbances": DisturbanceBounds(4, 7)}  # fmt: skip
-    low = LinearMPC(MODEL, **WEIGHTS, **common, u_min=8, x_min=[340, 1]).deviations
-    assert low.u_min.tolist() == [-2] and np.isinf(low.u_max) and np.isinf(low.x_max).all()
-    high = LinearMPC(MODEL, **WEIGHTS, **common, u_max=15, x_max=[360, 3]).deviations
-    assert high.u_max.tolist() == [5] and np.isinf(high.u_min) and np.isinf(high.x_min).all()
-    assert high.x_max.tolist() == [10, 1]
-
-
 # ---- By how much episodes exceed the bounds of their problem, and what its soft bounds cost ----
 
 
@@ -355,29 +331,6 @@ def test_a_hundred_reachable_references_are_reached_without_offset(name: str) ->
         theta = mpc.predict(theta, mpc.explicit()(theta))
     reached = theta[:, mpc.layout.state] @ mpc.tracking.C.T
     assert np.max(np.abs(reached - r)) < 1e-6
-
-
-def test_with_as_many_disturbances_as_measurements_a_wrong_model_leaves_no_offset() -> None:
-    mpc = solved("two tanks")
-    observer = DisturbanceObserver(solved("two tanks").model)
-    model = mpc.model
-    # The plant: other gains, other poles, and a load that enters elsewhere.
-    A = model.A * [[1.02, 1], [0.9, 0.97]]
-    B = model.B * [[0.9, 1.2], [1, 1.1]]
-    load = np.array([0.05, -0.03])
-    r = np.array([0.2, 0.3])
-    x = np.zeros(2)
-    u = np.zeros(2)
-    x_hat, d_hat = observer.reset(x)
-    for _ in range(400):
-        u = mpc.explicit()(np.concatenate([x_hat, r, d_hat]))
-        x = A @ x + B @ u + load
-        x_hat, d_hat = observer.update(x, u)
-    np.testing.assert_allclose(x, r, atol=1e-6)
-    blind = np.zeros(2)
-    for _ in range(400):  # without the estimate there is an offset
-        blind = A @ blind + B @ mpc.explicit()(np.concatenate([blind, r, 0 * d_hat])) + load
-    assert np.max(np.abs(blind - r)) > 0.02
 
 
 @pytest.mark.parametrize("name", TRACKING)

@@ -4,12 +4,12 @@ import itertools
 import pickle
 import warnings
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from benchmarks.online_problems import wide_plant
 from general_problems import PROBLEMS, servo, solved, two_tanks
+from sample_plants import Plant
 from sample_problems import input_bounds_only, small_mpc
 from sample_problems import solved as sample_problem
 from sb3_yann import LinearModel, LinearMPC, Log, RateLimits, Terminal, Tracking, identify
@@ -73,25 +73,13 @@ def test_a_start_in_deviations_is_refused() -> None:
     assert mpc.simulate([352.0], 5)[0][0] == 352
 
 
-class Heater(gym.Env):
+def heater() -> Plant:
     """Shows a temperature near 350 K, takes a power of 20 to 60 kW."""
-
-    observation_space = gym.spaces.Box(300, 400, (1,), np.float64)
-    action_space = gym.spaces.Box(20, 60, (1,), np.float64)
-    dt = 60.0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = np.array((options or {}).get("state", [350.0]), np.float64)
-        return self.state.copy(), {}
-
-    def step(self, power):
-        self.state = 350 + 0.9 * (self.state - 350) + 0.05 * (np.asarray(power) - 40)
-        return self.state.copy(), 0.0, False, False, {}
+    return Plant(lambda x, u: 350 + 0.9 * (x - 350) + 0.05 * (u - 40), (300, 400), (20, 60), 350)
 
 
 def test_the_bounds_are_those_of_the_spaces_as_the_plant_shows_them() -> None:
-    mpc = LinearMPC.from_env(Heater, Q=[[1]], R=[[0.01]], horizon=3, dt=60.0, x_ss=[350], u_ss=[40])
+    mpc = LinearMPC.from_env(heater, Q=[[1]], R=[[0.01]], horizon=3, dt=60.0, x_ss=[350], u_ss=[40])
     np.testing.assert_allclose([mpc.model.A[0, 0], mpc.model.B[0, 0]], [0.9, 0.05], atol=1e-6)
     by_hand = LinearMPC(
         mpc.model, Q=[[1]], R=[[0.01]], horizon=3, u_min=20, u_max=60, theta_min=300,

@@ -12,11 +12,11 @@ import pytest
 
 from benchmarks.online_problems import points, six_masses, three_masses, wide_plant, worst_condition
 from general_problems import PROBLEMS, solved
-from reference_answers import relative_error
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, SoftBounds
 from sb3_yann.control._kernels import online as _kernels
 from sb3_yann.control._kernels.online import SOLVED
 from sb3_yann.control.online import DualProgram, KnownPoints
+from sparse_qp import relative_error
 
 
 def drawn(mpc: LinearMPC, count: int, stretch: float = 1.0) -> np.ndarray:
@@ -192,15 +192,6 @@ def test_what_a_law_remembers_does_not_travel() -> None:
     law = solved("servo").online()
     law([[0.1, 0.2, 0.3]])
     assert np.any(law.known._keys) and not np.any(pickle.loads(pickle.dumps(law)).known._keys)
-
-
-def test_inputs_do_not_depend_on_what_was_asked_before() -> None:
-    mpc = three_masses()
-    theta = points(mpc, 300)
-    fresh = three_masses().online()
-    together = mpc.online()(theta)
-    assert np.array_equal(together, mpc.online()(theta))  # now they are known
-    assert np.array_equal(together, [fresh(each) for each in theta[::-1]][::-1])
 
 
 # ---- What an online law makes of numbers that float64 cannot hold or tell apart ----
