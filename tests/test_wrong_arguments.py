@@ -31,12 +31,7 @@ from sb3_yann.commissioning.plant import Plant
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.evaluation import comparison_table, evaluate
 from sb3_yann.evaluation.plots import loops_figure
-from sb3_yann.wrappers import (
-    ObserveDisturbance,
-    PastInputs,
-    PreviousInput,
-    StageCost,
-)
+from sb3_yann.wrappers import ObserveDisturbance, PastInputs, PreviousInput, StageCost
 
 
 def plant() -> LinearPlant:
@@ -105,11 +100,6 @@ WRONG_VALUES = {
 def test_a_wrong_value_is_a_value_error_that_says_what_was_expected(call, message) -> None:
     with pytest.raises(ValueError, match=message):
         call()
-
-
-def test_a_guard_that_has_not_been_at_work_says_so() -> None:
-    with pytest.raises(RuntimeError, match="The guard has no state yet: pass it to learn"):
-        ImprovementGuard("CSTR-v0").summary()
 
 
 def test_a_simulator_of_a_function_that_returns_none_is_named() -> None:
@@ -246,22 +236,3 @@ def test_a_twins_env_says_how_it_is_used() -> None:
         env.step(env.action_space.sample())
     with pytest.raises(ValueError, match="must be finite numbers of the shape"):
         env.reset(options={"state": np.zeros(7)})
-
-
-@pytest.mark.parametrize(
-    ("beside", "message"),
-    [
-        ({"references": [np.zeros((3, 1))]}, r"references have shape \(3, 1\), expected \(11, 1\)"),
-        ({"previous": [[0.0, 0.0]]}, r"previous has shape \(2,\), expected \(1,\)"),
-    ],
-)
-def test_a_log_names_what_does_not_fit(beside, message) -> None:
-    problem = general_problems.solved("servo with all of it")
-    n = problem.model.n_states
-    m = problem.model.n_inputs
-    d = problem.model.n_disturbances
-    given = {"references": [np.zeros((11, 1))], "disturbances": [np.zeros((11, d))]} | beside
-    with pytest.raises(ValueError, match=message):
-        PlantTwin.fit(problem, [(np.zeros((11, n)), np.zeros((10, m)))], **given)
-    with pytest.raises(ValueError, match="is given, but states are all of theta: leave it out"):
-        PlantTwin.fit(problem, [(np.zeros((11, problem.n_theta)), np.zeros((10, m)))], **beside)

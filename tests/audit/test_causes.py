@@ -12,14 +12,7 @@ from gymnasium import wrappers
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from audit_samples import (
-    MPC,
-    WRONG,
-    Changed,
-    audited,
-    plant,
-    show_shifted,
-)
+from audit_samples import MPC, WRONG, Changed, audited, plant, show_shifted
 from sample_plants import LinearPlant, asymmetric_pendulum_mpc, two_input_mpc
 from sb3_yann import (
     AffineObservation,
@@ -37,7 +30,7 @@ from sb3_yann import (
 )
 from sb3_yann.audit.meaning import below_set_points, warn_of_own_reward
 from sb3_yann.improvement.simulator import of_law
-from sb3_yann.rollout import Trajectories, rollout
+from sb3_yann.rollout import rollout
 from sb3_yann.wrappers import SetPoint, StageCost
 
 
@@ -350,24 +343,6 @@ def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
     assert below_set_points(gym.wrappers.TimeLimit(held, 9)) and not below_set_points(plain)
     tracking = dataclasses.replace(mpc(), tracking=Tracking([0], -1, 1))
     headroom(tracking, held, n_starts=2)  # a warning would be an error
-
-
-def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
-    problem = mpc()
-    for steps, theta in ((9, 1.0), (30, 0.0)):
-        thetas = np.full((steps + 1, 2), theta)
-        inputs = np.zeros((steps, 1))
-        none = np.zeros(1, dtype=int)
-        rewards = np.arange(float(steps))
-        played = Trajectories(
-            none.astype(float),
-            none,
-            (thetas,),
-            (inputs,),
-            none.astype(bool),
-            own_rewards=(rewards,),
-        )
-        warn_of_own_reward(problem, played)
 
 
 def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:

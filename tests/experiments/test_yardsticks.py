@@ -11,8 +11,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from experiments import optimum, yardsticks
 from experiments.yardsticks import (
-    BurnIn,
-    Learner,
     best_of_ddpg,
     cloned,
     lqr,
@@ -108,44 +106,6 @@ def test_the_residual_policy_is_the_mpc_before_training(env_id) -> None:
     np.testing.assert_array_equal(learner.policy.predict(states[0])[0], expected[0])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", ENVS)
-def test_without_noise_the_residual_executes_the_mpc_until_the_actor_moves(env_id) -> None:
-    env = recorder(env_id)
-    learner = residual_rl(lambda: env, 0, noise=0.0)
-    learner.callbacks[0].steps = 100
-    learner.model.learn(120, callback=learner.callbacks)
-    observations, executed = env.recorded()
-    expected = law_of(env)(observations).astype(np.float32)
-    np.testing.assert_array_equal(executed[:100], expected[:100])
-    assert np.any(executed[101:] != expected[101:])
-
-
-def test_the_residual_reaches_every_input_from_any_other() -> None:
-    learner = residual_rl(lambda: gym.make("ClippedPendulum-v0"), 0)
-    assert learner.model.action_space == gym.spaces.Box(-4.0, 4.0, (1,), np.float32)
-    residual = learner.model.env.envs[0].get_wrapper_attr("combine")
-    state = np.array([-0.5, -0.5], dtype=np.float32)
-    assert residual(state, np.zeros(1)) == 2.0
-    assert residual(state, np.array([-4.0])) == -2.0
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["quiet residual", "cloned"])
-def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
-    env = gym.make("ClippedPendulum-v0")
-    learner = BUILDERS[name](lambda: env, 0)
-    (burn_in,) = learner.callbacks
-    assert isinstance(burn_in, BurnIn)
-    burn_in.steps = 100
-    states = random_states(env)
-    before, _ = learner.policy.predict(states)
-    learner.model.learn(100, callback=burn_in)
-    np.testing.assert_array_equal(learner.policy.predict(states)[0], before)
-    learner.model.learn(5, callback=burn_in, reset_num_timesteps=False)
-    assert np.any(learner.policy.predict(states)[0] != before)
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("env_id", ENVS)
 def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts(env_id) -> None:
@@ -157,16 +117,6 @@ def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts(env_id) -> None:
     states = states[law.in_domain(states)]  # the law jumps outside, which no such network does
     error = (learner.policy.predict(states)[0] - law(states)) / (2 * env.action_space.high)
     assert np.sqrt(np.mean(error**2)) < 0.01
-
-
-def test_networks_see_the_pendulum_as_gymnasium_shows_it() -> None:
-    learner: Learner = sb3_ddpg(lambda: gym.make("ClippedPendulum-v0"), 0)
-    env = learner.model.env.envs[0]
-    seen, info = env.reset(seed=3)
-    angle, speed = info["state"]
-    np.testing.assert_allclose(seen, [np.cos(angle), np.sin(angle), speed], rtol=1e-6)
-    plain = info["state"].astype(np.float32)
-    np.testing.assert_array_equal(learner.policy.predict(plain)[0], learner.model.predict(seen)[0])
 
 
 @pytest.mark.parametrize("problem", [problems.clipped_pendulum(), problems.cstr()], ids=ENVS[::-1])

@@ -361,18 +361,6 @@ def test_a_region_that_no_start_comes_through_stays_as_it_was(alone, when) -> No
     assert actor_bits(model.policy) == accepted_bits(guard)
 
 
-def test_what_no_start_can_tell_apart_is_not_played() -> None:
-    simulator = Slide(low=2.0)
-    model = build(gradient_steps=0)
-    guard = make_guard(simulator)
-    count: list[int] = []
-    before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
-    train(
-        model, STEPS + 1, At([1], partial(correct, region=LEFT, value=-7.0)), before, guard, after
-    )
-    assert count[0] == count[1]
-
-
 def test_an_error_of_the_simulator_under_a_candidate_alone_is_a_refusal() -> None:
     class Brittle(Slide):
         def step(self, action):

@@ -26,19 +26,10 @@ from guard_samples import (
     env_random_states,
     make_guard,
     random_states,
-    randomize,
     train,
     verdicts,
 )
-from resumed import (
-    Checkpoint,
-    all_bits,
-    envs,
-    go_on,
-    guard_in_simulator,
-    loaded,
-    model_bits,
-)
+from resumed import Checkpoint, all_bits, envs, go_on, guard_in_simulator, loaded, model_bits
 from sb3_yann import ImprovementGuard, compare
 from sb3_yann.compare import Verdict
 from sb3_yann.guard import callback
@@ -87,27 +78,6 @@ def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
     assert state == expected
     assert is_mpc(model)
     assert not is_mpc(free)
-
-
-def test_a_check_moves_no_random_state_and_not_the_training_env(monkeypatch) -> None:
-    model = build()
-    guard = make_guard()
-    checks: list[bool] = []
-
-    def unchanged(method, *args) -> None:
-        before = random_states(), env_random_states(model), model.env.envs[0].unwrapped.played
-        method(*args)
-        after = random_states(), env_random_states(model), model.env.envs[0].unwrapped.played
-        checks.append(before == after)
-
-    for name in ("_on_training_start", "_try_candidate", "_end"):
-        method = getattr(guard, name)
-        monkeypatch.setattr(guard, name, partial(unchanged, method))
-    randomize(model.policy)  # the MPC takes its place: that builds an actor
-    train(model, 3 * STEPS, guard, At([STEPS], better))
-    assert "rejected" in verdicts(guard)
-    assert len(checks) == 6
-    assert all(checks)
 
 
 def test_two_training_envs_side_by_side_count_their_episodes_together() -> None:
@@ -161,24 +131,6 @@ def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -
     assert all_bits(other.player.mpc) == all_bits(guard.player.mpc)
 
 
-@ALGORITHMS
-def test_a_guard_that_rejects_everything_leaves_the_mpc_while_the_critic_learns(
-    algorithm, monkeypatch
-) -> None:
-    monkeypatch.setattr(compare, "no_worse", lambda *_, **__: Verdict("no"))
-    fresh = build(algorithm)
-    seen: list[bool] = []
-    look = At(range(STEPS, 9 * STEPS, STEPS), lambda p: seen.append(is_mpc(p)))
-    model = build(algorithm)
-    guard = make_guard()
-    train(model, 8 * STEPS, guard, look)
-    assert seen == [True] * 8
-    assert len(guard.decisions) >= 7
-    assert bits(model.policy.actor.state_dict()) == bits(fresh.policy.actor.state_dict())
-    assert critic_bits(model.policy)["critic"] != critic_bits(fresh.policy)["critic"]
-    assert model.policy.critic_updates == model._n_updates == 8 * STEPS
-
-
 @pytest.fixture(autouse=True)
 def heeded():
     """Python's own handler: a shell starts what runs in its background with the signal ignored."""
@@ -228,15 +180,6 @@ def test_in_the_midst_of_a_gradient_step_as_well(monkeypatch, part) -> None:
 
     monkeypatch.setattr(optimizer, "step", cut_off)
     interrupted(model, 40, guard)
-
-
-@pytest.mark.parametrize("at", [FIRST + 12, FIRST + 10 + 5 + 7], ids=["a trial", "the end"])
-def test_in_a_trial_what_stood_before_it_is_left(at) -> None:
-    simulator = partial(CutOff, at, ctrl_c)
-    model = build(gradient_steps=0)
-    guard = make_guard(simulator, n_new_starts=5)
-    interrupted(model, 2 * STEPS, At([1], better), guard)
-    assert is_mpc(model) == (at == FIRST + 12)
 
 
 def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_policy() -> None:

@@ -110,18 +110,6 @@ def test_a_policy_without_an_mpc_is_refused() -> None:
         train(DDPG("MlpPolicy", Slide()), STEPS, make_guard())
 
 
-def test_a_simulator_may_be_named_by_its_module_as_in_a_yaml_file() -> None:
-    model = build(learning_rate=0.0)
-    guard = make_guard("guard_samples:Slide", n_new_starts=4)
-    train(model, 8, At([2], better), guard)
-    assert verdicts(guard)[0] == "accepted"
-    assert guard.state.settings["env"] == "guard_samples:Slide"
-    with pytest.raises(
-        ValueError, match="'guard_samples' has no function 'Slid' that makes an env"
-    ):
-        make_guard("guard_samples:Slid")
-
-
 NOISE = np.random.default_rng(0)
 
 

@@ -54,19 +54,24 @@ def first_step(network) -> float:
     return float(steps[0].mean())
 
 
+def again(model, way, folder):
+    """Return the policy of a model: itself, or after a copy or a file."""
+    if way == "deep copy":
+        return copy.deepcopy(model.policy)
+    if way == "pickle":
+        return cloudpickle.loads(cloudpickle.dumps(model.policy))
+    if way == "saved and loaded":
+        model.save(folder / "model")
+        return DDPG.load(folder / "model").policy
+    return model.policy
+
+
 @pytest.mark.parametrize("way", ["as built", "deep copy", "pickle", "saved and loaded"])
 def test_actor_and_critic_step_at_their_own_rates(way, tmp_path) -> None:
     mpc = scalar_mpc()
     kwargs = {"problem": mpc, "actor_lr_mult": 0.1, "critic_lr_mult": 0.5, "critic_warmup": 0}
     model = DDPG(YannPolicy, LinearPlant(mpc), learning_rate=1e-2, policy_kwargs=kwargs)
-    policy = model.policy
-    if way == "deep copy":
-        policy = copy.deepcopy(policy)
-    elif way == "pickle":
-        policy = cloudpickle.loads(cloudpickle.dumps(policy))
-    elif way == "saved and loaded":
-        model.save(tmp_path / "model")
-        policy = DDPG.load(tmp_path / "model").policy
+    policy = again(model, way, tmp_path)
     assert first_step(policy.actor) == pytest.approx(1e-3, rel=1e-2)
     assert first_step(policy.critic) == pytest.approx(5e-3, rel=1e-2)
     assert policy.actor.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
@@ -123,15 +128,8 @@ def test_the_actor_stays_the_mpc_bit_for_bit_until_the_critic_is_warm(policy_del
 def test_a_warm_up_goes_on_where_it_was(way, tmp_path) -> None:
     model = with_full_buffer(critic_warmup=5)
     updates(model, 3)
-    policy = model.policy
-    if way == "deep copy":
-        policy = copy.deepcopy(policy)
-    elif way == "pickle":
-        policy = cloudpickle.loads(cloudpickle.dumps(policy))
-    elif way == "saved and loaded":
-        model.save(tmp_path / "model")
-        policy = DDPG.load(tmp_path / "model").policy
-    else:
+    policy = again(model, way, tmp_path)
+    if way == "parameters":
         other = with_full_buffer(critic_warmup=5)
         other.set_parameters(model.get_parameters())
         policy = other.policy

@@ -11,13 +11,12 @@ import torch as th
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
-from guard_samples import LEFT, REGION, RIGHT, actor_bits, build, correct, randomize
+from guard_samples import RIGHT, build, correct, randomize
 from sb3_yann import retarget
 from sb3_yann.compare import Scores, Starts, Tolerance
 from sb3_yann.guard import state
 from sb3_yann.guard.state import Evidence
-from sb3_yann.policy.checkpoint import DIVERGED_SIZE, ActorCheckpoint
-from weights import last_layer
+from sb3_yann.policy.checkpoint import ActorCheckpoint
 
 
 def pair() -> tuple[Any, ActorCheckpoint, ActorCheckpoint]:
@@ -26,45 +25,6 @@ def pair() -> tuple[Any, ActorCheckpoint, ActorCheckpoint]:
     before = ActorCheckpoint.of(policy)
     correct(policy, RIGHT, 0.5)
     return policy, before, ActorCheckpoint.of(policy)
-
-
-def test_a_checkpoint_is_a_copy_that_is_restored_bit_for_bit() -> None:
-    policy, before, after = pair()
-    assert after.is_actor_of(policy) and not before.is_actor_of(policy)
-    before.restore(policy)
-    original = actor_bits(policy)
-    randomize(policy)
-    assert not before.is_actor_of(policy)
-    before.restore(policy)
-    assert actor_bits(policy) == original and before.is_actor_of(policy)
-
-
-def test_the_regions_whose_networks_differ_are_reported() -> None:
-    _, before, after = pair()
-    changed = np.arange(3) == REGION[RIGHT]
-    np.testing.assert_array_equal(before.changed_regions(after), changed)
-    np.testing.assert_array_equal(after.changed_networks(before), changed)
-    assert before.has_networks_of(before) and not before.has_networks_of(after)
-    boxed = ActorCheckpoint(dict(after.actor), after.target, after.optimizer)
-    (name,) = (key for key in boxed.actor if key.endswith("confines"))
-    boxed.actor[name] = th.ones_like(boxed.actor[name])
-    assert boxed.changed_regions(after).all() and not boxed.changed_networks(after).any()
-    assert not boxed.is_confined_as(after) and not boxed.has_networks_of(after)
-
-
-def test_part_of_the_way_is_a_share_of_the_difference_of_all_weights() -> None:
-    policy, before, _ = pair()
-    randomize(policy, 0.3)
-    other = ActorCheckpoint.of(policy)
-    found = before.part_way(other, 0.25)
-    assert before.networks().keys() == found.networks().keys()
-    for side in ("actor", "target"):
-        ours, theirs, mixed = (getattr(each, side) for each in (before, other, found))
-        for key in before.networks():
-            expected = ours[key] + 0.25 * (theirs[key] - ours[key])
-            th.testing.assert_close(mixed[key], expected)
-        assert all(th.equal(mixed[key], ours[key]) for key in ours if key not in found.networks())
-    assert before.part_way(other, 0.0).has_networks_of(before)
 
 
 def test_a_shrunk_correction_is_a_share_of_what_the_networks_add() -> None:
@@ -94,34 +54,6 @@ def test_a_shrunk_correction_is_a_share_of_what_the_networks_add() -> None:
     assert whole.is_confined_as(before)
 
 
-def test_regions_of_another_come_with_their_targets() -> None:
-    policy, before, _ = pair()
-    randomize(policy, 0.3)
-    other = ActorCheckpoint.of(policy)
-    index = REGION[LEFT]
-    found = before.with_regions(other, [index])
-    for side in ("actor", "target"):
-        ours, theirs, mixed = (getattr(each, side) for each in (before, other, found))
-        for key in before.networks():
-            for region in range(3):
-                source = theirs if region == index else ours
-                assert th.equal(mixed[key][region], source[key][region])
-    np.testing.assert_array_equal(before.changed_regions(found), np.arange(3) == index)
-    assert before.with_regions(other, []).has_networks_of(before)
-
-
-@pytest.mark.parametrize(
-    ("value", "bad"),
-    [(0.0, False), (DIVERGED_SIZE, False), (-DIVERGED_SIZE, False), (1.01 * DIVERGED_SIZE, True),
-     (-2e9, True), (np.nan, True), (np.inf, True)],
-)  # fmt: skip
-def test_a_parameter_beyond_a_thousand_million_has_diverged(value: float, bad: bool) -> None:
-    policy = build().policy
-    with th.no_grad():
-        last_layer(policy)[0, 0, 0] = value
-    assert ActorCheckpoint.of(policy).has_diverged() == bad
-
-
 def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(monkeypatch) -> None:
     policy, mpc, _ = pair()
     some = []
@@ -142,14 +74,6 @@ def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(mo
         monkeypatch.setattr(state, "MAX_PASSED_BYTES", int(room * mpc.size))
         found = evidence.with_passed(some[1]).with_passed(some[2])
         assert [*found.passed] == [some[1], some[2]][-left:]
-
-
-def test_a_checkpoint_knows_whether_it_has_learned_anything() -> None:
-    policy, before, after = pair()
-    assert not before.has_learned() and after.has_learned()
-    assert not after.shrunk(0.0).has_learned()
-    randomize(policy, 0.3)
-    assert ActorCheckpoint.of(policy).has_learned()
 
 
 # ---- Another MPC for a model, with what a shared network has learnt ----

@@ -13,13 +13,11 @@ from scipy import stats
 from stable_baselines3 import DDPG, PPO, SAC
 
 from policy_samples import scalar_mpc
-from sample_plants import LinearPlant, Recorder, feasible_states
+from sample_plants import LinearPlant, Recorder
 from sb3_yann import (
     ControlDiagnostics,
     CostAudit,
     ImprovementGuard,
-    LinearModel,
-    LinearMPC,
     NoActionNoise,
     YannPolicy,
     export,
@@ -40,16 +38,6 @@ def build(algorithm, env=None, **policy_kwargs):
     return algorithm("YannPolicy", env, policy_kwargs=given, seed=0, device="cpu", **small)
 
 
-def twelve_states() -> LinearMPC:
-    """Four chains of three lags, too many for regions."""
-    A = np.kron(np.eye(4), [[0.9, 0.1, 0], [0, 0.8, 0.2], [0, 0, 0.7]])
-    B = np.kron(np.eye(4), [[0.0], [0.0], [0.3]])[:, :3]
-    return LinearMPC(
-        LinearModel(A, B, 1), Q=np.eye(12), R=0.1 * np.eye(3), horizon=8, gamma=0.98,
-        theta_min=-2, theta_max=2, u_min=-1, u_max=1,
-    )  # fmt: skip
-
-
 @EXPLORING
 @pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
 def test_the_deterministic_action_is_the_law_s_at_ten_thousand_points(algorithm, env_id) -> None:
@@ -62,15 +50,6 @@ def test_the_deterministic_action_is_the_law_s_at_ten_thousand_points(algorithm,
     assert np.max(np.abs(actions - law) / (mpc.u_max - mpc.u_min)) < 1e-6
     bounds = np.minimum(law - mpc.u_min, mpc.u_max - law) / (mpc.u_max - mpc.u_min)
     assert np.sum(bounds < 1e-9) > 1000  # it rides them
-
-
-@EXPLORING
-def test_so_it_is_with_twelve_states_and_a_law_that_is_solved_online(algorithm) -> None:
-    mpc = twelve_states()
-    model = build(algorithm, LinearPlant(mpc), problem=mpc, law="online")
-    states, expected = feasible_states(mpc, 200)
-    actions, _ = model.predict(states.astype(np.float32), deterministic=True)
-    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-6
 
 
 def test_a_truncated_normal_is_scipy_s() -> None:
@@ -215,13 +194,6 @@ def test_a_guard_of_before_does_not_silence_that_nobody_confirms_now() -> None:
         model.learn(32, callback=ImprovementGuard(make, n_eval_episodes=5, n_new_starts=2))
     with pytest.warns(UserWarning, match="That belongs into a simulator"):
         model.learn(8)
-
-
-@pytest.mark.parametrize("std", [0.02, 0.4])
-def test_the_target_is_the_entropy_of_the_cut_distribution(std: float) -> None:
-    model = build(SAC, initial_std=std)
-    entropy = model.policy.actor.distribution(th.zeros(1, 1)).entropy()
-    assert model.target_entropy == pytest.approx(entropy.item(), abs=1e-5)
 
 
 def test_entropy_starts_in_balance_and_what_the_user_gives_stays() -> None:

@@ -13,7 +13,7 @@ from stable_baselines3 import DDPG, TD3
 from deployed import Compiled, disturbed, needs_compiler
 from general_problems import LOADED, solved
 from policy_samples import POLICIES, build, scalar_mpc, starts, updates, with_full_buffer
-from sample_plants import LinearPlant, feasible_states
+from sample_plants import LinearPlant
 from sb3_yann import (
     Controller,
     DisturbanceBounds,
@@ -295,26 +295,6 @@ def test_observations_that_are_sampled_again_are_not_solved_again() -> None:
     known.function = lambda rows: solved.append(len(rows)) or answers(rows)
     updates(model, 20)
     assert sum(solved) < 0.05 * 20 * 2 * 16
-
-
-NAMES = [
-    "servo",
-    "servo with a disturbance",
-    "servo with a weight on nothing but the rate",
-    "servo with all of it",
-    "soft states",
-    "invariant with all of it",
-    "two tanks, all parts",
-]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_predict_equals_an_independent_online_qp(name: str) -> None:
-    mpc = solved(name)
-    model = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc})
-    thetas, expected = feasible_states(mpc, 1000)
-    actions, _ = model.predict(thetas.astype(np.float32))
-    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
 
 
 class LoadedPlant(gym.Env):

@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces, wrappers
-from gymnasium.wrappers import RescaleObservation, TimeLimit
+from gymnasium import wrappers
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
@@ -95,15 +95,6 @@ def test_frames_stacked_by_sb3_start_as_the_law_and_train() -> None:
         assert error(model, observations, theta) < 1e-5
         observations, *_ = env.step(model.predict(observations)[0])
     model.learn(50, callback=[NoActionNoise(), ControlDiagnostics()])
-
-
-def test_the_map_of_gymnasium_s_rescaling_is_the_one_that_undoes_it() -> None:
-    plant = LinearPlant(MPC)
-    plant.observation_space = spaces.Box(LOW.astype(np.float32), HIGH.astype(np.float32))
-    env = RescaleObservation(plant, np.float32(0), np.float32(3))
-    model = build(env, AffineObservation.rescaled(LOW, HIGH, to=(0, 3)))
-    observation, _ = env.reset(seed=0)
-    assert error(model, observation, plant.x) < 1e-5
 
 
 # --- the critic ----------------------------------------------------------------------------------

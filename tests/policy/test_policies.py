@@ -1,7 +1,6 @@
 """The policy in SB3: exact at the start, fed by problems of every kind, saved and loaded."""
 
 import copy
-import dataclasses
 import subprocess
 import sys
 import textwrap
@@ -12,14 +11,11 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from policy_samples import (
     CRITICS,
     POLICIES,
     build,
-    changed,
     scalar_mpc,
     starts,
     two_inputs,
@@ -29,10 +25,7 @@ from policy_samples import (
 from sample_plants import LinearPlant, feasible_states, two_input_mpc
 from sb3_yann import LinearMPC, NoActionNoise, SoftBounds, YannPolicy
 from sb3_yann.policy.checkpoint import ActorCheckpoint
-from sb3_yann_envs import problems
 from weights import last_layer, unpin
-
-ENVS = ("CSTR-v0", "ClippedPendulum-v0")
 
 
 @pytest.mark.slow
@@ -41,41 +34,6 @@ def test_predict_equals_an_independent_online_qp_at_ten_thousand_feasible_states
     states, expected = feasible_states(mpc, 10_000)
     actions, _ = model.predict(states.astype(np.float32))
     assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
-
-
-@pytest.mark.slow
-@CRITICS
-@pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
-@pytest.mark.parametrize(("gamma", "discounted"), [(0.9, True), (1 - 1e-3, False)])
-def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, critic) -> None:
-    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal=None)
-    kwargs = {"critic": critic}
-    model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0, policy_kwargs=kwargs)
-    model.learn(1)  # sets up the logger
-    law = mpc.explicit()
-    rng = np.random.default_rng(0)
-    origin = law.locate(np.zeros(mpc.n_theta))
-    stored = 0
-    model.replay_buffer.reset()
-    while stored < 2000:
-        # A third of the box around the origin: the next state is in the same region mostly.
-        theta = rng.uniform(mpc.theta_min, mpc.theta_max) / 3
-        theta = theta.astype(np.float32).astype(np.float64)
-        u = law(theta)
-        following = mpc.model.step(theta, u)
-        if law.locate(theta) != origin or law.locate(following) != origin:
-            continue
-        action = model.policy.scale_action(u.astype(np.float32))
-        reward = -mpc.stage_cost(theta, u)
-        model.replay_buffer.add(theta, following, action, reward, np.zeros(1), [{}])
-        stored += 1
-    sample = model.replay_buffer.sample(2000)
-    with th.no_grad():
-        q = model.critic.q1_forward(sample.observations, sample.actions)
-    model.train(gradient_steps=1, batch_size=2000)
-    loss = model.logger.name_to_value["train/critic_loss"]
-    assert loss < 1e-12 * float((q**2).mean())
-    assert float((q**2).mean()) > 0
 
 
 def test_the_critic_takes_the_discount_of_the_algorithm() -> None:
@@ -150,31 +108,6 @@ def plain_cstr() -> gym.Env:
     env = gym.make("CSTR-v0")
     env.observation_space = spaces.Box(env.observation_space.low, env.observation_space.high)
     return env
-
-
-def test_the_policy_alone_saves_and_loads(tmp_path) -> None:
-    model = build(mpc=two_input_mpc(), gamma=0.9)
-    model.policy.save(tmp_path / "policy")
-    loaded = YannPolicy.load(tmp_path / "policy")
-    assert loaded.gamma == 0.9
-    states = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)
-    np.testing.assert_array_equal(loaded.predict(states)[0], model.predict(states)[0])
-
-
-@pytest.mark.parametrize(
-    "vec_env", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.slow)]
-)
-def test_it_trains_on_several_envs_at_once(vec_env) -> None:
-    # From many starts the first inputs are saturated, and nothing is learnt in twenty steps.
-    env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=vec_env, seed=2)
-    try:
-        model = DDPG(YannPolicy, env, policy_kwargs={"critic_warmup": 0})
-        before = copy.deepcopy(model.actor)
-        model.learn(20, callback=NoActionNoise())
-        assert model.policy.problem == problems.cstr()
-        assert changed(model.actor, before)
-    finally:
-        env.close()
 
 
 # --- max_correction ----------------------------------------------------------------------------

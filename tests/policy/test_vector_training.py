@@ -1,7 +1,5 @@
 """Several envs at once, in this process or in others: callbacks, time limits, ends of episodes."""
 
-import copy
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,12 +8,7 @@ from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    SubprocVecEnv,
-    VecFrameStack,
-    VecNormalize,
-)
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import (
@@ -29,7 +22,6 @@ from sb3_yann import (
     NoActionNoise,
     YannPolicy,
 )
-from sb3_yann.policy.checkpoint import ActorCheckpoint
 
 MPC = two_input_mpc()
 STEPS = 6
@@ -94,32 +86,6 @@ def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> 
         assert far.max() < 1e-5 * float(law.u_max[0] - law.u_min[0])
     finally:
         env.close()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", [DDPG, TD3])
-def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm) -> None:
-    model = build(DummyVecEnv([plant] * 3), algorithm, gradient_steps=-1)
-    before = copy.deepcopy(model.actor)
-    guard = ImprovementGuard(plant, n_eval_episodes=3, n_final_starts=0, eval_freq=6)
-    tried: list[int] = []
-    learnt: list[dict[str, th.Tensor]] = []
-    attempt = guard._try_candidate
-
-    def note() -> None:
-        tried.append(guard.state.episodes)
-        learnt.append(ActorCheckpoint.of(model.policy).networks())
-        attempt()
-
-    guard._try_candidate = note
-    callbacks = [NoActionNoise(), guard, ControlDiagnostics(), CostAudit(60, strict=True)]
-    model.learn(3 * STEPS * 6, callback=callbacks)
-    assert model._n_updates == 3 * STEPS * 6
-    assert guard.state.episodes == 18
-    assert tried == [3, 9, 15, 18]  # three end at each sixth step; and once more at the end
-    assert [each.episode for each in guard.decisions] == tried
-    pairs = zip(before.parameters(), learnt[0].values(), strict=True)
-    assert any(not th.equal(a, b) for a, b in pairs)
 
 
 # --- time limits ----------------------------------------------------------------------------------

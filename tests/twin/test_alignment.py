@@ -5,10 +5,9 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, identify
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import alignment
-from sb3_yann.twin.log import Episode, records
 from sb3_yann_envs import cstr, problems
 from twin_samples import log, problem
 
@@ -131,17 +130,6 @@ def test_consecutive_pieces_of_a_record_are_tested_as_episodes() -> None:
     assert "Every other one is independent: 5 of 10." in twin.report()
 
 
-def test_pieces_belong_to_one_record_where_a_set_point_changes_between_them() -> None:
-    tracking = LinearMPC(
-        mpc().model, Q=np.eye(2), R=np.eye(2), horizon=3, tracking=Tracking([0], [-1], [1]),
-        u_min=-1, u_max=1, theta_min=-4, theta_max=4,
-    )  # fmt: skip
-    theta = np.random.default_rng(0).normal(size=(3, 4, 3))
-    theta[1, 0, :2] = theta[0, -1, :2]
-    episodes = tuple(Episode(each, np.zeros((3, 2))) for each in theta)
-    assert records(tracking, episodes) == [range(2), range(2, 3)]
-
-
 @cache
 def room() -> LinearMPC:
     """Air and walls of a room, and one heater: nothing was tuned on it."""
@@ -195,12 +183,6 @@ def test_a_state_with_another_zero_and_scale_is_not_the_one_that_the_mpc_saw() -
     assert not twin.trusted
 
 
-def test_an_mpc_that_has_settled_still_shows_a_state_in_other_units() -> None:
-    twin = heated_twin([(x * [1, 0.4], u) for x, u in heated(1.0, 0.0, steps=200)])
-    assert "The MPC gives the logged inputs where x[1] is 2.5 times" in twin.report()
-    assert not twin.trusted
-
-
 def test_episodes_of_the_mpc_prove_the_units_of_those_that_it_did_not_make() -> None:
     """The heater has less than half of the model's gain, which steps alone make doubtful."""
     steps = heated(0.4, 0.0, open_loop=True)
@@ -217,17 +199,6 @@ def test_episodes_of_the_mpc_prove_the_units_of_those_that_it_did_not_make() -> 
         ):
             episodes = heated_twin([(x * of_x, of_u * u) for x, u in given]).episodes
             assert alignment.made_by_law(room(), episodes).all() == made
-
-
-def test_inputs_that_are_held_while_the_states_move_are_no_law_s() -> None:
-    def held(episodes: list) -> bool:
-        twin = heated_twin(episodes)
-        log = alignment._Log(room(), twin.dynamics.coordinates, twin.episodes, False)
-        return bool(alignment._held(log)[0])
-
-    assert held(heated(1.0, 0.0, open_loop=True, steps=200, hold=40))
-    assert not held(heated(1.0, 0.0, steps=200))  # at rest nothing moves
-    assert not held([(x, 0 * u + 2) for x, u in heated(1.0, 0.0)])  # on its bound
 
 
 def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed() -> None:
@@ -303,19 +274,6 @@ def refuse_or_doubt(mpc, episodes) -> None:
 )
 def test_a_reactor_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
     refuse_or_doubt(problems.cstr(), [change(x, u) for x, u in reactor()])
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda x, u: (x + np.array([20.0, 0.0]), u),
-        lambda x, u: (100 * x, u),
-        lambda x, u: (x, 100 * u),
-    ],
-    ids=["absolute place", "per cent", "input in per cent"],
-)
-def test_the_cart_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
-    refuse_or_doubt(problem(), [change(x, u) for x, u in log(3)])
 
 
 def test_what_is_missing_in_a_poor_log_is_advised() -> None:

@@ -134,18 +134,6 @@ def test_the_box_of_starts_is_on_average_that_of_the_plant() -> None:
     np.testing.assert_allclose(np.mean(widths, axis=0), [3.0, 1.0], rtol=0.1)
 
 
-def test_draws_lie_where_they_should_and_have_the_log_s_rest() -> None:
-    starts = twin().starts
-    rng = np.random.default_rng(0)
-    drawn = starts.draw(200, rng)
-    assert np.all((drawn >= starts.low) & (drawn <= starts.high))
-    around = starts.draw_around(2000, rng)
-    assert np.ptp(around[:, 0]) > 1.5 * (starts.high - starts.low)[0]
-    assert np.all((around >= problem().theta_min) & (around <= problem().theta_max))
-    logged = {row.tobytes() for each in twin().episodes for row in each.thetas}
-    assert all(row.tobytes() in logged for row in starts.draw_logged(50, rng))
-
-
 def test_the_log_and_the_starts_lie_within_the_limits_and_nan_does_not() -> None:
     found = twin()
     for episode in found.episodes:
@@ -225,20 +213,3 @@ def test_hard_bounds_cut_the_limits_and_soft_ones_do_not() -> None:
     found = limits_of(soft)
     np.testing.assert_allclose(found.low, [-0.4, -0.5], atol=1e-7)
     np.testing.assert_allclose(found.high, [0.3, 1.9], atol=1e-7)
-
-
-def test_with_set_points_the_limits_hold_what_the_mpc_plans() -> None:
-    mpc = solved("servo")
-    row = np.array([[0.0, 0.0, 1.0]])
-    rows = np.tile(row, (30, 1))
-    k = np.full(3, 0.01)
-    coordinates = Coordinates(-k, k, np.ones(3), np.ones(2), RowLayout(mpc))
-    zero = np.zeros(2)
-    found = Limits.of(coordinates, Starts(RowLayout(mpc), zero, zero, row, rows))
-    thetas, _ = mpc.simulate(row[0], 30)
-    low = thetas[:, :2].min(0)
-    high = thetas[:, :2].max(0)
-    width = 0.25 * (high - low)
-    np.testing.assert_allclose(found.high, np.maximum(high + width, k[:2]), atol=1e-6)
-    np.testing.assert_allclose(found.low, np.minimum(low - width, -k[:2]), atol=1e-6)
-    assert found.high[0] > 1.2

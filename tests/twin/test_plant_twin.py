@@ -177,21 +177,6 @@ def test_of_one_record_what_is_lacking_are_rows_and_hours() -> None:
     assert more_of(unit, (*pieces, *log), 3) == more_of(unit, log, 3) == "3 episodes"
 
 
-def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains() -> None:
-    rng = np.random.default_rng(0)
-    x = rng.uniform(-1, 1, (401, 2))
-    own = 0.1 * rng.standard_normal((400, 1))
-    feedback = 0.2 * x[:-1, :1] - 0.1 * x[:-1, 1:]
-    (episode,) = as_episodes(problem(), [(x, feedback + own)])
-    share, moves = trusts.excitation(problem(), (episode,))
-    assert share == pytest.approx(np.var(own) / np.var(feedback + own), rel=0.05)
-    assert moves == pytest.approx([np.std(feedback + own)])  # half the range is 1
-    (still,) = as_episodes(problem(), [(x, 0 * own + 0.25)])
-    assert [each.tolist() for each in trusts.excitation(problem(), (still,))] == [[0.0], [0.0]]
-    (closed,) = as_episodes(problem(), [(x, feedback)])
-    assert trusts.excitation(problem(), (closed,))[0] < 1e-20
-
-
 @pytest.mark.parametrize(
     ("ratio", "n", "problem", "advice"),
     [(1.9, 5, "", ""), (2.1, 5, "", "worse than 'nothing moves'"), (2.1, 1, "one episode", "Log"),
@@ -221,25 +206,6 @@ def test_the_edges_of_what_is_trusted() -> None:
     assert "u[1]" not in advice
     named = judged(runs(GOOD), inputs=inputs, names=["steam", "feed", "reflux"])
     assert "reflux never moves" in named[0] and "step test on reflux" in named[1]
-
-
-def test_the_noise_of_the_sensors_is_what_one_step_s_errors_amount_to() -> None:
-    """Noise e of the states leaves e+ - A e of a step."""
-    mpc = problem()
-    rng = np.random.default_rng(0)
-    sizes = np.array([0.02, 0.005])
-    logs = []
-    for seed in range(4):
-        x = np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
-        rows = []
-        u = 0.3 * rng.uniform(-1, 1, (400, 1))
-        for each in u:
-            rows.append(x)
-            x = mpc.model.step(x, each)
-        rows.append(x)
-        logs.append((np.array(rows) + sizes * rng.standard_normal((401, 2)), u))
-    found = PlantTwin.fit(mpc, logs, residuals=["none"], n_members=1)
-    np.testing.assert_allclose(found.trust.noise, sizes, rtol=0.1)
 
 
 def test_the_report_counts_what_it_leaves_out_and_says_what_the_log_does_not_show() -> None:
