@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 
+from errors import Message, raises
 from sb3_yann._validation import (
     check_bool,
     check_choice,
@@ -29,35 +30,27 @@ def test_what_is_no_real_number_is_refused_with_a_hint(value: Any) -> None:
         check_number("x", value, "Give 3.")
 
 
-BAD: list[tuple[Any, tuple[Any, ...], type[Exception], str]] = [
-    (check_number, (np.nan,), ValueError, "x = nan must be a finite number"),
-    (check_number, (-np.inf,), ValueError, "x = -inf must be a finite number"),
-    (check_positive, (np.inf,), ValueError, "x = inf must be a finite number above 0"),
-    (check_range, (np.inf, 1, np.inf), ValueError, "x = inf must be a finite number of at least 1"),
-    (check_range, (-1, 0, 1), ValueError, "x = -1 must be between 0 and 1"),
-    (check_range, (np.nan, 0, 1), ValueError, "x = nan must be between 0 and 1"),
-    (check_range, (0, 0, 1, "(]"), ValueError, r"x = 0 must lie in \(0, 1\]"),
-    (check_range, (1, 0, 1, "[)"), ValueError, r"x = 1 must lie in \[0, 1\)"),
-    (
-        check_positive_vector,
-        ([1, 0], 2),
-        ValueError,
-        r"\[1\.0, 0\.0\] must be above 0 in each entry",
-    ),
-    (check_choice, ("d", ("a", "b")), ValueError, r"x = 'd' must be one of \('a', 'b'\)"),
-    *((check_bool, (x,), TypeError, "x = .* must be True or False") for x in (0, 1, "no", None)),
-    *(
-        (check_int, (x,), ValueError, "whole number of at least 1")
-        for x in (True, 2.0, "2", None, 0)
-    ),
-    (check_range, ([[1], [1, 2]], 0, 2), TypeError, r"x = \[\[1\], \[1, 2\]\] must be a number"),
-    (check_range, (10**30, 0, 2), ValueError, "x = 10{30} must be between 0 and 2"),
+BAD: list[tuple[Any, tuple[Any, ...], Message]] = [
+    (check_number, (np.nan,), "x = nan must be a finite number"),
+    (check_number, (-np.inf,), "x = -inf must be a finite number"),
+    (check_positive, (np.inf,), "x = inf must be a finite number above 0"),
+    (check_range, (np.inf, 1, np.inf), "x = inf must be a finite number of at least 1"),
+    (check_range, (-1, 0, 1), "x = -1 must be between 0 and 1"),
+    (check_range, (np.nan, 0, 1), "x = nan must be between 0 and 1"),
+    (check_range, (0, 0, 1, "(]"), r"x = 0 must lie in \(0, 1\]"),
+    (check_range, (1, 0, 1, "[)"), r"x = 1 must lie in \[0, 1\)"),
+    (check_positive_vector, ([1, 0], 2), r"\[1\.0, 0\.0\] must be above 0 in each entry"),
+    (check_choice, ("d", ("a", "b")), r"x = 'd' must be one of \('a', 'b'\)"),
+    *((check_bool, (x,), TypeError("x = .* True or False")) for x in (0, 1, "no", None)),
+    *((check_int, (x,), "whole number of at least 1") for x in (True, 2.0, "2", None, 0)),
+    (check_range, ([[1], [1, 2]], 0, 2), TypeError(r"x = \[\[1\], \[1, 2\]\] must be a number")),
+    (check_range, (10**30, 0, 2), "x = 10{30} must be between 0 and 2"),
 ]
 
 
-@pytest.mark.parametrize(("check", "given", "error", "message"), BAD)
-def test_what_is_refused_is_named_with_what_was_expected(check, given, error, message) -> None:
-    with pytest.raises(error, match=message):
+@pytest.mark.parametrize(("check", "given", "message"), BAD)
+def test_what_is_refused_is_named_with_what_was_expected(check, given, message) -> None:
+    with raises(message):
         check("x", *given)
 
 

@@ -95,9 +95,9 @@ class PlantLaw(ReadOnlyArrays):
         """Return the same law with its plant, see the attributes."""
         law = object.__new__(type(self))
         plant: dict[str, Any] = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
-        plant |= {} if rate is None else {"rate": np.array(rate, np.float64)}
-        plant |= {} if moving is None else {"moving": np.array(moving, np.intp)}
-        plant |= {} if clamped is None else {"clamped": np.array(clamped, np.float64)}
+        for name, value, kind in (("rate", rate, float), ("moving", moving, np.intp)):
+            plant[name] = None if value is None else np.array(value, kind)
+        plant["clamped"] = None if clamped is None else np.array(clamped, np.float64)
         law.__setstate__({**self.__getstate__(), **plant})
         return law
 
@@ -227,13 +227,9 @@ class PlantLaw(ReadOnlyArrays):
         law = cls(**{name: each if each.ndim else each.item() for name, each in values.items()})
         if not any(name == "theta_ss" or name.startswith("model_") for name in data):
             return law
-        names = [each.name for each in fields(LinearModel)]
-        # Files of before do not hold the last ones.
-        later = {"C", "time_unit"}
-        own = [name for name in names if name not in later or f"model_{name}" in data]
-        given = {name: data[f"model_{name}"] for name in own}
+        given = {name[6:]: each for name, each in data.items() if name.startswith("model_")}
         for name in ("notes", "state_names", "input_names", "units", "estimated", "time_unit"):
-            given[name] = given[name].tolist() if name in given else ""
+            given[name] = given[name].tolist()
         model = LinearModel(**{**given, "dt": float(given["dt"])})
         if model.n_inputs != law.n_inputs or model.n_states > law.n_theta:
             raise ValueError(f"its model has {model.n_states} states and {model.n_inputs} inputs")
@@ -243,11 +239,8 @@ class PlantLaw(ReadOnlyArrays):
             for name in ("rate", "moving")
         )
         moves = None if moving is None else moving.astype(int)
-        clamped = None
-        if "clamped" in data:
-            low, high = data["clamped"]
-            clamped = check_bounds("clamped", low, high, law.n_theta)
-        return law.on_plant(model, theta_ss, rate, moves, clamped)
+        ends = check_bounds("clamped", *data["clamped"], law.n_theta) if "clamped" in data else None
+        return law.on_plant(model, theta_ss, rate, moves, ends)
 
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""

@@ -25,11 +25,9 @@ from sb3_yann.control.linear_system import (
     as_unit,
     as_units,
     completed,
-    from_control,
     names,
     past_inputs,
     require_different,
-    to_control,
     with_units,
     zero_order_hold,
 )
@@ -319,43 +317,6 @@ class LinearModel(LinearSystem):
         log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
         return cls(**vars(fit_log(log, **options).system))
 
-    @classmethod
-    def from_statespace(
-        cls,
-        system: Any,
-        dt: float | None = None,
-        x_ss: ArrayLike | None = None,
-        u_ss: ArrayLike | None = None,
-        *,
-        disturbances: Sequence[int | str] = (),
-        d_ss: ArrayLike | None = None,
-    ) -> LinearModel:
-        """Take over a `control.StateSpace`: a discrete one as it is, a continuous one sampled.
-
-        C is kept where it is not the identity: the law then needs a :class:`StateEstimator`. The
-        notes say so, whether one can estimate the states, and that D, if not zero, was dropped.
-
-        Parameters
-        ----------
-        system : control.StateSpace
-            A, B, C, D, in deviations from the operating point.
-        dt : float, optional
-            Sampling time. Needed unless the system has one.
-        x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
-            The operating point.
-        disturbances : sequence of int or str, optional
-            Inputs of the system, by number or label, that are measured disturbances: they make E.
-
-        Examples
-        --------
-        >>> import control
-        >>> lag = control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
-        >>> LinearModel.from_statespace(lag, dt=0.1).A.round(3).tolist()
-        [[0.905]]
-        """
-        A, B, E, C, step, notes = from_control(system, dt, disturbances)
-        return cls(A, B, step, x_ss, u_ss, E, d_ss, notes=notes, C=C)
-
     def step(self, x: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> Array:
         """Return ``A x + B u + E d``; each is a vector or a batch of them, (batch, size)."""
         moved = np.asarray(x) @ self.A.T + np.asarray(u) @ self.B.T
@@ -402,17 +363,6 @@ class LinearModel(LinearSystem):
     def about_zero(self) -> Self:
         """Return the model without an operating point: what it describes are deviations."""
         return type(self)(**{**vars(self), "x_ss": None, "u_ss": None, "d_ss": None})
-
-    def to_statespace(self) -> Any:
-        """Return a discrete `control.StateSpace` from [u, d] to x, all in deviations.
-
-        Examples
-        --------
-        >>> from sb3_yann.control import LinearModel
-        >>> LinearModel([[0.5]], [[2.0]], dt=0.1).to_statespace().dt
-        0.1
-        """
-        return to_control(self)
 
     def report(self) -> str:
         """Return an account in words: poles, controllability, scaling, sampling and notes."""

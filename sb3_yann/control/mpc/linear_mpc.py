@@ -528,12 +528,6 @@ class LinearMPC(MPCProblem):
         moves = moving if np.any(moving >= 0) else None
         return self.model, self.theta_ss, rate, moves, self.clamped
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        for law in (*self._laws.values(), vars(self).get("_online")):
-            if law is not None and self.clamped is not None:  # no file of before says so
-                vars(law)["clamped"] = self.clamped
-
     @cached_property
     def _laws(self) -> dict[str, PiecewiseAffine]:
         return {}
