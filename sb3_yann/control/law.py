@@ -94,11 +94,10 @@ class PlantLaw(ReadOnlyArrays):
     ) -> Self:
         """Return the same law with its plant, see the attributes."""
         law = object.__new__(type(self))
-        plant: dict[str, Any] = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
-        for name, value, kind in (("rate", rate, float), ("moving", moving, np.intp)):
-            plant[name] = None if value is None else np.array(value, kind)
-        plant["clamped"] = None if clamped is None else np.array(clamped, np.float64)
-        law.__setstate__({**self.__getstate__(), **plant})
+        plant: dict[str, Any] = {"theta_ss": theta_ss, "rate": rate, "clamped": clamped}
+        known = {k: np.array(v, np.float64) for k, v in plant.items() if v is not None}
+        moves = None if moving is None else np.array(moving, np.intp)
+        law.__setstate__({**self.__getstate__(), **known, "model": model, "moving": moves})
         return law
 
     def clamp(self, theta: Array) -> Array:
@@ -239,8 +238,11 @@ class PlantLaw(ReadOnlyArrays):
             for name in ("rate", "moving")
         )
         moves = None if moving is None else moving.astype(int)
-        ends = check_bounds("clamped", *data["clamped"], law.n_theta) if "clamped" in data else None
-        return law.on_plant(model, theta_ss, rate, moves, ends)
+        clamped = None
+        if "clamped" in data:
+            low, high = data["clamped"]
+            clamped = check_bounds("clamped", low, high, law.n_theta)
+        return law.on_plant(model, theta_ss, rate, moves, clamped)
 
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""
