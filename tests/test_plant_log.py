@@ -1,11 +1,13 @@
 """Logs are cut where time is missing, and nothing else is lost."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sample_plants import played
 from sb3_yann import (
     DisturbanceBounds,
     LinearModel,
@@ -18,6 +20,17 @@ from sb3_yann import (
 )
 from sb3_yann.log import Episode, Log
 from sb3_yann.log import split_episodes as split
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[..., Path]:
+    """Write lines to a log; return its path."""
+
+    def write(*lines: str) -> Path:
+        (tmp_path / "log.csv").write_text("\n".join(lines), encoding="utf-8")
+        return tmp_path / "log.csv"
+
+    return write
 
 
 def numbered(steps: int) -> Episode:
@@ -94,36 +107,19 @@ CSV = """run,t,level,T,valve,load
 """
 
 
-def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(tmp_path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(CSV)
-    log = Log.from_csv(
-        path,
-        states=["level", "T"],
-        inputs=["valve"],
-        dt=10,
-        disturbances=["load"],
-        episode="run",
-        time="t",
-    )
-    assert [each.states[:, 0].tolist() for each in log.episodes] == [
-        [1.0, 1.1, 1.2],
-        [2.0, 2.1],
-        [2.2, 2.3],
-        [2.5, 2.6],
-    ]
-    assert [each.inputs[:, 0].tolist() for each in log.episodes] == [
-        [0.5, 0.6],
-        [0.5],
-        [0.7],
-        [0.8],
-    ]
+def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
+    columns = {"disturbances": ["load"], "episode": "run", "time": "t"}
+    log = Log.from_csv(write(CSV), states=["level", "T"], inputs=["valve"], dt=10, **columns)
+    states = [[1.0, 1.1, 1.2], [2.0, 2.1], [2.2, 2.3], [2.5, 2.6]]
+    assert [each.states[:, 0].tolist() for each in log.episodes] == states
+    inputs = [[0.5, 0.6], [0.5], [0.7], [0.8]]
+    assert [each.inputs[:, 0].tolist() for each in log.episodes] == inputs
     assert log.lost_steps == 3 and log.state_names == ("level", "T")
     assert log.every == (1, 1) and log.with_all_states() is log
     assert log.episodes[0].disturbances.tolist() == [[7], [7]]
 
 
-def test_set_points_and_loads_of_a_csv_file_reach_the_twin(tmp_path) -> None:
+def test_set_points_and_loads_of_a_csv_file_reach_the_twin(write) -> None:
     model = LinearModel([[0.9]], [[0.5]], 1, [12], [3], E=[[0.1]], d_ss=[1])
     mpc = LinearMPC(
         model, Q=[[1]], R=[[1]], horizon=2, x_min=0, x_max=20, u_min=0, u_max=10,
@@ -146,8 +142,7 @@ def test_set_points_and_loads_of_a_csv_file_reach_the_twin(tmp_path) -> None:
         states.append(np.array(x)[:, None])
         inputs.append(u[:, None])
         held.append(([*r[:-1], r[-2]], [*d[:-1], d[-2]]))  # the last row's count for nothing
-    path = tmp_path / "log.csv"
-    path.write_text("\n".join(lines))
+    path = write(*lines)
     columns = {"disturbances": ["load"], "references": ["h_sp"], "episode": "run"}
     log = Log.from_csv(path, ["h"], ["q"], 1, **columns)
     assert log.units == ("cm", "", "") and log.disturbance_names == ("load",)
@@ -165,21 +160,18 @@ def test_set_points_and_loads_of_a_csv_file_reach_the_twin(tmp_path) -> None:
     assert log.cut(5).episodes[1].references.tolist() == log.episodes[0].references[5:].tolist()
 
 
-def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(tmp_path) -> None:
+def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(write) -> None:
     rng = np.random.default_rng(0)
     u = np.repeat(rng.uniform(-1, 1, 300), 4)
-    x = np.zeros((1201, 2))
-    for k in range(1200):
-        x[k + 1] = [[0.9, 0.0], [0.2, 0.7]] @ x[k] + [0.3 * u[k], 0.0]
+    plant = LinearModel([[0.9, 0], [0.2, 0.7]], [[0.3], [0]], 1)
+    x = played(plant.step, u[:, None], [0, 0])
     shown = x + 0.01 * rng.normal(size=x.shape)
     rows = [
         f"{shown[k, 0]:.6f},{'' if k % 10 else f'{shown[k, 1]:.6f}'},{u[min(k, 1199)]:.6f}"
         for k in range(1201)
     ]
     rows[700] = f",,{u[700]:.6f}"
-    path = tmp_path / "log.csv"
-    path.write_text("\n".join(["T,quality,valve", *rows]), encoding="utf-8")
-    log = Log.from_csv(path, ["T", "quality"], ["valve"], dt=1)
+    log = Log.from_csv(write("T,quality,valve", *rows), ["T", "quality"], ["valve"], dt=1)
     assert [len(each) for each in log.episodes] == [699, 499]
     assert (log.every, log.lost_steps) == ((1, 10), 2)
     found = identify_outputs(log)
@@ -189,17 +181,9 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(tmp_path)
     assert np.std((guess - x[20:])[40:], axis=0).max() < 0.05  # x moves by .7 and .5
     with pytest.raises(ValueError, match=r"quality every 10 samples.*identify_outputs"):
         identify(log)
-    mpc = LinearMPC(
-        LinearModel([[0.9, 0], [0.2, 0.7]], [[0.3], [0]], 1),
-        Q=np.eye(2),
-        R=[[1]],
-        horizon=2,
-        u_min=-1,
-        u_max=1,
-        theta_min=-9,
-        theta_max=9,
-        tracking=Tracking([0], -1, 1),
-    )
+    box = {"u_min": -1, "u_max": 1, "theta_min": -9, "theta_max": 9}
+    tracking = Tracking([0], -1, 1)
+    mpc = LinearMPC(plant, Q=np.eye(2), R=[[1]], horizon=2, tracking=tracking, **box)
     with pytest.raises(ValueError, match=r"quality every 10 samples.*PlantTwin.fit\(mpc, log, obs"):
         PlantTwin.fit(mpc, log)
     observer = StateEstimator(mpc.model, [0, 1], every=[1, 10])
@@ -208,56 +192,42 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(tmp_path)
 
 
 @pytest.mark.filterwarnings("ignore:u.0. has no effect")
-def test_a_state_that_is_often_read_is_cut_where_it_is_missing(tmp_path) -> None:
-    path = tmp_path / "log.csv"
+def test_a_state_that_is_often_read_is_cut_where_it_is_missing(write) -> None:
     rows = [f"{'' if k % 5 == 4 else np.sin(k)},{np.sin(3 * k)}" for k in range(40)]
-    path.write_text("\n".join(["T,valve", *rows]), encoding="utf-8")
-    log = Log.from_csv(path, ["T"], ["valve"], dt=1)
+    log = Log.from_csv(write("T,valve", *rows), ["T"], ["valve"], dt=1)
     assert {len(each) for each in log.episodes} == {3} and log.every == (1,)
     assert identify(log).model.n_states == 1
 
 
-def test_a_csv_file_that_does_not_fit_is_named(tmp_path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(CSV)
-    with pytest.raises(ValueError, match="no column 'h'; it has"):
-        Log.from_csv(path, states=["h"], inputs=["valve"], dt=10)
-    with pytest.raises(ValueError, match="list of column names"):
-        Log.from_csv(path, states="level", inputs=["valve"], dt=10)
-    path.write_text(CSV.replace("1.1", "high"))
-    with pytest.raises(ValueError, match=r"row 3: level is 'high', expected a number"):
-        Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
-    for rows, said in (("", "no rows below its"), ("1,2\n", "no two rows"), ("1,\n,2\n", "no two")):
-        path.write_text("level,valve\n" + rows)
-        with pytest.raises(ValueError, match=said):
-            Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
+TWO = "level,valve\n"
 
 
 @pytest.mark.parametrize(
     ("text", "states", "said"),
     [
+        (CSV, ["h"], "no column 'h'; it has"),
+        (CSV, "level", "list of column names"),
+        (CSV.replace("1.1", "high"), ["level"], "row 3: level is 'high', expected a number"),
+        (TWO, ["level"], "no rows below its"),
+        (f"{TWO}1,2\n", ["level"], "no two rows"),
+        (f"{TWO}1,\n,2\n", ["level"], "no two samples"),
         ("level,level,valve\n1,2,3\n4,5,6\n", ["level"], "several columns 'level'"),
-        ("level,valve\n1,2\n3,4\n", ["level", "valve"], "'valve' is named twice"),
-        ("level,valve\n1,2\n1,5,2,3\n", ["level"], "row 3 has more entries than the header"),
+        (f"{TWO}1,2\n3,4\n", ["level", "valve"], "'valve' is named twice"),
+        (f"{TWO}1,2\n1,5,2,3\n", ["level"], "row 3 has more entries than the header"),
     ],
 )
-def test_a_csv_file_whose_columns_are_not_certain_is_refused(tmp_path, text, states, said) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(text)
+def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> None:
     with pytest.raises(ValueError, match=said):
-        Log.from_csv(path, states=states, inputs=["valve"], dt=10)
+        Log.from_csv(write(text), states=states, inputs=["valve"], dt=10)
 
 
-def test_identify_takes_a_log_with_its_names(tmp_path) -> None:
-    rng = np.random.default_rng(0)
-    u = rng.normal(size=80)
-    x = np.zeros(81)
-    for k in range(80):
-        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
-    path = tmp_path / "log.csv"
+def test_identify_takes_a_log_with_its_names(write) -> None:
+    u = np.random.default_rng(0).normal(size=80)
+    x = played(lambda x, u: 0.8 * x + 0.5 * u, u, 0.0)
     rows = [f"{a:.12g};{b:.12g}" for a, b in zip(x, [*u, 0.0], strict=True)]
-    path.write_text("\n".join(["level;valve", *rows]))
-    log = Log.from_csv(path, states=["level"], inputs=["valve"], dt=2, delimiter=";")
+    log = Log.from_csv(
+        write("level;valve", *rows), states=["level"], inputs=["valve"], dt=2, delimiter=";"
+    )
     model = identify(log).model
     assert model.state_names == ("level",) and model.input_names == ("valve",) and model.dt == 2
     np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [0.8, 0.5], atol=1e-9)
@@ -267,20 +237,11 @@ def test_identify_takes_a_log_with_its_names(tmp_path) -> None:
         identify(x)
 
 
-def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(
-    tmp_path: Path,
-) -> None:
-    rng = np.random.default_rng(0)
-    u = rng.normal(size=60)
-    x = np.zeros(61)
-    for k in range(60):
-        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(write) -> None:
+    u = np.random.default_rng(0).normal(size=60)
+    x = played(lambda x, u: 0.8 * x + 0.5 * u, u, 0.0)
     rows = zip(10 * np.arange(60), x, u, strict=False)
-    path = tmp_path / "log.csv"
-    path.write_text(
-        "time [s],T [K],valve\n" + "".join(f"{t},{a:.6f},{b:.6f}\n" for t, a, b in rows),
-        encoding="utf-8",
-    )
+    path = write("time [s],T [K],valve", *(f"{t},{a:.6f},{b:.6f}" for t, a, b in rows))
     log = Log.from_csv(path, ["T"], ["valve"], dt=10, time="time")
     assert Log.from_csv(path, ["T [K]"], ["valve"], dt=10).state_names == ("T",)
     assert repr(log) == "Log(1 episode, 59 steps of dt = 10 s; 1 state (T), 1 input (valve))"
@@ -288,9 +249,7 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(
     assert (model.state_names, model.units, model.time_unit) == (("T",), ("K", ""), "s")
     assert "sampled every 10 s" in model.report() and "time constant 44.81 s" in model.report()
     assert replace(model, dt=5).time_unit == "s"
-    with pytest.raises(
-        ValueError, match=r"has no column 'T \[C\]'; it has \['time \[s\]', 'T \[K\]'"
-    ):
+    with pytest.raises(ValueError, match=r"no column 'T \[C\]'; it has \['time \[s\]', 'T \[K\]'"):
         Log.from_csv(path, ["T [C]"], ["valve"], dt=10)
     with pytest.raises(TypeError, match="time_unit = 3 must be a str"):
         model.named(time_unit=3)
@@ -300,11 +259,9 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(
 
 
 @pytest.mark.parametrize(("dt", "unit", "found"), [(120, "", "s"), (2, "min", "min")])
-def test_time_stamps_are_in_the_unit_of_dt(dt, unit, found, tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    stamps = [f"2026-03-01T08:{2 * k:02d}:00" for k in range(20)]
-    rows = "".join(f"{stamp},{k % 3},{k % 2}\n" for k, stamp in enumerate(stamps))
-    path.write_text("at,T,valve\n" + rows, encoding="utf-8")
+def test_time_stamps_are_in_the_unit_of_dt(dt, unit, found, write) -> None:
+    rows = [f"2026-03-01T08:{2 * k:02d}:00,{k % 3},{k % 2}" for k in range(20)]
+    path = write("at,T,valve", *rows)
     log = Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at", time_unit=unit)
     assert (len(log.episodes[0]), log.time_unit, log.lost_steps) == (19, found, 0)
     with pytest.raises(ValueError, match="time_unit = 'hours': expected one of"):

@@ -5,7 +5,6 @@ import functools
 import pickle
 import sys
 import types
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import cloudpickle
@@ -31,49 +30,22 @@ class Problem:
 
 
 @pytest.fixture(autouse=True)
-def targets(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
+def targets(monkeypatch: pytest.MonkeyPatch) -> Any:
     module: Any = types.ModuleType(MODULE)
+    module.calls = 0
 
     def factory() -> Problem:
         module.calls += 1
         return Problem("made")
 
-    for name, value in {
-        "calls": 0,
-        "ready": Problem("ready"),
-        "factory": factory,
-        "cached_factory": functools.cache(factory),
-        "empty_factory": lambda: None,
-    }.items():
-        setattr(module, name, value)
+    module.factory = factory
+    module.cached_factory = functools.cache(factory)
     monkeypatch.setitem(sys.modules, MODULE, module)
-    yield module
+    return module
 
 
 def box(problem: object) -> ProblemBox:
     return ProblemBox(-1.0, 1.0, (2,), problem=problem)
-
-
-def copied(space: ProblemBox) -> ProblemBox:
-    return copy.deepcopy(space)
-
-
-def pickled(space: ProblemBox) -> ProblemBox:
-    arrived: ProblemBox = pickle.loads(pickle.dumps(space))
-    return arrived
-
-
-def cloudpickled(space: ProblemBox) -> ProblemBox:
-    arrived: ProblemBox = cloudpickle.loads(cloudpickle.dumps(space))
-    return arrived
-
-
-TRAVELS: list[Callable[[ProblemBox], ProblemBox]] = [copied, pickled, cloudpickled]
-
-
-def test_an_object_is_returned_as_it_is() -> None:
-    problem = Problem("given")
-    assert box(problem).problem is problem
 
 
 @pytest.mark.parametrize("name", ["factory", "cached_factory"])
@@ -84,34 +56,28 @@ def test_a_reference_to_a_factory_is_called_once_and_not_before_it_is_needed(
     assert targets.calls == 0
     assert space.problem is space.problem
     assert targets.calls == 1
+    problem = Problem("given")
+    assert box(problem).problem is problem
 
 
-@pytest.mark.parametrize("travel", TRAVELS)
-def test_an_unresolved_reference_survives_the_travel(
-    travel: Callable[[ProblemBox], ProblemBox], targets: Any
-) -> None:
-    arrived = travel(box(f"{MODULE}:factory"))
-    assert targets.calls == 0
-    assert arrived.problem.name == "made"  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("travel", TRAVELS)
-def test_a_resolved_problem_travels_with_the_space(
-    travel: Callable[[ProblemBox], ProblemBox], targets: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "travel",
+    [
+        copy.deepcopy,
+        lambda space: pickle.loads(pickle.dumps(space)),
+        lambda space: cloudpickle.loads(cloudpickle.dumps(space)),
+    ],
+)
+def test_a_space_travels_with_its_bounds_and_its_problem_or_the_reference_to_it(
+    travel: Any, targets: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = box(f"{MODULE}:factory")
+    arrived = travel(space)
+    assert type(arrived) is ProblemBox and arrived == space and arrived.dtype == np.float32
+    assert targets.calls == 0 and arrived.problem.name == "made"
     space.problem.name = "changed after it was made"  # type: ignore[attr-defined]
     monkeypatch.delattr(targets, "factory")
-    assert travel(space).problem.name == "changed after it was made"  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("travel", TRAVELS)
-def test_the_bounds_survive_the_travel(travel: Callable[[ProblemBox], ProblemBox]) -> None:
-    space = box(Problem("given"))
-    arrived = travel(space)
-    assert type(arrived) is ProblemBox
-    assert arrived == space
-    assert arrived.dtype == np.float32
+    assert travel(space).problem.name == "changed after it was made"
 
 
 @pytest.mark.parametrize(

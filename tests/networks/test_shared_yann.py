@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch as th
 
-from general_problems import servo, solved
+from general_problems import servo
 from sample_laws import (
     EVERY_LAW,
     box_points,
-    by_loops_and_by_torch,
     facet_points,
     law_of,
     scrambled,
@@ -46,15 +45,6 @@ def as_inputs(mpc: LinearMPC, actions: th.Tensor) -> np.ndarray:
     low = mpc.u_min
     high = mpc.u_max
     return low + (actions.detach().double().numpy() + 1) / 2 * (high - low)
-
-
-@LAWS
-def test_loops_and_operations_of_torch_agree(kind) -> None:
-    mpc = solved("servo with rates")
-    theta = drawn(mpc)
-    for limit in (None, 0.1):
-        layer = scrambled(layer_of(mpc, kind, max_correction=limit))
-        by_loops_and_by_torch(layer, theta)
 
 
 def test_the_equilibrium_stays_where_it_is_unless_it_is_not_pinned() -> None:

@@ -1,5 +1,7 @@
 """The YANN layer: the explicit law, exactly, and a network for each region, which trains."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch as th
@@ -16,8 +18,7 @@ from sample_laws import (
     to_action,
     train,
 )
-from sb3_yann import LinearMPC
-from sb3_yann.control import PiecewiseAffine
+from sample_problems import strips
 from sb3_yann.networks import YannLayer
 from weights import last_layer, network_of
 
@@ -38,18 +39,7 @@ def test_layer_is_the_law_inside_and_outside_the_feasible_set(name: str, infeasi
 
 def test_stiff_law_keeps_its_digits() -> None:
     # Terms of 1e4 that cancel to an input of the order of 1: float32 would leave errors of 1e-3.
-    base = law_of("pendulum")
-    law = PiecewiseAffine(
-        gains=np.array([[[1e4, 1.0]]]),
-        offsets=np.array([[-1e4]]),
-        A=np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]),
-        b=np.full(4, 2.0),
-        starts=np.array([0]),
-        u_min=base.u_min,
-        u_max=base.u_max,
-        theta_min=np.full(2, -2.0),
-        theta_max=np.full(2, 2.0),
-    )
+    law = replace(strips(np.array([-2.0, 2.0])), gains=[[[1e4, 1.0]]], offsets=[[-1e4]])
     theta = th.tensor([1.0, 0.0]) + th.tensor([1e-4, 1.0]) * (2 * th.rand(1000, 2) - 1)
     action = YannLayer(law)(theta).detach()
     assert (action - to_action(law, law(theta.numpy()))).abs().max() < 2e-7
@@ -69,20 +59,7 @@ def test_region_on_a_facet_is_that_of_the_law(name: str) -> None:
 
 
 def test_points_of_a_facet_that_float32_holds_exactly_go_to_the_first_region() -> None:
-    # Three strips of equal law side by side, with facets at -0.5 and 0.5.
-    base = law_of("pendulum")
-    edges = [-2.0, -0.5, 0.5, 2.0]
-    law = PiecewiseAffine(
-        gains=np.zeros((3, 1, 2)),
-        offsets=np.zeros((3, 1)),
-        A=np.tile([[1.0, 0.0], [-1.0, 0.0]], (3, 1)),
-        b=np.array([s * e for i in range(3) for s, e in ((1, edges[i + 1]), (-1, edges[i]))]),
-        starts=np.array([0, 2, 4]),
-        u_min=base.u_min,
-        u_max=base.u_max,
-        theta_min=np.full(2, -2.0),
-        theta_max=np.full(2, 2.0),
-    )
+    law = replace(strips(np.array([-2.0, -0.5, 0.5, 2.0])), disjoint=False)
     theta = th.tensor([[-0.5, 1.0], [0.5, 1.0], [0.5, -1.0], [0.0, 0.0]])
     assert region_of(YannLayer(law), theta).tolist() == [0, 1, 1, 1]
     assert law.locate(theta.numpy()).tolist() == [0, 1, 1, 1]
@@ -111,17 +88,7 @@ def test_correction_at_its_bound_gets_the_gradient_that_leads_back_and_no_other(
 
 
 def test_law_without_input_bounds_is_refused() -> None:
-    bounded = solved("two inputs")
-    free = LinearMPC(
-        bounded.model,
-        Q=bounded.Q,
-        R=bounded.R,
-        horizon=1,
-        theta_min=-1,
-        theta_max=1,
-        u_min=[-1, -np.inf],
-        u_max=1,
-    )
+    free = replace(solved("two inputs"), horizon=1, u_min=[-1, -np.inf], u_max=1)
     with pytest.raises(ValueError, match=r"u_min = \[-1\.0, -inf\].*Pass u_min and u_max"):
         YannLayer(free.explicit())
 

@@ -32,6 +32,14 @@ class Plant(gym.Env):
         return self.x.copy(), 0.0, False, False, {}
 
 
+def played(step, inputs, start):
+    """The states (T + 1, n) from a start (n,) on, by a function of the state and an input (m,)."""
+    x = [np.asarray(start, float)]
+    for u in inputs:
+        x.append(np.asarray(step(x[-1], u), float))
+    return np.array(x)
+
+
 class Settable(Plant):
     """The same, but it is put into a state by ``env.unwrapped.state`` alone."""
 

@@ -178,3 +178,14 @@ def vertices(law: PiecewiseAffine) -> Array:
                 if np.all(A @ point <= b + 1e-12):
                     points.append(point * half)
     return np.array(points)
+
+
+def strips(edges: Array) -> PiecewiseAffine:
+    """A law with a region between every two edges of the first of two coordinates in [-2, 2]."""
+    p = len(edges) - 1
+    A = np.tile([[1.0, 0.0], [-1.0, 0.0]], (p, 1))
+    b = np.column_stack([edges[1:], -edges[:-1]]).ravel()
+    return PiecewiseAffine(
+        np.ones((p, 1, 2)), np.zeros((p, 1)), A, b, 2 * np.arange(p), -np.ones(1), np.ones(1),
+        np.full(2, -2.0), np.full(2, 2.0), disjoint=True,
+    )  # fmt: skip

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sample_plants import played
 from sb3_yann import LinearModel, LinearMPC, identify
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
@@ -108,13 +109,14 @@ def test_a_law_with_dead_time_is_better_than_one_that_ignores_it() -> None:
     assert cost([2, 0]) < 0.97 * ignorant
 
 
+def curved(x: Any, u: Any) -> Any:
+    a, b = x
+    return a + 0.2 * (b - a**3 - 0.5 * a * b), 0.8 * b + 0.5 * np.exp(u[0])
+
+
 def test_curvature_is_called_by_its_name() -> None:
-    rng = np.random.default_rng(0)
-    x = np.zeros((401, 2))
-    u = np.repeat(rng.uniform(-1, 1, (80, 1)), 5, axis=0)
-    for k in range(400):
-        a, b = x[k]
-        x[k + 1] = a + 0.2 * (b - a**3 - 0.5 * a * b), 0.8 * b + 0.5 * np.exp(u[k, 0])
+    u = np.repeat(np.random.default_rng(0).uniform(-1, 1, (80, 1)), 5, axis=0)
+    x = played(curved, u, [0, 0])
     model = LinearModel.from_data(x, u, dt=1)  # warns of no dead time
     assert "Curvature: squares and products" in model.report()
     assert "sensor noise" not in model.report()
@@ -125,11 +127,8 @@ def test_curvature_is_called_by_its_name() -> None:
 def test_dead_time_of_a_curved_plant_is_found(delay: int) -> None:
     rng = np.random.default_rng(delay)
     u = np.repeat(rng.uniform(-1, 1, (125, 1)), 4, axis=0)
-    x = np.zeros((501, 2))
-    for k in range(500):
-        a, b = x[k]
-        acting = u[k - delay, 0] if k >= delay else 0.0
-        x[k + 1] = a + 0.2 * (b - a**3 - 0.5 * a * b), 0.8 * b + 0.5 * np.exp(acting) - 0.5
+    late = np.vstack([np.zeros((delay, 1)), u[: 500 - delay]])
+    x = played(lambda x, u: np.subtract(curved(x, u), [0, 0.5]), late, [0, 0])
     x = x + 0.005 * rng.normal(size=x.shape)
     assert identify(x, u, dt=1, delay="auto").model.n_states == 2 + delay
 

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from errors import Message, raises
+from sample_plants import played
 from sb3_yann import Identified, LinearModel, LinearMPC, Tracking, identify
 from sb3_yann.control.identification.fit import fit_log
 
@@ -172,10 +173,7 @@ def drive(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return states and inputs of the double integrator with a little process noise."""
     rng = np.random.default_rng(seed)
     u = rng.uniform(-1, 1, (200, 1))
-    x = np.zeros((201, 2))
-    for k in range(200):
-        x[k + 1] = DOUBLE.step(x[k], u[k]) + rng.normal(0, 0.001, 2)
-    return x, u
+    return played(lambda x, u: DOUBLE.step(x, u) + rng.normal(0, 0.001, 2), u, [0, 0]), u
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -198,11 +196,9 @@ def delayed(steps: int, hold: int = 1, process: float = 0.01) -> tuple[np.ndarra
     """Return a record in which the input acts so many steps late."""
     rng = np.random.default_rng(1)
     u = np.repeat(rng.uniform(-1, 1, (400 // hold, 1)), hold, axis=0)
-    x = np.zeros((401, 2))
-    for k in range(400):
-        acting = u[k - steps] if k >= steps else np.zeros(1)
-        x[k + 1] = A @ x[k] + B @ acting + process * SPREAD * rng.normal(size=2)
-    return x, u
+    late = np.vstack([np.zeros((steps, 1)), u[: 400 - steps]])
+    noise = process * SPREAD
+    return played(lambda x, u: A @ x + B @ u + noise * rng.normal(size=2), late, [0, 0]), u
 
 
 @pytest.mark.parametrize("steps", [1, 3, 8])

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sample_plants import played
 from sb3_yann import identify
 from sb3_yann.control.identification.least_squares import Regression, regress
 from sb3_yann.control.identification.residuals import (
@@ -21,12 +22,13 @@ def log(steps: int = 300, curved: float = 0.0, noise: float = 0.1, seed: int = 0
     """Return steps of a plant with two states, one input and one disturbance."""
     rng = np.random.default_rng(seed)
     driven = rng.uniform(-1, 1, (steps, 2))
-    x = np.zeros((steps + 1, 2))
-    for k in range(steps):
-        u, d = driven[k]
-        x[k + 1] = [0.8 * x[k, 0] + u, 0.5 * x[k, 1] + 0.3 * x[k, 0] + d + curved * u * d]
-        x[k + 1] += noise * rng.standard_normal(2)
-    return Episode(x, driven)
+
+    def step(x: np.ndarray, driven: np.ndarray) -> np.ndarray:
+        u, d = driven
+        moved = [0.8 * x[0] + u, 0.5 * x[1] + 0.3 * x[0] + d + curved * u * d]
+        return moved + noise * rng.standard_normal(2)
+
+    return Episode(played(step, driven, [0, 0]), driven)
 
 
 SIZES = (2, 1, 1)
@@ -70,10 +72,7 @@ def linear(order: int, measured: int, seed: int, hold: int, noise: float = 0.0) 
     A *= 0.93 / np.abs(np.linalg.eigvals(A)).max()
     B = rng.normal(size=(order, 1))
     u = held(500, 1, hold, seed)
-    x = np.zeros((501, order))
-    for k in range(500):
-        x[k + 1] = A @ x[k] + B @ u[k]
-    x = x[:, :measured]
+    x = played(lambda x, u: A @ x + B @ u, u, np.zeros(order))[:, :measured]
     return x + noise * x.std(axis=0) * rng.normal(size=x.shape), u
 
 
@@ -115,7 +114,4 @@ def bilinear(x: np.ndarray, u: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("hold", [4, 12])
 def test_a_plant_that_is_not_linear_is_still_called_so(plant: Any, hold: int) -> None:
     u = held(600, 1, hold, 1)
-    x = np.ones((601, 1))
-    for k in range(600):
-        x[k + 1] = plant(x[k], u[k])
-    assert "The plant is not linear" in notes(x, u)
+    assert "The plant is not linear" in notes(played(plant, u, [1]), u)

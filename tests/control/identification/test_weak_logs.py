@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sample_plants import played
 from sb3_yann import LinearModel, identify
 from sb3_yann.control import lqr
 from sb3_yann.control.identification.fit import frozen_rows
@@ -54,10 +55,7 @@ def weak_log(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     moves = np.repeat(rng.uniform(-1, 1, (20, 2)), 10, axis=0)
     u = U_SS * (1 + moves * [0.3, 0.02])
-    x = [X_SS]
-    for each in u:
-        x.append(column(x[-1], each))
-    return np.array(x), u
+    return played(column, u, X_SS), u
 
 
 def closed_loop_cost(K: np.ndarray) -> float:
@@ -104,23 +102,18 @@ def test_a_log_that_says_nothing_is_refused_with_what_did_not_move() -> None:
 def test_a_perfect_log_that_is_weak_is_left_as_it_is() -> None:
     plant = LinearModel.from_continuous([[0, 1], [-2, -0.3]], [[0], [1]], 0.001)
     u = np.random.default_rng(0).normal(size=(300, 1))
-    x = [np.zeros(2)]
-    for each in u:
-        x.append(plant.step(x[-1], each))
-    found = identify(np.array(x), u, dt=0.001)
+    found = identify(played(plant.step, u, [0, 0]), u, dt=0.001)
     np.testing.assert_allclose(found.model.A, plant.A, atol=1e-7)
 
 
 def test_intervals_of_the_poles_hold_the_truth() -> None:
+    A = np.array([[0.9, 0.2], [0.0, 0.7]])
     inside = 0
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        x = np.zeros((301, 2))
         u = rng.normal(size=(300, 1))
-        for k in range(300):
-            x[k + 1] = (
-                [[0.9, 0.2], [0.0, 0.7]] @ x[k] + [0.0, 1.0] * u[k] + 0.1 * rng.normal(size=2)
-            )
+        driven = np.hstack([u, 0.1 * rng.normal(size=(300, 2))])
+        x = played(lambda x, v: A @ x + [0, v[0]] + v[1:], driven, [0, 0])
         note = next(n for n in identify(x, u, dt=1).model.notes if n.startswith("Poles with 95 %"))
         first = note.partition(": ")[2].partition(";")[0]
         value, _, width = first.partition(" within ")
@@ -130,20 +123,16 @@ def test_intervals_of_the_poles_hold_the_truth() -> None:
 
 def test_a_pole_that_may_be_unstable_is_reported() -> None:
     rng = np.random.default_rng(0)
-    x = np.zeros((61, 1))
     u = rng.normal(size=(60, 1))
-    for k in range(60):
-        x[k + 1] = 0.999 * x[k] + u[k] + 0.5 * rng.normal()
+    x = played(lambda x, u: 0.999 * x + u + 0.5 * rng.normal(), u, [0])
     assert "may be unstable in the plant" in LinearModel.from_data(x, u, dt=1).report()
 
 
 def log(steps: int = 200, noise: float = 0.0, hold: int = 1) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     u = np.repeat(rng.uniform(-1, 1, (-(-steps // hold), 1)), hold, axis=0)[:steps]
-    x = [np.array([1.0, -1.0])]
-    for each in u:
-        x.append(np.array([[0.9, 0.1], [0.0, 0.8]]) @ x[-1] + [0.0, 0.2] * each)
-    return np.array(x) + noise * rng.normal(size=(steps + 1, 2)), u
+    plant = LinearModel([[0.9, 0.1], [0.0, 0.8]], [[0.0], [0.2]], 1)
+    return played(plant.step, u, [1, -1]) + noise * rng.normal(size=(steps + 1, 2)), u
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])

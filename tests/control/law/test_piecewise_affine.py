@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 
 from errors import Message, raises
 from random_problems import edges
-from sample_problems import solved, vertices
+from sample_problems import solved, strips, vertices
 from sb3_yann import LinearModel, LinearMPC, RateLimits, Tracking
 from sb3_yann._archive import read_arrays, write_arrays
 from sb3_yann.control import DisturbanceBounds, OnlineLaw, PiecewiseAffine
@@ -282,32 +282,19 @@ def test_more_names_than_colors_share_a_gray() -> None:
     law = problems.cstr().explicit()
     numbered = law.plot(entries=(0, 3), name=lambda region, theta: f"own {region}")
     assert len({p.get_facecolor() for p in numbered.patches}) == len(numbered.patches) <= 8
-    many = _stripes(np.linspace(-2, 2, 12)).plot(name=lambda region, theta: f"own {region}")
+    many = strips(np.linspace(-2, 2, 12)).plot(name=lambda region, theta: f"own {region}")
     colors = [to_hex(p.get_facecolor()).upper() for p in many.patches]
     assert sorted(set(colors)) == sorted({*COLORS, REST}) and colors.count(REST) == 4
     assert "4 others" in many.get_legend_handles_labels()[1]
 
 
 def test_regions_are_numbered_but_for_slivers_and_where_they_are_too_many() -> None:
-    some = _stripes(np.array([-2, 0, 0.005, 2])).plot()
+    some = strips(np.array([-2, 0, 0.005, 2])).plot()
     assert {text.get_text() for text in some.texts} == {"0", "2"}
     first, last = (text.get_position() for text in some.texts)
     assert first == pytest.approx((-1, 0)) and last == pytest.approx((1.0025, 0))
-    assert len(_stripes(np.linspace(-2, 2, 61)).plot().texts) == 60
-    assert not _stripes(np.linspace(-2, 2, 62)).plot().texts
-
-
-def _stripes(edges: np.ndarray):
-    """Return a law with a region between every two edges of the first coordinate."""
-    from sb3_yann import PiecewiseAffine
-
-    p = len(edges) - 1
-    A = np.tile([[1.0, 0.0], [-1.0, 0.0]], (p, 1))
-    b = np.column_stack([edges[1:], -edges[:-1]]).ravel()
-    return PiecewiseAffine(
-        np.ones((p, 1, 2)), np.zeros((p, 1)), A, b, 2 * np.arange(p), -np.ones(1), np.ones(1),
-        np.full(2, -2.0), np.full(2, 2.0), disjoint=True,
-    )  # fmt: skip
+    assert len(strips(np.linspace(-2, 2, 61)).plot().texts) == 60
+    assert not strips(np.linspace(-2, 2, 62)).plot().texts
 
 
 @pytest.mark.parametrize("entries", [(0, 0), (0, 2), (0,), (0, 1.5)])

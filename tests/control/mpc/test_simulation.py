@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.online_problems import wide_plant
 from general_problems import PROBLEMS, servo, solved, two_tanks
-from sample_plants import Plant
+from sample_plants import Plant, played
 from sample_problems import input_bounds_only, small_mpc
 from sample_problems import solved as sample_problem
 from sb3_yann import LinearModel, LinearMPC, Log, RateLimits, Terminal, Tracking, identify
@@ -99,11 +99,8 @@ def test_what_is_given_counts_more_than_the_spaces() -> None:
 
 
 def test_what_identify_returns_is_a_model_for_it() -> None:
-    rng = np.random.default_rng(0)
-    u = rng.normal(size=(80, 1))
-    x = np.zeros((81, 1))
-    for k in range(80):
-        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+    u = np.random.default_rng(0).normal(size=(80, 1))
+    x = played(lambda x, u: 0.8 * x + 0.5 * u, u, [0])
     found = identify(Log.from_arrays(x, u, 1.0), x_ss=[0], u_ss=[0])
     mpc = LinearMPC(found, Q=[[1]], R=[[1]], horizon=2, x_min=-5, x_max=5, u_min=-1, u_max=1)
     assert isinstance(mpc.model, LinearModel) and mpc.explicit()([5.0])[0] == pytest.approx(-1)
