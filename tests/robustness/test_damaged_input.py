@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann import Controller, LinearModel, LinearMPC, export
-from sb3_yann._archive import digest_of, read_arrays, write_arrays
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann._archive import read_arrays, write_arrays
 from sb3_yann.commissioning.journal import CommissioningState, Journal, Record
 from sb3_yann.commissioning.plant import PlantEpisode
 
@@ -90,34 +90,9 @@ def _plant() -> LinearMPC:
 def _law_file(kind: str, folder: Path) -> tuple[Callable[[Path], Any], Path]:
     path = folder / "law.npz"
     mpc = _plant()
-    if kind == "controller":
-        export(mpc.explicit(), path)
-        return Controller.load, path
     law = mpc.explicit() if kind == "law" else mpc.online()
     law.save(path)
     return type(law).load, path
-
-
-def _bytes(kind: str) -> Callable[[Path], Target]:
-    """Return a target of damaged files: they are refused, or hold what they held."""
-
-    def target(folder: Path) -> Target:
-        load, path = _law_file(kind, folder)
-        content = path.read_bytes()
-        digest = digest_of(read_arrays(path))
-        known = load(path)
-
-        def attempt(rng: np.random.Generator) -> str:
-            path.write_bytes(damaged(content, rng))
-            read = load(path)
-            same = digest_of(read_arrays(path)) == digest
-            if not same or (kind != "controller" and read != known):
-                raise Wrong("another law was read")
-            return "the same"
-
-        return Target(attempt)
-
-    return target
 
 
 def _arrays(kind: str) -> Callable[[Path], Target]:
@@ -190,7 +165,6 @@ def _record(folder: Path) -> Target:
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {
-    **{kind: _bytes(kind) for kind in ("law", "online", "controller")},
     **{f"{kind}, signed": _arrays(kind) for kind in ("law", "online")},
     "record": _record,
 }
