@@ -202,13 +202,6 @@ def test_ctrl_c_is_an_exit_code(folder, monkeypatch, capsys) -> None:
     assert "Interrupted" in capsys.readouterr().err
 
 
-def test_wrong_arguments_are_argparse_s(folder, capsys) -> None:
-    with pytest.raises(SystemExit) as found:
-        main(["evaluate"])
-    assert found.value.code == 2
-    assert "usage: sb3-yann" in capsys.readouterr().err
-
-
 def test_it_runs_as_a_module(folder) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "sb3_yann", "solve", "CSTR-v0"], capture_output=True, text=True

@@ -68,58 +68,33 @@ def public_names(module: Any) -> list[str]:
     return list(getattr(module, "__all__", own))
 
 
-def public_callables() -> dict[str, tuple[Callable[..., Any], str]]:
-    """Return what the packages export, functions, methods and constructors, with docstrings."""
-    found: dict[str, tuple[Callable[..., Any], str]] = {}
-    for name, value in exported().items():
-        if inspect.isclass(value):
-            found |= methods(name, value)
-        else:
-            found[name] = value, value.__doc__ or ""
-    return found
-
-
-def methods(path: str, owner: type) -> dict[str, tuple[Callable[..., Any], str]]:
-    """Return a class's own public methods, and its constructor with the docstring of the class."""
-    found: dict[str, tuple[Callable[..., Any], str]] = {}
-    for name, value in vars(owner).items():
-        method = value.__func__ if isinstance(value, classmethod | staticmethod) else value
-        if not inspect.isfunction(method) or (name.startswith("_") and name != "__init__"):
-            continue
-        text = method.__doc__ or ""
-        if name == "__init__":
-            text += owner.__doc__ or ""
-        elif inherited(owner, name):
-            continue  # the signature, and with it the documentation, is another library's
-        found[f"{path}.{name}"] = method, text
-    return found
-
-
-def inherited(owner: type, name: str) -> bool:
-    return any(name in vars(base) for base in owner.__mro__[1:])
-
-
 def undocumented(function: Callable[..., Any], text: str) -> list[str]:
-    """Return the parameters that no line of a Parameters or Attributes section begins with."""
-    given = [
-        each.name
-        for each in inspect.signature(function).parameters.values()
-        if each.name not in ("self", "cls")
-        and each.kind not in (each.VAR_KEYWORD,)
-        and not each.name.startswith("_")  # what `dataclasses.replace` passes
-    ]
-    if len(given) < MANY:
-        return []
-    named: set[str] = set()
-    for body in re.findall(
-        r"^(Parameters|Attributes)\n-+\n(.*?)(?=^\w[\w ]*\n-+\n|\Z)",
-        inspect.cleandoc(text),
-        re.MULTILINE | re.DOTALL,
-    ):
-        for line in body[1].splitlines():
-            if not line.startswith(" "):
-                named |= set(re.findall(r"\w+", line.partition(" : ")[0]))
-    return [name for name in given if name not in named]
+    """Return the parameters that no line of the text but those of an example begins with."""
+    given = inspect.signature(function).parameters.values()
+    own = [each.name for each in given if each.kind is not each.VAR_KEYWORD]
+    own = [name for name in own if name not in ("self", "cls") and not name.startswith("_")]
+    lines = re.findall(r"^[\w*][\w, *]*(?= : |$)", inspect.cleandoc(text), re.MULTILINE)
+    named = set(re.findall(r"\w+", " ".join(lines)))
+    return [name for name in own if name not in named] if len(own) >= MANY else []
+
+
+def callables() -> dict[str, tuple[Callable[..., Any], str]]:
+    """Return exported functions, constructors and methods that are no override, with texts."""
+    found: dict[str, tuple[Callable[..., Any], str]] = {}
+    for path, thing in exported().items():
+        if not inspect.isclass(thing):
+            found[path] = thing, thing.__doc__ or ""
+            continue
+        for name, value in vars(thing).items():
+            method = getattr(value, "__func__", value)
+            text = inspect.cleandoc(getattr(method, "__doc__", None) or "")
+            if name == "__init__":
+                text += "\n" + inspect.cleandoc(thing.__doc__ or "")
+            inherited = any(name in vars(base) for base in thing.__mro__[1:])
+            own = name == "__init__" or not (name.startswith("_") or inherited)
+            if inspect.isfunction(method) and own:
+                found[f"{path}.{name}"] = method, text
+    return found
 
 
 @pytest.mark.parametrize("example", with_examples(), ids=lambda example: example.name)
@@ -147,7 +122,7 @@ def test_what_is_exported_has_examples(name: str) -> None:
     assert re.search(r"^Examples\n--------\n", text, re.MULTILINE) and ">>> " in text
 
 
-CALLABLES = public_callables()
+CALLABLES = callables()
 LONG = [
     name for name, (function, _) in CALLABLES.items() if len(undocumented(function, "")) >= MANY
 ]

@@ -25,18 +25,6 @@ from weights import last_layer, network_of
 # --- the law -----------------------------------------------------------------------------------
 
 
-@INFEASIBLE
-@EVERY_LAW
-def test_layer_is_the_law_inside_and_outside_the_feasible_set(name: str, infeasible: str) -> None:
-    law = law_of(name, infeasible)
-    theta = th.cat([box_points(law, 20_000), box_points(law, 20_000, stretch=3)])
-    assert 0.1 < np.mean(law.in_domain(theta.numpy())) < 0.9
-    with th.no_grad():
-        action = YannLayer(law)(theta)
-    error = (action - to_action(law, law(theta.numpy()))).abs() / 2  # of the input range
-    assert error.max() < 1e-7  # the rounding of the output to float32
-
-
 def test_stiff_law_keeps_its_digits() -> None:
     # Terms of 1e4 that cancel to an input of the order of 1: float32 would leave errors of 1e-3.
     law = replace(strips(np.array([-2.0, 2.0])), gains=[[[1e4, 1.0]]], offsets=[[-1e4]])

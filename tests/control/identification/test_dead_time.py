@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sample_plants import played
-from sb3_yann import LinearModel, LinearMPC, identify
+from sb3_yann import LinearModel, identify
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0, 0.5], [1.0, 0.0]])
@@ -81,32 +81,6 @@ def test_names_of_the_inputs_on_their_way_follow_from_those_of_the_inputs() -> N
     assert model.named(["T", "h"]).state_names == ("T", "h", "u[0](k-1)", "u[0](k-2)")
     with pytest.raises(ValueError, match="must be 4 different names"):
         model.named(["a", "b", "c"])
-
-
-def test_a_law_with_dead_time_is_better_than_one_that_ignores_it() -> None:
-    x, u = late((2, 0), 0.01)
-    weights = {"Q": np.eye(2), "R": np.eye(2), "horizon": 2, "u_min": -1, "u_max": 1}
-
-    def cost(delay: Any) -> float:
-        with np.errstate(all="ignore"):
-            model = LinearModel.from_data(x, u, dt=1, delay=delay, x_ss=[0, 0], u_ss=[0, 0])
-        weights["Q"] = np.diag([1.0, 1.0, *[0.0] * (model.n_states - 2)])
-        mpc = LinearMPC(model, **weights, theta_min=-20, theta_max=20)
-        law = mpc.explicit()
-        at = np.array([5.0, 2.0])
-        way = [np.zeros(2)] * 2
-        total = 0.0
-        for _ in range(40):
-            memory = [each[0] for each in way] if model.n_states > 2 else []
-            v = np.clip(law(np.r_[at, memory]), -1, 1)
-            total += float(at @ at + v @ v)
-            at = A @ at + B @ np.array([way[1][0], v[1]])
-            way = [v, way[0]]
-        return total
-
-    with pytest.warns(UserWarning, match=r"acts 2 samples late\. Pass delay=\[2, 0\], or"):
-        ignorant = cost(0)
-    assert cost([2, 0]) < 0.97 * ignorant
 
 
 def curved(x: Any, u: Any) -> Any:

@@ -296,15 +296,6 @@ def test_law_and_domain_are_those_of_an_online_qp(name: str) -> None:
     assert relative_error(mpc, mpc.explicit()(points[feasible]), inputs) <= 1e-9
 
 
-def test_a_soft_bound_is_kept_where_the_hard_one_can_be() -> None:
-    hard = servo(x_max=[1.5, 0.3], x_min=[-1.5, -0.3], theta_min=-3, theta_max=3)
-    soft = replace(hard, soft=SoftBounds([0.0, 1.0], penalty=1e3))
-    points = box_points(hard, 2000)
-    inside = points[hard.explicit().in_domain(points)]
-    error = relative_error(hard, soft.explicit()(inside), hard.explicit()(inside))
-    assert error <= 1e-9  # exact, not nearly: the penalty has a linear part
-
-
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("unit", [1.0, 1e-3, 1e4])
 def test_a_soft_bound_without_a_penalty_is_kept_too_whatever_the_units(seed, unit) -> None:

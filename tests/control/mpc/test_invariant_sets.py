@@ -40,22 +40,6 @@ def test_none_of_a_thousand_closed_loops_becomes_infeasible(name: str) -> None:
         assert law.in_domain(theta).all()
 
 
-@pytest.mark.parametrize("name", ["unstable regulator", "unstable servo"])
-def test_without_it_some_do(name: str) -> None:
-    mpc = INVARIANT[name]()
-    free = np.zeros((0, mpc.n_theta)), np.zeros(0)
-    values = {field: getattr(mpc, field) for field in mpc.__dataclass_fields__}
-    mpc = LinearMPC(**{**values, "terminal": Terminal(mpc.terminal.cost, free)})
-    law = mpc.explicit()
-    rng = np.random.default_rng(0)
-    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (2000, mpc.n_theta))
-    theta = theta[law.in_domain(theta)]
-    for _ in range(50):
-        theta = mpc.predict(theta, law(theta))
-        theta = np.clip(theta, -100, 100)
-    assert not law.in_domain(theta).all()
-
-
 def test_the_set_is_the_largest_one_on_a_plant_with_one_state() -> None:
     # x+ = 0.5 x under any gain near it: the set is where |x| <= 2 and |K x| <= 1.
     mpc = small_mpc(LinearModel([[0.9]], [[1]], 1.0), x_min=-2, x_max=2, u_max=0.5, **INVARIANT_SET)
