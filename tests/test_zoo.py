@@ -1,9 +1,6 @@
 """RL Zoo trains, continues and replays our policy from the hyperparameters that are shipped."""
 
 import csv
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -17,7 +14,7 @@ from stable_baselines3 import DDPG, TD3
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_yann
-import sb3_yann_envs
+from fresh_process import run_module
 from sample_plants import LinearPlant, feasible_states
 
 ALGORITHMS = {"ddpg": DDPG, "td3": TD3}
@@ -106,24 +103,9 @@ class Run:
 
     def zoo(self, script: str, *arguments: str) -> str:
         """Run a script of the zoo in the folder, return what it printed."""
-        packages = (Path(package.__file__).parents[1] for package in (sb3_yann, sb3_yann_envs))
-        command = [sys.executable, "-m", f"rl_zoo3.{script}", "--gym-packages", "sb3_yann"]
-        command += ["--algo", self.algo, "--env", self.env_id, "-f", "logs", "--seed", "0"]
-        done = subprocess.run(
-            [*command, *arguments],
-            cwd=self.folder,
-            env={
-                **os.environ,
-                "OMP_NUM_THREADS": "1",
-                "PYTHONPATH": os.pathsep.join(str(package) for package in packages),
-            },
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        given = ["--gym-packages", "sb3_yann", "--algo", self.algo, "--env", self.env_id]
+        given += ["-f", "logs", "--seed", "0", *arguments]
+        return run_module(self.folder, f"rl_zoo3.{script}", *given)
 
     def train(self, *arguments: str) -> None:
         with as_file(HYPERPARAMETERS / f"{self.algo}.yml") as conf_file:
@@ -212,10 +194,7 @@ pytest.importorskip("rl_zoo3")
 from sb3_yann import tuning  # noqa: E402
 
 
-def test_every_draw_builds_a_policy_that_is_the_mpc(monkeypatch):
-    import numpy as np
-    from stable_baselines3 import DDPG
-
+def test_every_draw_builds_a_policy_that_is_the_mpc():
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     seen = set()
     for _ in range(12):

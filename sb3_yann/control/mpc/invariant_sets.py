@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import optimize
 
 from sb3_yann._validation import Array, ReadOnlyArrays, check_array
 from sb3_yann.control import lqr
@@ -84,7 +83,6 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Facets:
     not enough.
     """
     errors = problem.error_system
-    parts = problem.layout
     K = lqr.gain(errors.model, errors.R, cost, problem.gamma, errors.cross)
     radius = lqr.spectral_radius(errors.model.A - errors.model.B @ K)
     if radius >= 1:
@@ -107,31 +105,28 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Facets:
             "Terminal(set='invariant') needs an operating point with room to every bound, but "
             "it lies on or beyond a hard one. Move the bounds or the operating point."
         )
-    granted = _granted(problem, half)
-    found = _remove_redundant((rows, bounds), granted)
-    if parts.constant.start < parts.constant.stop:
-        moving = np.any(np.abs(steady) > 1e-12, axis=1)
-        inside = (steady[moving], (1 - STEADY_MARGIN) * bounds[moving])
-        found = np.vstack([found[0], inside[0]]), np.concatenate([found[1], inside[1]])
-    found = _until_nothing_new((rows, bounds), closed, found, granted)
-    F, g = _remove_redundant(found, granted)
+    wide, ends = _around(problem, half, 1e3)
+    box = wide, ends - wide @ (rest / half)
+    moving = np.any(np.abs(steady) > 1e-12, axis=1)
+    inside = steady[moving], (1 - STEADY_MARGIN) * bounds[moving]
+    found = _reduced(_joined((rows, bounds), inside), box)
+    assert found is not None  # the origin lies inside of all
+    F, g = _until_nothing_new((rows, bounds), closed, found, box)
     return F / half, g + F @ (rest / half)
 
 
-def _until_nothing_new(ahead: Facets, closed: Array, found: Facets, granted: Facets) -> Facets:
+def _until_nothing_new(ahead: Facets, closed: Array, found: Facets, box: Facets) -> Facets:
     """Add the bounds of later steps until those of one step say nothing new."""
-    (F, g) = found
-    (later, bounds) = ahead
+    later, bounds = ahead
     for _ in range(MAX_STEPS):
         later = later @ closed
-        A = np.vstack([F, granted[0]])
-        b = np.concatenate([g, granted[1]])
-        new = [i for i, row in enumerate(later) if not _is_redundant(row, float(bounds[i]), A, b)]
-        if not new:
-            return F, g
-        F = np.vstack([F, later[new]])
-        g = np.concatenate([g, bounds[new]])
-        if len(g) > MAX_FACETS:
+        new = _exceeded(found, (later, bounds), box) > 1e-9 * np.linalg.norm(later, axis=1)
+        if not np.any(new):
+            return found
+        more = _reduced(_joined(found, (later[new], bounds[new])), box)
+        assert more is not None
+        found = more
+        if len(found[1]) > MAX_FACETS:
             raise ValueError(
                 f"The invariant terminal set has more than {MAX_FACETS} half-spaces. Give the "
                 "state more weight, sample more slowly, or pass a terminal set of your own."
@@ -182,44 +177,6 @@ def _steady_projection(problem: MPCProblem, half: Array) -> Array:
     at_rest[parts.constant, parts.constant] = np.eye(parts.constant.stop - parts.constant.start)
     at_rest[parts.previous, parts.now] = steady.u[: parts.n_previous]
     return np.asarray(at_rest / half[:, None] * half)
-
-
-def _granted(problem: MPCProblem, half: Array) -> Facets:
-    """Return the half-spaces that every predicted theta satisfies anyway."""
-    first = problem.layout.constant.start
-    rows = np.vstack([np.eye(problem.n_theta)[first:], -np.eye(problem.n_theta)[first:]])
-    rest = problem.theta_rest[first:]
-    bounds = np.concatenate([problem.theta_max[first:] - rest, rest - problem.theta_min[first:]])
-    bounds = bounds / np.tile(half[first:], 2)
-    bounded = np.isfinite(bounds)
-    return rows[bounded], bounds[bounded]
-
-
-def _remove_redundant(found: Facets, granted: Facets) -> Facets:
-    """Return the half-spaces that the others and the granted ones do not imply."""
-    (rows, bounds) = found
-    kept = list(range(len(found[1])))
-    for i in range(len(bounds)):
-        others = [j for j in kept if j != i]
-        A = np.vstack([rows[others], granted[0]])
-        b = np.concatenate([bounds[others], granted[1]])
-        if _is_redundant(rows[i], float(bounds[i]), A, b):
-            kept = others
-    return rows[kept], bounds[kept]
-
-
-def _is_redundant(row: Array, bound: float, A: Array, b: Array) -> bool:
-    """Tell whether ``row theta <= bound`` follows from ``A theta <= b`` (a linear program)."""
-    length = float(np.linalg.norm(row))
-    if length < 1e-12:
-        return True
-    row = row / length
-    bound = bound / length
-    # The row itself, one further out, keeps the program bounded.
-    A = np.vstack([A, row])
-    b = np.append(b, bound + 1)
-    best = optimize.linprog(-row, A_ub=A, b_ub=b, bounds=[(None, None)] * len(row))
-    return bool(best.status == 0 and -best.fun <= bound + 1e-9)
 
 
 ZERO_LENGTH = 1e-9
@@ -304,12 +261,12 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     return KeptSet(F, g, rows, steps, settled or (ends and steps == problem.horizon))
 
 
-def _around(problem: MPCProblem, half: Array) -> Facets:
+def _around(problem: MPCProblem, half: Array, unbounded: float = 1.0) -> Facets:
     """Return the box of theta, ten times as large in the states, in half-widths."""
     low = problem.theta_min / half
     high = problem.theta_max / half
-    low = np.where(np.isfinite(low), low, -1)
-    high = np.where(np.isfinite(high), high, 1)
+    low = np.where(np.isfinite(low), low, -unbounded)
+    high = np.where(np.isfinite(high), high, unbounded)
     far = np.ones(len(half))
     far[problem.layout.state] = 10
     middle = (low + high) / 2
@@ -379,11 +336,14 @@ def _reduced(rows: Facets, box: Facets) -> Facets | None:
     return F[facets], g[facets]
 
 
-def _implies(found: Facets, wanted: Facets, box: Facets, room: float = 1e-7) -> bool:
+def _implies(found: Facets, wanted: Facets, box: Facets) -> bool:
     """Tell whether all theta of one set lie in another, to some room."""
-    if not len(wanted[1]):
-        return True
+    return not len(wanted[1]) or bool(np.all(_exceeded(found, wanted, box) <= 1e-7))
+
+
+def _exceeded(found: Facets, wanted: Facets, box: Facets) -> Array:
+    """Return by how much the theta of a set exceed some half-spaces at most, negative inside."""
     A, b = _joined(found, box)
     inside, _, _, _ = bounded_region(A, b, np.inf)
     ends = farthest_points(A, b, inside, wanted[0])
-    return bool(np.all(np.sum(ends * wanted[0], axis=1) <= wanted[1] + room))
+    return np.asarray(np.sum(ends * wanted[0], axis=1) - wanted[1])
