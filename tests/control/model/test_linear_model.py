@@ -27,18 +27,10 @@ def test_sampling_is_the_matrix_exponential(n: int, m: int, dt: float, seed: int
     B = rng.normal(size=(n, m))
     # x' = A x + B u with u' = 0, in one exponential (Van Loan 1978)
     both = expm(dt * np.vstack([np.hstack([A, B]), np.zeros((m, n + m))]))
-    model = LinearModel.from_continuous(A, B, dt)
-    np.testing.assert_allclose(np.hstack([model.A, model.B]), both[:n], rtol=1e-11, atol=1e-12)
-
-
-def test_disturbances_are_sampled_like_inputs() -> None:
-    A = [[0, 1], [-2, -1]]
-    B = [[0], [1]]
-    E = [[1], [3]]
-    model = LinearModel.from_continuous(A, B, 0.3, E=E, d_ss=[5])
-    other = LinearModel.from_continuous(A, E, 0.3)
-    np.testing.assert_allclose(model.E, other.B, rtol=1e-12)
-    assert model.d_ss == [5]
+    for k in (0, m):  # inputs alone, and the first as an input, others as disturbances
+        model = LinearModel.from_continuous(A, B[:, : m - k + 1], dt, E=B[:, m - k + 1 :])
+        found = np.hstack([model.A, model.B, model.E])
+        np.testing.assert_allclose(found, both[:n], rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -217,6 +217,7 @@ def test_problems_are_copied_pickled_and_changed_with_all_their_parts() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"model": "pendulum"}, TypeError("model = 'pendulum' must be a LinearModel")),
         ({"control_horizon": 7}, "must be at most the horizon, 6"),
         ({"control_horizon": [1, 2]}, "make 3 samples, and the horizon is 6"),
         ({"control_horizon": "3"}, TypeError("must be a number of samples, or a list")),
