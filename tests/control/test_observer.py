@@ -3,12 +3,11 @@
 import dataclasses
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 
 from general_problems import LOADED, THERMAL
+from sample_plants import Plant
 from sb3_yann import (
     DisturbanceObserver,
     IdentifiedOutputs,
@@ -134,28 +133,21 @@ A = np.array([[0.9, 0.3], [0.0, 0.7]])
 B = np.array([[0.0], [0.5]])
 
 
-class Hidden(gym.Env[Array, Array]):
+class Hidden(Plant):
     """A plant that shows its first state, about (50, 3), and differs from the model by a load."""
 
     def __init__(self, load: float = 0.0, lost: int = -1) -> None:
-        self.observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
-        self.action_space = spaces.Box(1.0, 5.0, (1,), np.float64)
-        self.load = load
+        super().__init__(lambda x, u: A @ x + B @ (u - 3) + [0.0, load], (-np.inf, np.inf), (1, 5))
+        self.start = np.array([0.5, 0.0])
         self.lost = lost
-        self.x = np.zeros(2)
-        self.k = 0
 
-    def reset(self, *, seed: int | None = None, options: object = None) -> Any:
-        super().reset(seed=seed)
-        self.x = np.array([0.5, 0.0])
-        self.k = 0
-        return self.x[:1] + 50, {}
+    def reset(self, **given: Any) -> Any:
+        self.k = -1
+        return super().reset(**given)
 
-    def step(self, action: Array) -> Any:
-        self.x = A @ self.x + B @ (np.asarray(action, float) - 3) + [0.0, self.load]
+    def shown(self) -> Array:
         self.k += 1
-        shown = [np.nan] if self.k % 5 == self.lost else self.x[:1] + 50
-        return np.array(shown), 0.0, False, False, {}
+        return np.array([np.nan]) if self.k % 5 == self.lost else self.x[:1] + 50
 
 
 def identified(dt: float = 1.0) -> IdentifiedOutputs:
@@ -192,41 +184,28 @@ def test_the_estimator_of_a_model_predicts_as_the_model_does() -> None:
 def test_tracking_from_outputs_alone_settles_without_offset(lost: int) -> None:
     model = identified().model
     n = model.n_states
-    half = 20 * np.ones(n)
-    mpc = LinearMPC(
-        model,
-        Q=np.eye(n),
-        R=[[0.1]],
-        horizon=5,
-        u_min=1,
-        u_max=5,
-        theta_min=model.x_ss - half,
-        theta_max=model.x_ss + half,
-        tracking=Tracking(model.C, 45, 55),
-    )
+    box = {"u_min": 1, "u_max": 5, "theta_min": model.x_ss - 20, "theta_max": model.x_ss + 20}
+    tracking = Tracking(model.C, 45, 55)
+    mpc = LinearMPC(model, Q=np.eye(n), R=[[0.1]], horizon=5, tracking=tracking, **box)
     free, observer = offset_free(mpc)
     assert observer.n_estimated == 1
-    low = free.disturbances.d_min
-    high = free.disturbances.d_max
     reference = 52.0
-    env = ObserveDisturbance(
-        SetPoint(Hidden(0.4, lost), 45, 55, schedule=lambda _: [reference]), observer, low, high
-    )
-    law = free.online()
-    shown, _ = env.reset(seed=0)
-    with np.errstate(all="ignore"):
-        for _ in range(120):
-            shown, *_ = env.step(law.plant_input(shown))
-    assert env.unwrapped.x[0] + 50 == pytest.approx(reference, abs=1e-3)
-    plain = EstimateState(
-        SetPoint(Hidden(0.4), 45, 55, schedule=lambda _: [reference]), StateEstimator(model)
-    )
-    law = mpc.online()
-    shown, _ = plain.reset(seed=0)
-    assert shown.shape == (n + 1,)
-    for _ in range(120):
-        shown, *_ = plain.step(law.plant_input(shown))
-    assert abs(plain.unwrapped.x[0] + 50 - reference) > 0.1  # what the estimate takes away
+
+    def rest(law: Any, wrapped: Any) -> float:
+        shown, _ = wrapped.reset(seed=0)
+        with np.errstate(all="ignore"):
+            for _ in range(120):
+                shown, *_ = wrapped.step(law.plant_input(shown))
+        return float(wrapped.unwrapped.x[0] + 50)
+
+    def followed(plant: Hidden) -> Any:
+        return SetPoint(plant, 45, 55, schedule=lambda _: [reference])
+
+    ends = free.disturbances.d_min, free.disturbances.d_max
+    observed = ObserveDisturbance(followed(Hidden(0.4, lost)), observer, *ends)
+    assert rest(free.online(), observed) == pytest.approx(reference, abs=1e-3)
+    plain = EstimateState(followed(Hidden(0.4)), StateEstimator(model))
+    assert abs(rest(mpc.online(), plain) - reference) > 0.1  # what the estimate takes away
 
 
 def test_a_filter_of_two_rates_uses_the_rare_readings_fully() -> None:

@@ -25,11 +25,14 @@ class Plant(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.x = np.array((options or {}).get("state", self.start), dtype=float)
-        return self.x.copy(), {}
+        return self.shown(), {}
 
     def step(self, action):
         self.x = np.array(self.advance(self.x, np.asarray(action, float)), dtype=float)
-        return self.x.copy(), 0.0, False, False, {}
+        return self.shown(), 0.0, False, False, {}
+
+    def shown(self):
+        return self.x.copy()
 
 
 def played(step, inputs, start):
