@@ -5,15 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sb3_yann import (
-    LinearCost,
-    LinearModel,
-    LinearMPC,
-    MixedBounds,
-    RateLimits,
-    Terminal,
-    Tracking,
-)
+from sb3_yann import LinearCost, LinearModel, LinearMPC, MixedBounds, RateLimits, Terminal, Tracking
 from sb3_yann.plan import WEIGHT, Task, planned, value_at_end
 
 STEPS = 30

@@ -7,12 +7,7 @@ import pytest
 import torch as th
 
 from sample_laws import box_points, law_of
-from sb3_yann.networks import (
-    AfterstateValue,
-    LinearPrediction,
-    Ranges,
-    YannLayer,
-)
+from sb3_yann.networks import AfterstateValue, LinearPrediction, Ranges, YannLayer
 from sb3_yann.networks._kernels.stack import tanh
 from sb3_yann_envs import problems
 from weights import later_layers, network_of

@@ -68,11 +68,7 @@ def test_output_is_zero_bit_for_bit_at_first(
     activation: str, hidden: tuple[int, ...], stack: int, dtype: th.dtype
 ) -> None:
     net = ZeroOutputNetwork(
-        3,
-        2,
-        hidden,
-        activation=ACTIVATIONS[activation],
-        pinned=pins(True, False, True)[:stack],
+        3, 2, hidden, activation=ACTIVATIONS[activation], pinned=pins(True, False, True)[:stack]
     ).to(dtype)
     for size in (1.0, 1e3, 1e6):
         x = size * (2 * th.rand(200, 3, dtype=dtype) - 1)

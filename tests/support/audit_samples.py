@@ -128,11 +128,7 @@ WRONG = {
         "unknown",
         "step by step: weights, units",
     ),
-    "ActionRepeat": (
-        lambda: ActionRepeat(plant(), 2),
-        "unknown",
-        "step by step: weights, units",
-    ),
+    "ActionRepeat": (lambda: ActionRepeat(plant(), 2), "unknown", "step by step: weights, units"),
     "RescaleAction": (
         lambda: wrappers.RescaleAction(with_other_inputs(), LOW, HIGH),
         "unknown",
@@ -143,14 +139,6 @@ WRONG = {
         "unknown",
         "step by step: weights, units",
     ),
-    "the next state": (
-        lambda: Changed(plant(), at_the_next_state),
-        "next state",
-        "c(s', u)",
-    ),
-    "other weights": (
-        lambda: plant(OTHER),
-        "unknown",
-        "step by step: weights, units",
-    ),
+    "the next state": (lambda: Changed(plant(), at_the_next_state), "next state", "c(s', u)"),
+    "other weights": (lambda: plant(OTHER), "unknown", "step by step: weights, units"),
 }

@@ -11,13 +11,7 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from sb3_yann import (
-    ImprovementGuard,
-    LinearModel,
-    LinearMPC,
-    NoActionNoise,
-    YannPolicy,
-)
+from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
 from weights import last_layer
 
 LEFT, CENTER, RIGHT = range(3)

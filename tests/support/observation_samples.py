@@ -9,10 +9,7 @@ from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG
 
 from sample_plants import LinearPlant, two_input_mpc
-from sb3_yann import (
-    AffineObservation,
-    YannPolicy,
-)
+from sb3_yann import AffineObservation, YannPolicy
 
 MPC = two_input_mpc()
 LOW = np.array([-5.0, -5, -5])

@@ -18,12 +18,7 @@ from sb3_yann import (
     Terminal,
     Tracking,
 )
-from sb3_yann.control import (
-    ExplicitLimitError,
-    ExplicitSolutionError,
-    OnlineLaw,
-    PiecewiseAffine,
-)
+from sb3_yann.control import ExplicitLimitError, ExplicitSolutionError, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.polyhedra import largest_ball
 
 Array = NDArray[np.float64]

@@ -162,24 +162,6 @@ def half_spaces(law: PiecewiseAffine, region: int) -> tuple[Array, Array]:
     return law.A[rows], law.b[rows]
 
 
-def vertices(law: PiecewiseAffine) -> Array:
-    """The vertices of every region of a law with two parameters (count, 2)."""
-    half = (law.theta_max - law.theta_min) / 2
-    points = []
-    for region in range(law.n_regions):
-        A, b = half_spaces(law, region)
-        A = A * half
-        for i in range(len(b)):
-            for j in range(i):
-                corner = A[[i, j]]
-                if abs(np.linalg.det(corner)) < 1e-9 * np.prod(np.linalg.norm(corner, axis=1)):
-                    continue
-                point = np.linalg.solve(corner, b[[i, j]])
-                if np.all(A @ point <= b + 1e-12):
-                    points.append(point * half)
-    return np.array(points)
-
-
 def strips(edges: Array) -> PiecewiseAffine:
     """A law with a region between every two edges of the first of two coordinates in [-2, 2]."""
     p = len(edges) - 1

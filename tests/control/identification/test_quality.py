@@ -10,11 +10,7 @@ import pytest
 from sample_plants import played
 from sb3_yann import identify
 from sb3_yann.control.identification.least_squares import Regression, regress
-from sb3_yann.control.identification.residuals import (
-    curvature_test,
-    listed,
-    quality_notes,
-)
+from sb3_yann.control.identification.residuals import curvature_test, listed, quality_notes
 from sb3_yann.log import Episode
 
 

@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 
 from errors import Message, raises
 from random_problems import edges
-from sample_problems import solved, strips, vertices
+from sample_problems import solved, strips
 from sb3_yann import LinearModel, LinearMPC, RateLimits, Tracking
 from sb3_yann._archive import read_arrays, write_arrays
 from sb3_yann.control import DisturbanceBounds, OnlineLaw, PiecewiseAffine
@@ -40,7 +40,7 @@ def far_points(law: PiecewiseAffine, seed: int = 0) -> np.ndarray:
 @cache
 def special_points(name: str) -> np.ndarray:
     law = law_of(name)
-    corners = [vertices(law)] if law.n_theta == 2 else []
+    corners = slices(law, (0, 1), np.zeros(2)).values() if law.n_theta == 2 else ()
     return np.vstack([edges(law, seed=0)[0], *corners])
 
 

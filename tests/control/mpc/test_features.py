@@ -30,14 +30,7 @@ from sb3_yann.control import lqr
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
 from sb3_yann.deployment.controller import Controller
 from sb3_yann.wrappers import PlantEnv
-from sparse_qp import (
-    FEATURES,
-    SparseQP,
-    draw,
-    online_answers,
-    relative_error,
-    worst_difference,
-)
+from sparse_qp import FEATURES, SparseQP, draw, online_answers, relative_error, worst_difference
 
 CART = LinearModel([[1, 1], [0, 1]], [[0], [1]], dt=1.0)
 BOUNDS: dict[str, Any] = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 1}
