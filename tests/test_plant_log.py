@@ -249,6 +249,11 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(wr
     assert (model.state_names, model.units, model.time_unit) == (("T",), ("K", ""), "s")
     assert "sampled every 10 s" in model.report() and "time constant 44.81 s" in model.report()
     assert replace(model, dt=5).time_unit == "s"
+    limits = {"x_min": -9, "x_max": 9, "u_min": -4, "u_max": 4}
+    mpc = LinearMPC(replace(model, units=("C", "")), Q=[[1]], R=[[1]], horizon=2, **limits)
+    with pytest.raises(ValueError, match="T is in K in the log, and in C in the model of the MPC"):
+        PlantTwin.fit(mpc, log)
+    assert PlantTwin.fit(mpc, log, units_confirmed=True, residuals=["none"]).kind == "none"
     with pytest.raises(ValueError, match=r"no column 'T \[C\]'; it has \['time \[s\]', 'T \[K\]'"):
         Log.from_csv(path, ["T [C]"], ["valve"], dt=10)
     with pytest.raises(TypeError, match="time_unit = 3 must be a str"):

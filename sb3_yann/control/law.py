@@ -114,9 +114,11 @@ class PlantLaw(ReadOnlyArrays):
             raise ValueError(f"theta has shape {points.shape}, expected ({n},) or (batch, {n}).")
         rows = np.ascontiguousarray(np.atleast_2d(points))
         if not np.all(np.isfinite(rows)):
-            bad = rows[~np.all(np.isfinite(rows), axis=1)][0].tolist()
+            bad = self.units.to_plant(rows[~np.all(np.isfinite(rows), axis=1)][0])
+            plant = " (as the plant shows it)" if self.units.shifted else ""
             raise ValueError(
-                f"theta holds NaN or infinite entries, {bad}; the law is defined for numbers."
+                f"theta holds NaN or infinite entries, {bad.tolist()}{plant}; the law is defined "
+                "for numbers."
             )
         return points, self.clamp(rows)
 
@@ -367,7 +369,9 @@ class PiecewiseAffine(PlantLaw):
         if type(theta) is np.ndarray and theta.shape == self.theta_min.shape and self._is_fixed:
             if theta.dtype.kind in "fiu" and theta.flags.carray:
                 u = np.empty(len(self.u_min))
-                if self._at(self.clamp(theta.astype(np.float64, copy=False)), u):
+                given = theta.astype(np.float64, copy=False)
+                finite = self.clamped is None or np.isfinite(given.sum())  # clamping hides inf
+                if finite and self._at(self.clamp(given), u):
                     return u
         from sb3_yann.control._kernels.law import law_of_batch
 

@@ -86,7 +86,7 @@ def objections(
     proven |= exact
     found += [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
     if not found and not units_confirmed:
-        found += _other_units(log, proven)
+        found += _other_units(log, readings[0], proven)
     return found or [*_against_plant(log, proven)]
 
 
@@ -226,7 +226,6 @@ def _against_law(
             continue
         _, s, i = min(found)
         slope = readings[s].slope[i, j]
-        offset = readings[s].offset[i, j]
         cures = ["move the inputs by a row"] if s else []
         cures += ["exchange the columns"] if i != j else []
         cures += ["change the sign"] if slope < 0 else []
@@ -239,16 +238,6 @@ def _against_law(
                 f"{100 * np.sqrt(readings[s].left[i, j]):.3g} % of its deviation; its own leaves "
                 f"{100 * np.sqrt(logged.left[j, j]):.3g} %). In the log, "
                 f"{' and '.join(cures)}.{late if s == -1 else ''}"
-            )
-            continue
-        room = SLOPE_TOLERANCE * logged.deviation[i, j] + logged.offset_room[i, j]
-        away = offset if abs(offset) > room else 0.0
-        scaled = abs(slope - 1) > SLOPE_TOLERANCE + error or away
-        if s == 0 and i == j and not log.units_confirmed and scaled and abs(slope) > error:
-            yield (
-                f"The logged {names[j]} is {slope:.4g} times what the MPC gives"
-                f"{f', {away:+.4g}' if away else ''}: is it in other units, or has a state "
-                f"another zero? Log it as the plant got it. {CONFIRM}"
             )
 
 
@@ -290,22 +279,50 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
             )
 
 
-def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
-    """Yield where the law gives the inputs once one state is taken times a factor, plus a zero."""
-    proven = proven | _held(log)
-    if np.all(proven):
-        return
-    names = labels_of(log.problem.model)[0]
-    n = log.problem.model.n_states
+def _other_units(log: _Log, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterator[str]:
+    """Yield which inputs, or which state instead, in another unit or with another zero are the law.
+
+    A law that is nearly linear takes the zero of one state for that of another, or of its input:
+    the model tells them apart, or all are named.
+    """
+    names = labels_of(log.problem.model)
+    row = log.coordinates.row
     unit = log.coordinates.units
+    n = log.problem.model.n_states
+    x = np.concatenate([each.thetas[:-1] for each in log.episodes])
+    actions = np.concatenate([each.actions for each in log.episodes])
+    after = np.concatenate([each.thetas[1:, row.state] for each in log.episodes])
+
+    def left_by_model(change: Array, shift: Array, u: Array) -> float:
+        rows = np.concatenate([x, u], axis=1)
+        rows[:, row.state] = x[:, row.state] @ change.T + shift
+        error = after @ change.T + shift - rows @ row.linear[row.state].T
+        return float(np.mean((error / (change @ unit)) ** 2))
+
+    found: list[tuple[float, str]] = []
+    of_inputs = []
+    read = actions.copy()
+    for j in np.flatnonzero(~proven & np.diagonal(logged.alone)):
+        slope = logged.slope[j, j]
+        error = STANDARD_ERRORS * logged.error[j, j]
+        room = SLOPE_TOLERANCE * logged.deviation[j, j] + logged.offset_room[j, j]
+        away = logged.offset[j, j] if abs(logged.offset[j, j]) > room else 0.0
+        if abs(slope) > error and (abs(slope - 1) > SLOPE_TOLERANCE + error or away):
+            zero = f", {away:+.4g}" if away else ""
+            of_inputs.append(
+                f"The logged {names[1][j]} is {slope:.4g} times what the MPC gives{zero}"
+            )
+            read[:, j] = (actions[:, j] - away) / slope
+    if of_inputs:
+        found = [(left_by_model(np.eye(n), np.zeros(n), read), " and ".join(of_inputs))]
+    left_open = ~(proven | _held(log))
     law = law_of(log.problem)
     theta, u = _rows(log)
     some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
     theta = theta[some]
     u = u[some]
     scale = np.maximum(np.std(u, axis=0), 1e-6 * log.problem.u_half)
-
-    for i in range(n):
+    for i in range(n) if left_open.any() else ():
 
         def left(p: Array, i: int = i) -> Array:
             rows = theta.copy()
@@ -323,11 +340,14 @@ def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
         change[i, i] = factor
         shift[i] = zero * unit[i]
         on = _on_law(log, 0, (change, shift))
-        if np.any(np.diagonal(_is_one(on) & on.alone) & ~proven):
-            yield (
-                f"The MPC gives the logged inputs where {names[i]} is {factor:.4g} times what is "
-                f"logged, {shift[i]:+.4g}: is it in other units, or has it another zero? {CONFIRM}"
-            )
+        if np.any(np.diagonal(_is_one(on) & on.alone) & left_open):
+            times = f"{factor:.4g} times " if abs(factor - 1) > 0.01 else ""
+            words = f"The MPC gives the logged inputs where {names[0][i]} is {times}what is logged"
+            words += f", {shift[i]:+.4g}"
+            found.append((left_by_model(change, shift, actions), words))
+    least = min((error for error, _ in found), default=0.0)
+    if said := [words for error, words in found if CLEARLY_BETTER * error <= least]:
+        yield f"{'; or: '.join(said)}: is it in other units, or has it another zero? {CONFIRM}"
 
 
 def _other_pace(log: _Log) -> Iterator[str]:

@@ -163,7 +163,8 @@ class PlantTwin(LearntModel):
             Whether somebody has checked the log's units. A plant whose gain is below 0.6 or above
             1.7 times the model's looks like an input in other units, and a controller that is a
             multiple of the law like another zero or scale: such a log is not trusted unless you
-            say so. Where the MPC made the log its inputs are proven, and nothing needs saying.
+            say so. A header with another unit than the model's is an error. Where the MPC made the
+            log its inputs are proven, and nothing needs saying.
         progress_bar : bool, default True
             Whether to show what takes more than three seconds.
 
@@ -183,6 +184,8 @@ class PlantTwin(LearntModel):
         notes: tuple[str, ...] = ()
         if isinstance(episodes, Log):
             _require_same_sampling(episodes, problem)
+            if observer is None and not units_confirmed:
+                _require_same_units(episodes, problem)
             whole = episodes if observer is not None else episodes.with_all_states()
             if references is disturbances is previous is None:  # else they are one for each
                 whole, notes = without_short_pieces(whole)
@@ -372,3 +375,17 @@ def _require_same_sampling(log: Log, problem: LinearMPC) -> None:
             + f", the model of the MPC every {model.step_length}. Identify the model at the log's "
             "sampling time, or, where only the unit differs, name it: time_unit= of both."
         )
+
+
+def _require_same_units(log: Log, problem: LinearMPC) -> None:
+    """Raise where a header declares another unit than the model does."""
+    model = problem.model
+    units = dict(zip((*model.state_names, *model.input_names), model.units, strict=False))
+    for name, its in zip((*log.state_names, *log.input_names), log.units, strict=False):
+        own = units.get(name)
+        if its and own and its != own:
+            raise ValueError(
+                f"{name} is in {its} in the log, and in {own} in the model of the MPC. Log it in "
+                f"{own}, or state the MPC in {its}. If only the spelling differs: "
+                "PlantTwin.fit(..., units_confirmed=True)."
+            )

@@ -12,9 +12,18 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, check_bounds, check_int, check_number, check_type, warn
+from sb3_yann._validation import (
+    Array,
+    NonFiniteWarning,
+    check_bounds,
+    check_int,
+    check_number,
+    check_type,
+    warn,
+)
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control.linear_system import with_units
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
 from sb3_yann.units import ActionUnits
 from sb3_yann.wrappers.theta import (
@@ -138,7 +147,8 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     set-points and bounds that change, drawn at random, and the previous input. The inputs are held
     for a sample, ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps``
     equal steps. ``reset(options={"state": x})`` begins in a state. Where the state is no longer
-    finite an episode terminates, in the last one that was, with ``info["violation"]``.
+    finite an episode terminates, in the last one that was, with ``info["violation"]``; a warning
+    says where f was not.
 
     Parameters
     ----------
@@ -209,8 +219,13 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
                 "pass start_low and start_high."
             )
         check_int("substeps", substeps)
-        env: Any = Equations(f, mpc, start, substeps)
-        if ratio := ratio_of_time_units(env._slope, mpc):
+        plant = Equations(f, mpc, start, substeps)
+        with np.errstate(all="ignore"):
+            plant.slope(x_ss, mpc.model.u_ss)
+        if plant.fault:
+            raise ValueError(f"{plant.fault}, the operating point.")
+        env: Any = plant
+        if ratio := ratio_of_time_units(plant.slope, mpc):
             faster = ratio < 1
             times = 1 / ratio if faster else ratio
             warn(
@@ -279,6 +294,10 @@ class Equations(gym.Env[Array, Array]):
         self.observation_space = spaces.Box(-np.inf, np.inf, (mpc.model.n_states,), np.float64)
         self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
         self.state: Array = mpc.model.x_ss
+        self.model = mpc.model
+        self.time = 0.0
+        self.fault = ""  # of a step: where f was not finite first
+        self.warned = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -286,6 +305,7 @@ class Equations(gym.Env[Array, Array]):
         """Begin in the box of starts, or in ``options["state"]``."""
         super().reset(seed=seed)
         self.state = self.np_random.uniform(*self.start)
+        self.time = 0.0
         if options and "state" in options:
             given = np.asarray(options["state"], np.float64)
             if given.shape != self.state.shape or not np.all(np.isfinite(given)):
@@ -298,11 +318,17 @@ class Equations(gym.Env[Array, Array]):
         """Hold the inputs, clipped to their bounds, for a sample."""
         box: Any = self.action_space
         u = np.clip(np.asarray(action, np.float64), box.low, box.high)
+        self.fault = ""
         with np.errstate(all="ignore"):
             reached = self._advance(u)
         lost = not np.all(np.isfinite(reached))
+        if self.fault and not self.warned:
+            self.warned = True
+            when = f"t = {self.time:g} {self.model.time_unit}".rstrip()
+            warn(f"{self.fault}, {when}: the episode ends there, as a violation.", NonFiniteWarning)
         if not lost:
             self.state = reached
+        self.time += self.dt
         info = {"state": self.state.copy(), **({"violation": True} if lost else {})}
         return self.state.copy(), 0.0, lost, False, info
 
@@ -311,14 +337,22 @@ class Equations(gym.Env[Array, Array]):
         x = self.state
         h = self.dt / self.substeps
         for _ in range(self.substeps):
-            k1 = self._slope(x, u)
-            k2 = self._slope(x + h / 2 * k1, u)
-            k3 = self._slope(x + h / 2 * k2, u)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self._slope(x + h * k3, u))
+            k1 = self.slope(x, u)
+            k2 = self.slope(x + h / 2 * k1, u)
+            k3 = self.slope(x + h / 2 * k2, u)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.slope(x + h * k3, u))
         return x
 
-    def _slope(self, x: Array, u: Array) -> Array:
+    def slope(self, x: Array, u: Array) -> Array:
+        """Return dx/dt; `fault` says where it was not finite first."""
         slope = np.asarray(self.f(x, u), np.float64)
         if slope.shape != x.shape:
-            raise ValueError(f"f(x, u) has shape {slope.shape}, expected dx/dt, {x.shape}.")
+            wanted = f"{x.shape}, one entry for each of {', '.join(with_units(self.model)[0])}"
+            raise ValueError(f"f(x, u) has shape {slope.shape}, expected dx/dt, {wanted}.")
+        wrong = np.flatnonzero(~np.isfinite(slope))
+        if wrong.size and not self.fault and np.all(np.isfinite(x)):
+            states, inputs = with_units(self.model)
+            values = zip((*states, *inputs), (*x, *u), strict=True)
+            at = ", ".join(f"{name} = {value:.6g}" for name, value in values)
+            self.fault = f"f(x, u) is {slope[wrong[0]]} for the slope of {states[wrong[0]]} at {at}"
         return slope

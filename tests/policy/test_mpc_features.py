@@ -167,6 +167,7 @@ SERVOS: dict[str, dict[str, Any]] = {
 @needs_compiler
 @pytest.mark.parametrize("kind", ["explicit", "online"])
 @pytest.mark.parametrize("name", SERVOS)
+@pytest.mark.filterwarnings("ignore:The observation is not finite")
 def test_what_is_asked_for_beyond_its_range_counts_as_at_its_end_in_every_form(
     name: str, kind: str, tmp_path: Any
 ) -> None:
@@ -214,6 +215,16 @@ def test_what_is_asked_for_beyond_its_range_counts_as_at_its_end_in_every_form(
         for times in (1e-3, 1, 49):
             found = np.asarray(answer(ends + times * outward))
             np.testing.assert_array_equal(found, np.asarray(answer(ends)), form)
+    rest = mpc.units.theta_ss
+    for lost in (np.inf, -np.inf, np.nan):  # as of a state: a law refuses it, a policy rests
+        at = np.where(np.arange(len(rest)) == asked[0], lost, rest)[None]
+        for form in ("law", "domain", "one row after another"):
+            with pytest.raises(ValueError, match=r"NaN or infinite .*\(as the plant shows it\)"):
+                forms[form](at)
+        for form in {*forms} & {"per_region", "shared", "law.npz", "policy.npz", "C", "ONNX"}:
+            np.testing.assert_allclose(
+                forms[form](at)[0], law.plant_input(rest), 1e-6, err_msg=form
+            )
 
 
 def test_set_points_need_not_lie_about_the_operating_point() -> None:

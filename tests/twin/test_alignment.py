@@ -108,6 +108,14 @@ def test_the_report_says_what_is_wrong_with_a_log_of_the_mpc(fault, said) -> Non
     assert said in fitted([FAULTS[fault](x, u) for x, u in logged("the MPC")]).report()
 
 
+@pytest.mark.parametrize("biased", [0, 1])
+def test_a_biased_column_is_named_and_no_other_is(biased) -> None:
+    log = [(x + 0.4 * np.eye(2)[biased], u) for x, u in logged("the MPC", noise=0.003)]
+    said = " ".join(fitted(log).trust.problems)
+    assert f"inputs where x[{biased}] is what is logged, -0.4" in said
+    assert f"x[{1 - biased}]" not in said and "The logged u" not in said
+
+
 @pytest.mark.parametrize("samples", [2, 3])
 def test_a_log_whose_rows_are_samples_apart_says_so(samples) -> None:
     log = [

@@ -17,6 +17,7 @@ from sb3_yann import (
     LinearModel,
     LinearMPC,
     NoActionNoise,
+    NonFiniteWarning,
     PlantEnv,
     PlantTwin,
     RateLimits,
@@ -113,11 +114,21 @@ def test_plans_are_made_in_its_own_states(monkeypatch) -> None:
     assert found.total >= 0
 
 
-def test_a_plant_that_runs_away_terminates_in_its_last_finite_state() -> None:
-    env = PlantEnv(lambda x, u: x * np.inf, LinearMPC(TANK, **WEIGHTS, **BOX))
-    x, _ = env.reset(seed=0)
-    reached, _, terminated, _, info = env.step(np.array([2.0]))
+def test_equations_that_fail_are_named_with_state_input_and_time() -> None:
+    model = LinearModel.from_dynamics(slope, x_ss=[350], u_ss=[2], dt=2.0)
+    model = model.named(["level"], ["flow"], units={"level": "cm"}, time_unit="min")
+    mpc = LinearMPC(model, **WEIGHTS, **BOX)
+    env = PlantEnv(lambda x, u: slope(x, u) * np.where(x < 349, np.nan, 1), mpc)
+    env.reset(options={"state": [349.5]})
+    x = env.step(np.array([2.0]))[0]
+    said = r"nan for the slope of level \(cm\) at level \(cm\) = 34\d.*, flow = 0, t = 2 min"
+    with pytest.warns(NonFiniteWarning, match=said):
+        reached, _, terminated, _, info = env.step(np.array([0.0]))
     assert reached.tolist() == x.tolist() and terminated and info["violation"]
+    with pytest.raises(ValueError, match=r"slope of level .* = 350, flow = 2, the operating point"):
+        PlantEnv(lambda x, u: x * np.inf, mpc)
+    with pytest.raises(ValueError, match=r"shape \(1, 2\), expected dx/dt, \(1,\).* level \(cm\)"):
+        PlantEnv(lambda x, u: np.ones((1, 2)), mpc)
 
 
 def test_what_is_of_no_use_is_named() -> None:
