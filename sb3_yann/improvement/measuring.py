@@ -43,7 +43,8 @@ CURE = (
     "mpc.disturbances.d_min, mpc.disturbances.d_max)."
 )
 ADVICE = {
-    "keep the MPC": f"there is little to gain over the MPC, less than {WORTH:.0%}.",
+    "keep the MPC": f"little was found to gain over the MPC, less than {100 * WORTH:g} %. It is no "
+    "bound: improve(mpc, {source}) may still find some of it, or more.",
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
     "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
     "headroom(...).reidentified.",

@@ -393,6 +393,16 @@ def _decisions(decisions: Sequence[Decision]) -> list[Html]:
     return [tag("h3", "Every decision"), paragraph(text), table(head, rows)]
 
 
+IMPROVE_SETTINGS = {
+    "max_steps": "the most steps of the simulator, for everything",
+    "n_starts": "episodes for which the best inputs are planned in a model of the plant",
+    "rounds": "how often, at most, a model is fitted, planned in, and the policy taught the plans",
+    "updates": "steps of the optimizer each time that the policy is taught",
+    "confine": "whether, after a log, the MPC acts alone where the log shows nothing",
+    "seed": "repeats the same run",
+}
+
+
 def improve_part(subject: Subject) -> Part:
     """Return what `improve` did, in what, with how many episodes, and whose the policy is."""
     title = "What improve did"
@@ -420,7 +430,9 @@ def improve_part(subject: Subject) -> Part:
         checks = str(len(each.checks))
         place = f"{each.where}: {each.source}"
         rows.append([str(k), place, str(each.episodes), checks])
-    settings = [[name.replace("_", " "), str(value)] for name, value in found[-1].settings.items()]
+    settings = [
+        [name, str(v), IMPROVE_SETTINGS.get(name, "")] for name, v in found[-1].settings.items()
+    ]
     how = (
         "Episodes are those of the log that the twin was fitted to, or those that were played in "
         "the simulator to compare. What was confirmed there holds for the plant as far as the "
@@ -432,7 +444,7 @@ def improve_part(subject: Subject) -> Part:
         table(["", "in", "episodes", "candidates"], rows),
         *(lines(f"{k}. {each.report()}") for k, each in enumerate(found, start=1)),
         tag("h3", "Settings of the last improvement"),
-        table(["setting", "value"], settings),
+        table(["setting", "value", "what it is"], settings),
     ]
     return Part(title, join(content), (finding,))
 

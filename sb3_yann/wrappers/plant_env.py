@@ -143,8 +143,11 @@ UNITS_OF_TIME = (24.0, 60.0, 1000.0, 1440.0, 3600.0, 86400.0)
 class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     """The equations ``dx/dt = f(x, u)`` as an env in plant units.
 
-    The reward is minus the stage cost of the MPC. It shows the state, and what else theta holds:
-    set-points and bounds that change, drawn at random, and the previous input. The inputs are held
+    The reward is minus the stage cost of the MPC. It shows the state, and what else theta holds, in
+    the order of ``mpc.layout.names``: set-points and bounds that change, drawn uniformly from their
+    ranges and held for the episode, or for ``hold`` steps, and the previous input. No
+    :class:`SetPoint` is needed around it. The state alone is float64, with more of theta it is
+    float32, and ``info["state"]`` is exact. The inputs are held
     for a sample, ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps``
     equal steps. ``reset(options={"state": x})`` begins in a state. Where the state is no longer
     finite an episode terminates, in the last one that was, with ``info["violation"]``; a warning

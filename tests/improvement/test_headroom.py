@@ -310,6 +310,9 @@ def test_what_an_observer_loses_is_shown_as_a_loss() -> None:
     assert "-0.00 %" not in text
     observer = "+20.00 % as it was played, worst start +43.33 % of its own cost; 1 of 3 cost more"
     assert f"  observer     {observer}\n  new model    not played" in text
+    some = dataclasses.replace(found, best_costs=costs - 0.2, nonlinearity=0.01, budget=8_000)
+    for said in ("less than 2 %", "improve(mpc, make, max_steps=8_000) may still find some of it"):
+        assert said in some.report()
 
 
 def test_an_observer_that_pays_on_average_alone_is_advised_with_its_worst_start() -> None:

@@ -348,7 +348,7 @@ def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) ->
     for said in (
         "The policy is the one that improve accepted last, in the twin (5 episodes",
         *(line.split()[0] for line in found.report().splitlines()), found.source,
-        "n starts 7", "updates 1000",
+        "n_starts 7 episodes for which the best inputs are planned", "updates 1000 steps of the",
     ):  # fmt: skip
         assert said in text
     assert "nothing has confirmed" not in text and found.settings["n_starts"] == 7

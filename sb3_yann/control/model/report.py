@@ -10,6 +10,7 @@ from sb3_yann.control.linear_system import LinearSystem, combination, labels_of,
 
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
 UNREACHED = 1e-6
+SAME_SCALE = 2.0  # factor of balancing up to which states are of one size
 HARDLY_REACHED = 1e-3
 """Motions of a direction by the inputs, relative to the largest."""
 DOUBLINGS = 16  # doublings of the Gramian's horizon: 65,536 samples
@@ -144,9 +145,10 @@ def _scaling(model: LinearSystem) -> list[str]:
     advice = " Consider other units." if spread > 1e3 else ""
     lines = []
     if effects.size:
+        balance = f"; balancing A would rescale its states by up to {spread:.3g} against each other"
         lines.append(
-            f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}; balancing "
-            f"A would rescale its states by up to {spread:.3g} against each other.{advice}"
+            f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}"
+            f"{balance if spread > SAME_SCALE else ''}.{advice}"
         )
     if np.min(np.abs(np.linalg.eigvals(model.A) - 1)) > ON_CIRCLE:
         gain = np.linalg.solve(np.eye(model.n_states) - model.A, model.B)

@@ -227,6 +227,7 @@ def test_bad_names_are_named(changes: Any, message: Message) -> None:
 def test_deviations_in_the_report_say_that_they_are() -> None:
     """A gain is no state: one unit more than u_ss moves the state from x_ss."""
     model = LinearModel(A, B, dt=1.0, x_ss=[12, 350], u_ss=[3], **NAMES)
+    assert "Scaling: entries of B from 0.5 to 1.\n" in model.report()  # nothing to balance
     assert "Held at u_ss + 1, pump moves the state to x_ss + (12.5, 2.5)." in model.report()
 
 
