@@ -4,7 +4,7 @@ import ast
 import os
 import subprocess
 import sys
-from graphlib import CycleError, TopologicalSorter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -99,22 +99,9 @@ def _floor(name: str) -> int:
     return next(i for i, rooms in enumerate(FLOORS) if _room(name) in rooms)
 
 
-def circle(imports: dict[str, set[str]]) -> list[str]:
-    """Return modules that import each other in a circle, none if there is no circle."""
-    try:
-        TopologicalSorter(imports).prepare()
-    except CycleError as error:
-        return list(error.args[1])
-    return []
-
-
 def test_no_files_import_each_other_in_a_circle() -> None:
     own = {name: found & MODULES.keys() - {name} for name, found in IMPORTS.items()}
-    assert circle(own) == []
-
-
-def test_a_circle_would_be_found() -> None:
-    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+    TopologicalSorter(own).prepare()  # raises a CycleError that names the circle
 
 
 def test_every_module_has_a_floor() -> None:

@@ -108,14 +108,7 @@ def test_the_distance_is_a_fraction_of_the_input_range(tmp_path) -> None:
     assert 0 < shown["yann/distance_from_mpc_mean"][-1] <= shown["yann/distance_from_mpc_max"][-1]
 
 
-def test_violations_are_counted(tmp_path) -> None:
-    model, _ = noisy(env=FixedRewards(gym.make("ClippedPendulum-v0")))
-    diagnostics = ControlDiagnostics()
-    model.learn(12, callback=[NoActionNoise(), diagnostics])
-    assert diagnostics.violations == 4
-
-
-def test_the_critic_error_compares_q_with_the_return_that_followed() -> None:
+def test_violations_count_and_the_critic_error_compares_q_with_the_return_that_followed() -> None:
     model, _ = noisy(env=FixedRewards(gym.make("ClippedPendulum-v0")), gamma=0.5)
     states: list[np.ndarray] = []
     diagnostics = ControlDiagnostics()
@@ -125,12 +118,15 @@ def test_the_critic_error_compares_q_with_the_return_that_followed() -> None:
         record(episode, info),
     )[-1]
     model.learn(3, callback=[NoActionNoise(), diagnostics], log_interval=100)
+    assert diagnostics.violations == 1
     theta = th.as_tensor(np.array(states))
     with th.no_grad():
         q = model.critic.q1_forward(theta, model.actor(theta)).numpy()[:, 0]
     returns = np.array([-1.75, -1.5, -1.0])  # three steps at -1, discounted by a half
     expected = np.abs(q - returns).mean() / np.abs(returns).mean()
     assert model.logger.name_to_value["yann/critic_error"] == pytest.approx(expected, rel=1e-5)
+    model.learn(9, callback=[NoActionNoise(), diagnostics], reset_num_timesteps=False)
+    assert diagnostics.violations == 3  # of each learn
 
 
 FEW = {"per_episode": 3}

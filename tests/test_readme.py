@@ -230,7 +230,7 @@ def test_the_results_it_quotes_are_those_of_the_report() -> None:
             assert not cost or re.search(rf"\| {learner} \| \d+ \| {re.escape(cost)} \|", of_plant)
 
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = ROOT / "docs"
 PICTURES = sorted((DOCS / "pictures").glob("*.png"))
 MOST_BYTES = 60_000
 
@@ -261,7 +261,6 @@ def test_a_picture_is_small_and_on_a_page(path) -> None:
     assert any(f"](pictures/{path.name})" in page.read_text("utf-8") for page in DOCS.glob("*.md"))
 
 
-PAGE = Path(__file__).parents[1] / "docs" / "troubleshooting.md"
 UNSEEDED = np.random.default_rng(0)
 """No env seeds it."""
 
@@ -390,13 +389,9 @@ CASES: dict[str, Callable[[], object]] = {
 }
 
 
-def quoted() -> list[str]:
-    """Return the beginnings of messages that the page quotes."""
-    return re.findall(r"^\| `(.+?)` \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-
-
 def test_each_message_of_the_page_is_one_of_the_cases() -> None:
-    assert sorted(quoted()) == sorted(CASES)
+    quoted = re.findall(r"^\| `(.+?)` \|", page("docs/troubleshooting.md"), re.MULTILINE)
+    assert sorted(quoted) == sorted(CASES)
 
 
 @pytest.mark.parametrize("beginning", CASES)

@@ -141,13 +141,8 @@ def test_a_trained_model_loads_without_solving_its_problem_again(run, monkeypatc
     assert model.num_timesteps == EPISODE[run.env_id]
     assert isinstance(model.policy, sb3_yann.YannPolicy)
     assert model.replay_buffer.n_steps == 10
+    assert model.action_noise is None and model.learning_starts == 0
     assert np.all(np.abs(model.predict(np.zeros((1, mpc.n_theta), np.float32))[0]) <= mpc.u_max)
-
-
-def test_no_training_step_explored(run) -> None:
-    model = run.model()
-    assert model.action_noise is None
-    assert model.learning_starts == 0
 
 
 def test_evaluation_keeps_the_best_model_and_the_rewards(run) -> None:

@@ -157,13 +157,6 @@ def test_what_limits_the_plan_is_called_by_its_name() -> None:
     assert "u[0]" not in text and "x[0]" not in text and "-> flow = [10]" in text
 
 
-def test_an_input_that_cannot_rest_is_reported() -> None:
-    tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
-    box = {"theta_min": 0, "theta_max": 20, "u_min": 4, "u_max": 10}
-    with pytest.warns(UserWarning, match=r"u_min = 4 and u_max = 10 leave out u\[0\] = 3, .*Line"):
-        LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **box)
-
-
 def test_a_warning_names_the_line_that_led_to_it_and_comes_once() -> None:
     tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3], input_names=["inflow"])
     mpc = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, x_min=0, x_max=20, u_min=0, u_max=10)
@@ -172,7 +165,9 @@ def test_a_warning_names_the_line_that_led_to_it_and_comes_once() -> None:
         for _ in range(2):
             dataclasses.replace(mpc, u_min=4)  # in a function that dataclasses writes
     assert [each.filename for each in told] == [__file__]
-    assert "leave out inflow = 3, the operating point" in str(told[0].message)
+    message = str(told[0].message)
+    assert message.startswith("u_min = 4 and u_max = 10 leave out inflow = 3, the operating point")
+    assert "Line" in message
 
 
 def test_a_box_that_leaves_out_the_operating_point_is_reported() -> None:
@@ -251,18 +246,6 @@ def test_a_soft_bound_is_no_hard_excess_and_costs_its_penalty_in_each_step() -> 
     # Of the states (3 - 2) / 0.5 counts, not (14 - 10) / 4; then the output, (5 - 4) / 2.
     np.testing.assert_allclose(found.penalty, [10 * (2 + 4) + 10 * (0.5 + 0.25)], rtol=1e-4)
     assert not found.largest.any() and found.any_bound[0] > 0
-
-
-def test_the_penalty_of_a_step_is_the_mpc_s_own_for_a_horizon_of_one_step() -> None:
-    model = LinearModel([[1.2]], [[1.0]], dt=1.0)
-    given: Any = {"Q": [[1.0]], "R": [[1.0]], "horizon": 1, "u_min": -1, "u_max": 1}
-    mpc = LinearMPC(model, **given, x_min=-2, x_max=2, soft=SoftBounds(x=0.3, penalty=50),
-                    theta_min=-6, theta_max=6)  # fmt: skip
-    theta = np.array([4.0])
-    u = mpc.explicit()(theta)
-    found = bound_excess(mpc, np.array([theta, mpc.predict(theta, u)]), u[None])
-    s = (1.2 * 4 - 1 - 2) / 0.3
-    np.testing.assert_allclose(found.penalty, 50 * (s + s**2), rtol=1e-4)
 
 
 def test_what_is_not_finite_exceeds_by_inf() -> None:
