@@ -357,8 +357,9 @@ def confirm(
     """Play pairs from new starts until they are decisive; return the last look, and the trial.
 
     Looks come after 10, 20, 40 and 80 pairs. The last two accept, and together err with a
-    probability of no more than ``significance``. A policy that breaks a bound, or surely gains too
-    little, is refused at the first look that shows it. Where a hard bound is in force, acceptance
+    probability of no more than ``significance``. A policy that breaks a bound is refused at the
+    first look that shows it. One that surely gains too little is so from the second on: ten starts
+    may all be of those from which nothing can be gained. Where a hard bound is in force, acceptance
     takes all 80: it may be exceeded in few episodes, and that is never traded for cost. ``say`` is
     called with what each look shows, and after how many pairs.
     """
@@ -370,8 +371,9 @@ def confirm(
         say(f"{count} pairs: {100 * found.change:+.2f} %", count)
         enough = LOOKS[-1] if trial.rides_a_bound else ENOUGH
         most = max(-found.change, 2 * found.error - found.logged)  # what it may gain
-        hopeless = verdict.is_hopeless or most < RULE.least_gain
-        if (found.accepted and count >= enough) or (not found.accepted and hopeless):
+        hopeless = count > FIRST_LOOK and (verdict.is_hopeless or most < RULE.least_gain)
+        refused = not found.accepted and (hopeless or not found.safe)
+        if refused or (found.accepted and count >= enough):
             break
     if found.accepted and count < ENOUGH:
         few = f"{count} pairs whose costs are finite are too few"

@@ -41,7 +41,7 @@ from sb3_yann.twin.selection import fit_ensemble
 FIRST = 3_000_000  # seed of the first episode: far from those that people try first
 APART = 1_000_000  # how far the episodes of two seeds are apart
 EPISODES = 20  # of the MPC, with and without random inputs, that the first model is fitted to
-SHORT = 1_500  # steps that they have at least: of short episodes there are more
+SHORT = 3_000  # steps that they have at least: of short episodes there are more
 MOST = 60  # of such episodes, at most
 PUSH = 0.5  # half-widths by which inputs are moved at random, at most
 OFTEN = 0.7  # share of the time in which they are
