@@ -215,14 +215,13 @@ def imitate(
     Then the policy plays these episodes in the model, and learns more where it does worse than
     plans or the MPC: from their starts, and from where it had got to (S. Ross, G. Gordon and D.
     Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
-    learning*, AISTATS 2011). A fit moves the weights half of its way only, unless that is worse
-    than where it began and where it ended: a mean of weights errs less on what they have not seen
-    (P. Izmailov and others, *Averaging weights leads to wider optima and better generalization*,
-    UAI 2018). The layer ends with the fit that cost the least. Return what it saves in the model:
-    see :meth:`Teacher.saved`.
+    learning*, AISTATS 2011). Starts that it loses count more in the next fit. A fit moves the
+    weights half of its way where that costs less: a mean of weights errs less on what they have not
+    seen (P. Izmailov and others, *Averaging weights leads to wider optima and better
+    generalization*, UAI 2018). The layer ends with the fit that cost the least. Return what it
+    saves in the model: see :meth:`Teacher.saved`.
     """
     most = -np.inf
-    score = np.inf
     promised = 0.0
     since = 0
     best = copy.deepcopy(layer.state_dict())
@@ -230,7 +229,6 @@ def imitate(
         before = copy.deepcopy(layer.network)
         teacher.teach(layer, updates)
         played = teacher.play(layer)
-        last = score
         score = teacher.score(played.costs)
         if not before.is_zero():
             fitted = copy.deepcopy(layer.state_dict())
@@ -238,7 +236,7 @@ def imitate(
                 for now, old in zip(layer.network.parameters(), before.parameters(), strict=True):
                     now.lerp_(old, 0.5)
             halfway = teacher.play(layer)
-            if teacher.score(halfway.costs) >= min(last, score):
+            if teacher.score(halfway.costs) > score:
                 score = teacher.score(halfway.costs)
                 played = halfway
             else:
