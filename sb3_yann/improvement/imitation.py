@@ -215,11 +215,11 @@ def imitate(
     Then the policy plays these episodes in the model, and learns more where it does worse than
     plans or the MPC: from their starts, and from where it had got to (S. Ross, G. Gordon and D.
     Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
-    learning*, AISTATS 2011). Starts that it loses count more in the next fit. A fit moves the
-    weights half of its way where that costs less: a mean of weights errs less on what they have not
-    seen (P. Izmailov and others, *Averaging weights leads to wider optima and better
-    generalization*, UAI 2018). The layer ends with the fit that cost the least. Return what it
-    saves in the model: see :meth:`Teacher.saved`.
+    learning*, AISTATS 2011). Starts that it loses count more in the next fit. Of a fit and the
+    mean of its weights before and after, which often errs less on what both have not seen (P.
+    Izmailov and others, *Averaging weights leads to wider optima and better generalization*, UAI
+    2018), the one that costs less is played. The layer ends with what cost the least. Return what
+    it saves in the model: see :meth:`Teacher.saved`.
     """
     most = -np.inf
     promised = 0.0
@@ -230,8 +230,8 @@ def imitate(
         teacher.teach(layer, updates)
         played = teacher.play(layer)
         score = teacher.score(played.costs)
+        fitted = copy.deepcopy(layer.state_dict())
         if not before.is_zero():
-            fitted = copy.deepcopy(layer.state_dict())
             with th.no_grad():
                 for now, old in zip(layer.network.parameters(), before.parameters(), strict=True):
                     now.lerp_(old, 0.5)
@@ -257,6 +257,7 @@ def imitate(
         if (done and not objection) or fit == FITS - 1 or fit - since == VAIN_FITS:
             break
         teacher.show(policy_of(layer, teacher.problem), played)
+        layer.load_state_dict(fitted)
     layer.load_state_dict(best)
     return promised
 

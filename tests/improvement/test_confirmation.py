@@ -140,22 +140,25 @@ def test_where_a_bound_is_in_force_acceptance_takes_all_pairs(excess) -> None:
     assert found.accepted and len(pairs.starts.seeds) == (80 if excess else 40)
 
 
-def test_what_costs_more_is_refused_at_the_first_look() -> None:
-    found, pairs = looked(Fake(gains(-0.05, 0.01)))
-    assert not found.accepted and len(pairs.starts.seeds) == 10
-    assert found.safe and found.change > 0
-    assert found.reason
+@pytest.mark.parametrize(
+    ("share", "spread", "said"),
+    [
+        (-0.05, 0.01, "cost too much"),
+        (0.5 * RULE.least_gain, 1e-6, "too little a gain"),
+        (0.8 * RULE.least_gain, 1e-6, "too little a gain"),
+    ],
+)
+def test_what_costs_more_or_gains_too_little_is_refused_at_the_second_look(
+    share, spread, said
+) -> None:
+    found, pairs = looked(Fake(gains(share, spread)))
+    assert not found.accepted and found.safe and len(pairs.starts.seeds) == 20
+    assert said in found.reason
 
 
-def test_a_small_gain_is_too_small() -> None:
-    found, pairs = looked(Fake(gains(0.5 * RULE.least_gain, 1e-6)))
-    assert not found.accepted and "too little a gain" in found.reason
-    assert len(pairs.starts.seeds) == 10
-
-
-def test_what_surely_gains_too_little_is_refused_at_the_first_look() -> None:
-    found, pairs = looked(Fake(gains(0.8 * RULE.least_gain, 1e-6)))
-    assert not found.accepted and len(pairs.starts.seeds) == 10
+def test_ten_starts_from_which_nothing_can_be_gained_refuse_nothing() -> None:
+    found, pairs = looked(Fake(lambda seeds, rng: np.where(seeds < 10, 0.001, -0.5)))
+    assert found.accepted and len(pairs.starts.seeds) == 40
 
 
 def test_no_gain_is_accepted_by_chance_in_one_of_twenty_at_most() -> None:
