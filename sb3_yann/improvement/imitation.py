@@ -218,8 +218,9 @@ def imitate(
     learning*, AISTATS 2011). Starts that it loses count more in the next fit. Of a fit and the
     mean of its weights before and after, which often errs less on what both have not seen (P.
     Izmailov and others, *Averaging weights leads to wider optima and better generalization*, UAI
-    2018), the one that costs less is played. The layer ends with what cost the least. Return what
-    it saves in the model: see :meth:`Teacher.saved`.
+    2018), the one that costs less is played; where several members act, a policy has seen several
+    plants, and the mean was no better. The layer ends with what cost the least. Return what it
+    saves in the model: see :meth:`Teacher.saved`.
     """
     most = -np.inf
     promised = 0.0
@@ -231,7 +232,7 @@ def imitate(
         played = teacher.play(layer)
         score = teacher.score(played.costs)
         fitted = copy.deepcopy(layer.state_dict())
-        if not before.is_zero():
+        if teacher.scenarios.members is None and not before.is_zero():
             with th.no_grad():
                 for now, old in zip(layer.network.parameters(), before.parameters(), strict=True):
                     now.lerp_(old, 0.5)
