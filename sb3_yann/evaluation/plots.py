@@ -524,7 +524,9 @@ def _draw_differences(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) ->
         style = _style(number, entry >= problem.n_theta)
         _draw_rows(axes, rows[:, :steps] - base[:, :steps], problem.model.dt, style, "_nolegend_")
     axes.axhline(0, color="black", linewidth=0.8)
-    axes.set_ylabel("difference")
+    plain = [*problem.labels(), *labels_of(problem.model)[1]][entry]
+    whole = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
+    axes.set_ylabel(f"difference{whole.removeprefix(plain)}")
     axes.grid(alpha=0.3)
 
 

@@ -431,7 +431,9 @@ def improve_part(subject: Subject) -> Part:
         place = f"{each.where}: {each.source}"
         rows.append([str(k), place, str(each.episodes), checks])
     settings = [
-        [name, str(v), IMPROVE_SETTINGS.get(name, "")] for name, v in found[-1].settings.items()
+        [name, str(v), IMPROVE_SETTINGS.get(name, "")]
+        for name, v in found[-1].settings.items()
+        if name != "confine" or found[-1].where == "the twin"
     ]
     how = (
         "Episodes are those of the log that the twin was fitted to, or those that were played in "

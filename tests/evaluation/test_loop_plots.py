@@ -126,7 +126,7 @@ def test_below_many_pairs_lie_their_differences() -> None:
     rows = [panel.get_subplotspec().rowspan.start for panel in figure.axes]
     assert rows == [0, 0, 1, 1]
     difference = figure.axes[2]
-    assert difference.get_ylabel() == "difference"
+    assert difference.get_ylabel() == "difference (m)"
     np.testing.assert_allclose(difference.lines[0].get_ydata(), 0.25)
     assert len(loops_figure(tank(), {"before": before, "after": episodes(20)}).axes) == 2
 

@@ -141,7 +141,8 @@ def _scaling(model: LinearSystem) -> list[str]:
     """Return the lines on scaling and steady-state gains."""
     _, (factors, _) = linalg.matrix_balance(model.A, permute=False, separate=True)
     spread = np.max(factors) / np.min(factors)
-    effects = np.abs(model.B[model.B != 0])
+    sizes = np.abs(model.B)
+    effects = sizes[sizes > 1e-12 * np.max(sizes, initial=0.0)]  # the rest is rounding
     advice = " Consider other units." if spread > 1e3 else ""
     lines = []
     if effects.size:
