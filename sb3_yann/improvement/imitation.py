@@ -245,7 +245,8 @@ def imitate(
         saved = teacher.saved(played.costs, teacher.usual)
         objection = teacher.objection(played)
         say(
-            f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model"
+            f"fit {fit + 1}: in the model the policy gains {round(100 * saved, 3) + 0.0:g} %, "
+            f"plans {round(100 * teacher.gain, 3) + 0.0:g} %"
             f"{'; ' * bool(objection)}{objection}"
         )
         if score > most + NEAR / 2 * teacher.gain:

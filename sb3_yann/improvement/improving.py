@@ -449,7 +449,7 @@ class _Work:
                 scenarios = self._of_estimates(scenarios, episodes, self.seed + number)
             teacher = Teacher(scenarios, self.seed + number)
             teacher.show()
-            gain = f"{100 * teacher.gain:.3g} %"
+            gain = f"{round(100 * teacher.gain, 3) + 0.0:g} %"
             if shown is None and not teacher.gain > RULE.least_gain / 10:
                 return improvement(False, f"plans gain {gain} in the twin, too little to teach")
             if shown is not None:
@@ -458,8 +458,8 @@ class _Work:
             shown = teacher
             self.say.end_of_round()
             self.say(
-                f"round {number + 1} of at most {self.rounds}: the policy gains "
-                f"{100 * gained:.3g} % of plans' {gain} in the twin"
+                f"round {number + 1} of at most {self.rounds}: in the twin the policy gains "
+                f"{round(100 * gained, 3) + 0.0:g} %, plans {gain}"
             )
             if passes(1.0):
                 return improvement(True)
