@@ -1,6 +1,6 @@
 """What has happened in a commissioning so far, on disk before anything else happens.
 
-The record has a line of JSON for each event.
+The record has a line of JSON for each event, with its CRC-32.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import zlib
 from dataclasses import asdict, dataclass, fields
 from hashlib import sha256
 from itertools import pairwise
@@ -49,7 +50,10 @@ class Record:
             raise ValueError(f"{self.path} is no record of a commissioning. Name another file.")
         for number, line in enumerate(lines, start=1):
             try:
-                self.events.append(dict(json.loads(line)))
+                event = dict(json.loads(line))
+                if event.pop("crc32", None) != _checksum(event):
+                    raise ValueError("its checksum is another")
+                self.events.append(event)
             except (TypeError, ValueError, RecursionError) as error:
                 raise ValueError(
                     f"{self.path}, line {number}: no event of a commissioning ({error}). Name "
@@ -62,7 +66,8 @@ class Record:
         """Add an event; when this returns it is on the disk."""
         if self.path is None:
             return
-        line = f"{json.dumps(event, allow_nan=False)}\n".encode()
+        checked = event | {"crc32": _checksum(event)}
+        line = f"{json.dumps(checked, allow_nan=False)}\n".encode()
         self.path.touch()
         if self.path.stat().st_size != self._seen:
             raise RuntimeError(
@@ -103,6 +108,11 @@ class Record:
                 f"that was written, or begin anew with another record than {self.path}."
             )
         model.set_parameters(str(self.path.with_name(name)), device=model.device)
+
+
+def _checksum(event: Event) -> int:
+    """Return the CRC-32 of an event as JSON."""
+    return zlib.crc32(json.dumps(event, allow_nan=False).encode())
 
 
 def _as_event(data: Any) -> Event:
