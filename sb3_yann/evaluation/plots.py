@@ -7,10 +7,10 @@ A ``plot_...`` takes matplotlib's Axes, or makes a new figure, and returns the A
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, check_array, check_choice, check_type
 from sb3_yann.control import LinearMPC, PiecewiseAffine
@@ -146,27 +146,15 @@ def plot_regions(
 # ---- Surfaces ----
 
 
-class _Surface:
-    """An input over a grid of two entries of theta, in plant units, to be drawn.
-
-    Parameters are those of :func:`plot_surface`.
-    """
+class _Plane:
+    """A grid of two entries of theta, in plant units; the others are at the operating point."""
 
     def __init__(
-        self,
-        problem: LinearMPC,
-        entries: Sequence[Quantity],
-        at: ArrayLike | None,
-        output: int,
-        frame: Frame | None,
+        self, problem: LinearMPC, entries: Sequence[Quantity], frame: Frame | None
     ) -> None:
         chosen = [_entry_of(problem, each) for each in entries]
         if len(chosen) != 2 or chosen[0] == chosen[1]:
             raise ValueError(f"entries = {[*entries]} must be two different entries of theta.")
-        if not 0 <= output < problem.model.n_inputs:
-            raise ValueError(
-                f"output = {output} must be an input, from 0 to {problem.model.n_inputs - 1}."
-            )
         low = problem.theta_min[chosen]
         high = problem.theta_max[chosen]
         if frame is not None:
@@ -177,41 +165,32 @@ class _Surface:
                 f"There is no frame to draw {names} in: the box goes from {low.tolist()} to "
                 f"{high.tolist()}. Pass frame=(lower left, upper right)."
             )
-        rest = problem.units.to_plant(problem.theta_rest)
-        fixed = rest if at is None else check_array("at", at, (problem.n_theta,))
         law = problem.law()
         points = 121 if isinstance(law, PiecewiseAffine) else 41  # a program for each of them
         self.grid = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
-        shown = np.tile(fixed, (points**2, 1))
+        shown = np.tile(problem.units.to_plant(problem.theta_rest), (points**2, 1))
         shown[:, chosen] = np.stack(np.meshgrid(*self.grid), axis=-1).reshape(-1, 2)
         self.theta = problem.units.to_deviations(shown)
         self.inside = law.in_domain(self.theta).astype(float).reshape(points, points)
         self.labels = [problem.labels(units=True)[i] for i in chosen]
         self.problem = problem
-        self.output = output
-        self.name = with_units(problem.model)[1][output]
+        self.name = with_units(problem.model)[1][0]
 
     def values(self, policy: Any) -> Array:
-        """Return the input of a policy on the grid."""
+        """Return the first input of a policy on the grid."""
         u = self.problem.units.input_to_plant(inputs_of(self.problem, policy, self.theta))
-        return np.reshape(u[:, self.output], self.inside.shape)
+        return np.reshape(u[:, 0], self.inside.shape)
 
-    def draw(self, axes: Axes, u: Array, scale: tuple[float, float]) -> Any:
+    def draw(
+        self, axes: Axes, u: Array, scale: tuple[float, float], colors: str = "cividis"
+    ) -> Any:
         """Draw values in colors of a scale, and the border of where the MPC has a solution."""
         low, high = scale
-        mesh = axes.pcolormesh(*self.grid, u, cmap="cividis", vmin=low, vmax=high, rasterized=True)
+        mesh = axes.pcolormesh(*self.grid, u, cmap=colors, vmin=low, vmax=high, rasterized=True)
         if not self.inside.all():
             axes.contour(*self.grid, self.inside, levels=[0.5], colors="black", linewidths=1.0)
         axes.set(xlabel=self.labels[0], ylabel=self.labels[1])
         return mesh
-
-    def draw_change(self, axes: Axes, change: Array) -> None:
-        """Draw a difference in colors that are symmetric about zero; rounding is pale."""
-        rounding = 1e-4 * float(self.problem.u_half[self.output])
-        size = max(float(np.abs(change).max()), rounding)
-        mesh = self.draw(axes, change, (-size, size))
-        mesh.set_cmap("PuOr")
-        axes.figure.colorbar(mesh, ax=axes, label=f"change of {self.name}")
 
 
 def plot_surface(
@@ -220,13 +199,12 @@ def plot_surface(
     axes: Axes | None = None,
     *,
     entries: Sequence[Quantity] = (0, 1),
-    at: ArrayLike | None = None,
-    output: int = 0,
     frame: Frame | None = None,
 ) -> Axes:
-    """Draw an input, in plant units, over two entries of theta.
+    """Draw the first input, in plant units, over two entries of theta.
 
-    A line surrounds where the MPC has a solution, if that is not everywhere.
+    The other entries are at the operating point. A line surrounds where the MPC has a solution, if
+    that is not everywhere.
 
     Parameters
     ----------
@@ -238,10 +216,6 @@ def plot_surface(
         Where to draw; a new figure's by default.
     entries : pair of int or str, default (0, 1)
         The coordinates to the right and up: indices, or names as in ``problem.labels()``.
-    at : array_like, shape (n_theta,), optional
-        The other entries, in plant units; the operating point by default.
-    output : int, default 0
-        Which input.
     frame : pair of array_like, shape (2,), optional
         The lower left and the upper right corner, in plant units; by default the box of theta.
 
@@ -253,11 +227,11 @@ def plot_surface(
     >>> float(abs(axes.collections[0].get_array()).max())
     2.0
     """
-    surface = _Surface(problem, entries, at, output, frame)
-    u = surface.values(policy)
+    plane = _Plane(problem, entries, frame)
+    u = plane.values(policy)
     axes = axes_or_new(axes, 5.4, 4.2)
-    mesh = surface.draw(axes, u, (u.min(), u.max()))
-    axes.figure.colorbar(mesh, ax=axes, label=surface.name)
+    mesh = plane.draw(axes, u, (u.min(), u.max()))
+    axes.figure.colorbar(mesh, ax=axes, label=plane.name)
     return axes
 
 
@@ -267,8 +241,6 @@ def surfaces_figure(
     after: Any,
     *,
     entries: Sequence[Quantity] = (0, 1),
-    at: ArrayLike | None = None,
-    output: int = 0,
     frame: Frame | None = None,
 ) -> Figure:
     """Return a figure of the control surface before, after, and of their difference.
@@ -279,7 +251,7 @@ def surfaces_figure(
         With the box of theta, names and units.
     before, after : callable, model or YannPolicy
         As of :func:`plot_surface`; the first two panels share their colors.
-    entries, at, output, frame
+    entries, frame
         As there.
 
     Examples
@@ -292,14 +264,17 @@ def surfaces_figure(
     """
     figure = new_figure(10.2, 3.2)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
-    surface = _Surface(problem, entries, at, output, frame)
-    first = surface.values(before)
-    second = surface.values(after)
+    plane = _Plane(problem, entries, frame)
+    first = plane.values(before)
+    second = plane.values(after)
     scale = min(first.min(), second.min()), max(first.max(), second.max())
-    surface.draw(panels[0], first, scale)
-    mesh = surface.draw(panels[1], second, scale)
-    figure.colorbar(mesh, ax=[*panels[:2]], label=surface.name)
-    surface.draw_change(panels[2], second - first)
+    plane.draw(panels[0], first, scale)
+    mesh = plane.draw(panels[1], second, scale)
+    figure.colorbar(mesh, ax=[*panels[:2]], label=plane.name)
+    rounding = 1e-4 * float(problem.u_half[0])  # is pale
+    size = max(float(np.abs(second - first).max()), rounding)
+    mesh = plane.draw(panels[2], second - first, (-size, size), "PuOr")
+    figure.colorbar(mesh, ax=panels[2], label=f"change of {plane.name}")
     for panel, title in zip(panels, ("before", "after", "after - before"), strict=True):
         panel.set_title(title)
         panel.label_outer()
@@ -307,35 +282,6 @@ def surfaces_figure(
 
 
 # ---- Which regions are used ----
-
-
-class RegionUse(NamedTuple):
-    """The regions (k,) that episodes visit, those visited most first.
-
-    ``share`` is that of all steps; ``mean`` and ``largest`` are distances of the policy's input
-    from the MPC's, in half-widths of the input range, of the input that is farthest.
-    """
-
-    regions: NDArray[np.int64]
-    share: Array
-    mean: Array
-    largest: Array
-
-
-def region_use(problem: LinearMPC, policy: Any, episodes: Trajectories) -> RegionUse:
-    """Return which regions a law, model or policy uses; observations are theta."""
-    law = problem.explicit()
-    theta = np.concatenate([each[:-1] for each in episodes.observations])
-    theta = problem.units.to_deviations(theta[np.isfinite(theta).all(axis=1)])
-    apart = np.abs(inputs_of(problem, policy, theta) - law(theta)) / problem.u_half
-    distance = apart.max(axis=1)
-    region = law.locate(theta)
-    found, where, visits = np.unique(region, return_inverse=True, return_counts=True)
-    largest = np.zeros(len(found))
-    np.maximum.at(largest, where, distance)
-    mean = np.bincount(where, weights=distance) / visits
-    order = np.argsort(-visits, kind="stable")
-    return RegionUse(found[order], visits[order] / len(theta), mean[order], largest[order])
 
 
 def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figure:
@@ -362,21 +308,28 @@ def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figur
     >>> len(use_figure(mpc, mpc.explicit(), played).axes)
     2
     """
-    use = region_use(problem, policy, episodes)
-    share, mean, largest = (100 * each[:MAX_REGIONS] for each in (use.share, use.mean, use.largest))
+    law = problem.explicit()
+    theta = np.concatenate([each[:-1] for each in episodes.observations])
+    theta = problem.units.to_deviations(theta[np.isfinite(theta).all(axis=1)])
+    apart = np.abs(inputs_of(problem, policy, theta) - law(theta)) / problem.u_half
+    distance = 100 * apart.max(axis=1)
+    regions, where, visits = np.unique(law.locate(theta), return_inverse=True, return_counts=True)
+    order = np.argsort(-visits, kind="stable")[:MAX_REGIONS]
+    mean = (np.bincount(where, weights=distance) / visits)[order]
+    largest = [float(distance[where == k].max()) for k in order]
     figure = new_figure(6.8, 4.8)
     above, below = figure.subplots(2, 1, sharex=True)
-    places = range(len(share))
-    above.bar(places, share, color=COLORS[5])
+    places = range(len(order))
+    above.bar(places, 100 * visits[order] / len(theta), color=COLORS[5])
     above.set(ylabel="steps there (%)")
     below.bar(places, mean, color=COLORS[0], label="mean")
     below.plot(places, largest, "v", color=COLORS[1], markersize=5, label="largest")
     below.set(ylabel="distance from the MPC\n(% of half the range)")
     below.set_ylim(0, max(below.get_ylim()[1], 0.01))  # rounding is not drawn large
     below.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
-    below.set_xticks(places, [str(each) for each in use.regions[:MAX_REGIONS]])
+    below.set_xticks(places, [str(each) for each in regions[order]])
     below.tick_params(axis="x", rotation=90 if len(places) > 15 else 0)
-    left_out = len(use.regions) - len(places)
+    left_out = len(regions) - len(order)
     more = f" ({left_out} more, visited less, are left out)" if left_out else ""
     below.set_xlabel(f"region{more}")
     for panel in (above, below):
@@ -448,6 +401,7 @@ def loops_figure(
         n = problem.n_theta
         quantities = [*range(problem.model.n_states), *range(n, n + problem.model.n_inputs)]
     entries = [_entry_of(problem, each, inputs=True) for each in quantities]
+    unit = problem.model.time_unit
     counts = {len(each.costs) for each in runs.values()}
     height = 2 if len(runs) > 1 and len(counts) == 1 and counts.pop() > MAX_LINES else 1
     columns = min(3, len(entries))
@@ -464,7 +418,7 @@ def loops_figure(
         _draw_loops(own[0], problem, runs, entries[k])
         if height > 1:
             _draw_differences(own[1], problem, runs, entries[k])
-        own[-1].set_xlabel(_time_label(problem))
+        own[-1].set_xlabel(f"time ({unit})" if unit else "time")
     found: dict[str, Any] = {}
     for panel in panels.ravel():
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -478,11 +432,6 @@ def loops_figure(
     return figure
 
 
-def _time_label(problem: LinearMPC) -> str:
-    unit = problem.model.time_unit
-    return f"time ({unit})" if unit else "time"
-
-
 def _draw_loops(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
     """Draw one quantity of all controllers."""
     n = problem.n_theta
@@ -492,50 +441,37 @@ def _draw_loops(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
     if reference != entry:  # the last one belongs to a step that is not taken
         set_points = np.unique(_rows(next(iter(runs.values())), reference, n)[:, :-1], axis=0)
     differ = len(set_points) > 1
-    every = []
+    every = [np.zeros(0), set_points.ravel()]
     for number, (name, episodes) in enumerate(runs.items()):
         rows = _rows(episodes, entry, n)
         if differ:
             rows = rows[:, :-1] - _rows(episodes, reference, n)[:, :-1]
-        _draw_rows(axes, rows, problem.model.dt, _style(number, entry >= n), name)
-        every.append(rows[np.isfinite(rows)])
+        _draw_rows(axes, rows, problem.model.dt, number, entry >= n, name)
+        every.append(rows.ravel())
+    axes.grid(alpha=0.3)
+    axes.set_ylabel(f"{label}\nless its set-point" if differ else label)
     if differ:
         axes.axhline(0, **SET_POINT)  # type: ignore[arg-type]
-        axes.set_ylabel(f"{label}\nless its set-point")
-        axes.grid(alpha=0.3)
         return
     for row in set_points:
         time = problem.model.dt * np.arange(len(row))
         axes.plot(time, row, drawstyle="steps-post", label="set-point", **SET_POINT)  # type: ignore[arg-type]
-        every.append(row[np.isfinite(row)])
-    data = np.concatenate(every) if sum(map(len, every)) else np.array([0.0, 1.0])
-    _draw_limits(axes, problem, entry, float(data.min()), float(data.max()))
-    axes.set_ylabel(label)
-    axes.grid(alpha=0.3)
+    data = np.concatenate(every)
+    _draw_limits(axes, problem, entry, data[np.isfinite(data)])
 
 
 def _draw_differences(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
     """Draw by how much a quantity differs from the first controller's, from the same starts."""
-    first, *others = runs
-    base = _rows(runs[first], entry, problem.n_theta)
-    for number, name in enumerate(others, start=1):
-        rows = _rows(runs[name], entry, problem.n_theta)
-        steps = min(base.shape[1], rows.shape[1])
-        style = _style(number, entry >= problem.n_theta)
-        _draw_rows(axes, rows[:, :steps] - base[:, :steps], problem.model.dt, style, "_nolegend_")
+    first, *others = (_rows(each, entry, problem.n_theta) for each in runs.values())
+    held = entry >= problem.n_theta
+    for number, rows in enumerate(others, start=1):
+        steps = min(first.shape[1], rows.shape[1])
+        _draw_rows(axes, rows[:, :steps] - first[:, :steps], problem.model.dt, number, held)
     axes.axhline(0, color="black", linewidth=0.8)
     plain = [*problem.labels(), *labels_of(problem.model)[1]][entry]
     whole = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
     axes.set_ylabel(f"difference{whole.removeprefix(plain)}")
     axes.grid(alpha=0.3)
-
-
-def _style(number: int, held: bool) -> dict[str, Any]:
-    """Return how the lines of a controller are drawn; inputs are held for a sample."""
-    return {
-        "color": COLORS[number % len(COLORS)],
-        "drawstyle": "steps-post" if held else "default",
-    }
 
 
 def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:
@@ -549,51 +485,43 @@ def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:
     return found
 
 
-def _draw_rows(axes: Axes, rows: Array, dt: float, style: dict[str, Any], name: str) -> None:
-    """Draw lines of a few episodes; of many the median, and the band of 80 % of them."""
+def _draw_rows(
+    axes: Axes, rows: Array, dt: float, number: int, held: bool, name: str = "_nolegend_"
+) -> None:
+    """Draw lines of a few episodes; of many the median, and the band of 80 % of them.
+
+    Inputs are ``held`` for a sample.
+    """
     time = dt * np.arange(rows.shape[1])
+    color = COLORS[number % len(COLORS)]
+    line: dict[str, Any] = {"color": color, "drawstyle": "steps-post" if held else "default"}
     if len(rows) <= MAX_LINES:
         for k, row in enumerate(rows):
             label = name if k == 0 else "_nolegend_"
-            axes.plot(time, row, linewidth=1.1, alpha=0.85, label=label, **style)
+            axes.plot(time, row, linewidth=1.1, alpha=0.85, label=label, **line)
         return
     low, middle, high = np.nanpercentile(rows, [10, 50, 90], axis=0)
-    step: Any = "post" if style["drawstyle"] == "steps-post" else None
-    axes.fill_between(time, low, high, alpha=0.2, color=style["color"], linewidth=0, step=step)
-    hidden = name.startswith("_")
-    label = name if hidden else f"{name}, median of {len(rows)}, and 80 % of them"
-    axes.plot(time, middle, linewidth=1.7, label=label, **style)
+    step: Any = "post" if held else None
+    axes.fill_between(time, low, high, alpha=0.2, color=color, linewidth=0, step=step)
+    label = name if name.startswith("_") else f"{name}, median of {len(rows)}, and 80 % of them"
+    axes.plot(time, middle, linewidth=1.7, label=label, **line)
 
 
-def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: float) -> None:
-    """Draw limits near the data, name those far away, and set the range of the axis."""
+def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, data: Array) -> None:
+    """Draw limits no farther from the data than these are apart; others would flatten them."""
     k = entry - problem.n_theta
-    model = problem.model
-    kind = ""
-    sides = -np.inf, np.inf
     if k >= 0:
         sides = problem.u_min[k], problem.u_max[k]
         kind = "bound of the input"
-    elif entry < model.n_states:
+    elif entry < problem.model.n_states:
         sides = problem.x_min[entry], problem.x_max[entry]
         kind = "soft limit" if problem.soft.penalty and problem.soft.x[entry] > 0 else "limit"
-    width = max(high - low, 1e-9 * max(abs(low), abs(high), 1.0))
-    bottom = low
-    top = high
-    for value, corner in zip(sides, ("bottom", "top"), strict=True):
-        if not np.isfinite(value):
-            continue
-        if low - width <= value <= high + width:
+    else:
+        return
+    width = max(float(np.ptp(data)), 1e-9 * float(np.abs(data).max()))
+    for value in sides:
+        if data.min() - width <= value <= data.max() + width:
             axes.axhline(value, label=kind, **LIMIT)  # type: ignore[arg-type]
-            bottom = min(bottom, value)
-            top = max(top, value)
-        else:
-            y = 0.04 if corner == "bottom" else 0.96
-            text = f"{kind}: {value:.4g}"
-            place: dict[str, Any] = {"ha": "right", "va": corner, "transform": axes.transAxes}
-            axes.text(0.98, y, text, fontsize=7, **place)
-    room = 0.06 * max(top - bottom, width)
-    axes.set_ylim(bottom - room, top + room)
 
 
 def plot_gains(runs: Runs, axes: Axes | None = None) -> Axes:
