@@ -399,20 +399,21 @@ class Starts:
         mpc = others.mpc.at(hard).extended_by(self.mpc)
         return replace(self, seeds=seeds, mpc=mpc, n_hard=self.n_hard + len(hard))
 
-    def lost(self, policy: Scores) -> NDArray[np.bool_]:
-        """Return which of the first starts a policy loses against the MPC."""
+    def _excess(self, policy: Scores) -> Array:
+        """Return what the first starts cost a policy more, inf where it is less safe."""
         mpc = self.mpc.at(slice(len(policy.costs)))
         less = less_safe(policy.unsafe, mpc.unsafe, self.tolerance.excess_room).any(axis=1)
-        return np.asarray((self.tolerance.excess(mpc.costs, policy.costs) > 1.0) | less)
+        return np.where(less, np.inf, self.tolerance.excess(mpc.costs, policy.costs))
+
+    def lost(self, policy: Scores) -> NDArray[np.bool_]:
+        """Return which of the first starts a policy loses against the MPC."""
+        return np.asarray(self._excess(policy) > 1.0)
 
     def hardest(self, policy: Scores) -> NDArray[np.int64]:
         """Return the hardest of the first starts that a policy loses, else that cost it more."""
-        mpc = self.mpc.at(slice(len(policy.costs)))
-        excess = self.tolerance.excess(mpc.costs, policy.costs)
-        less = less_safe(policy.unsafe, mpc.unsafe, self.tolerance.excess_room).any(axis=1)
-        order = np.argsort(np.where(less, -np.inf, -excess), kind="stable")
-        count = self.lost(policy).sum() or np.count_nonzero(excess > 0)
-        return order[: min(MAX_NEW_HARD, count)]
+        excess = self._excess(policy)
+        count = np.count_nonzero(excess > 1.0) or np.count_nonzero(excess > 0)
+        return np.argsort(-excess, kind="stable")[: min(MAX_NEW_HARD, count)]
 
 
 @dataclass

@@ -58,7 +58,6 @@ FORBIDDEN = {
 
 
 def _modules() -> dict[str, Path]:
-    """Return all modules of the packages by their names."""
     found = {}
     for package, root in PACKAGES.items():
         for path in sorted((root / package).rglob("*.py")):

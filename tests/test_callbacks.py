@@ -10,14 +10,12 @@ from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecNormalize
 
 from event_files import scalars
 from guard_samples import MPC, STEPS, Slide, build
 from sample_plants import Recorder
 from sb3_yann import ControlDiagnostics, NoActionNoise, SimulatedEpisodes, YannPolicy
 from sb3_yann.callbacks import _Exploration
-from sb3_yann.policy import AffineObservation
 from weights import last_layer, unpin
 
 
@@ -118,7 +116,6 @@ def test_violations_count_and_the_critic_error_compares_q_with_the_return_that_f
         record(episode, info),
     )[-1]
     model.learn(3, callback=[NoActionNoise(), diagnostics], log_interval=100)
-    assert diagnostics.violations == 1
     theta = th.as_tensor(np.array(states))
     with th.no_grad():
         q = model.critic.q1_forward(theta, model.actor(theta)).numpy()[:, 0]
@@ -133,8 +130,6 @@ FEW = {"per_episode": 3}
 
 
 class Ends(Slide):
-    """Terminates after two steps from some of its starts."""
-
     def step(self, action):
         observation, reward, _, truncated, info = super().step(action)
         return observation, reward, self.low_start and self.t == 2, truncated, info
@@ -216,19 +211,6 @@ def test_with_several_envs_each_column_holds_whole_episodes_but_for_its_last(n_e
         ended = buffer.dones[rows(model), column].astype(bool)
         ended |= buffer.timeouts[rows(model), column].astype(bool)
         assert ended[breaks].all()
-
-
-def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> None:
-    venv = VecNormalize(make_vec_env(Slide, 1), training=False, norm_reward=False)
-    venv.obs_rms.mean = np.array([1.0])
-    venv.obs_rms.var = np.array([4.0])
-    venv.clip_obs = np.inf
-    seen = AffineObservation.from_vec_normalize(venv)
-    model = build(env=venv, actor={"observation": seen}, learning_rate=0.0)
-    learnt(model, 1, SimulatedEpisodes(Slide, per_episode=3, noise=0.0, step_tests=0))
-    shown = model.replay_buffer.observations[: 3 * STEPS, 0].astype(float)
-    taken = model.replay_buffer.actions[: 3 * STEPS, 0]
-    np.testing.assert_allclose(taken, MPC.explicit()(shown), atol=1e-5)
 
 
 def test_step_tests_hold_an_action_from_all_of_the_space_for_one_to_so_many_samples() -> None:

@@ -38,7 +38,6 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """A saved model whose correction is not zero."""
     model = DDPG(YannPolicy, Cart(), device="cpu", seed=0, learning_starts=10)
     model.policy.critic_warmup = 0
     model.learn(40)
@@ -49,7 +48,6 @@ def saved(tmp_path_factory):
 
 @pytest.fixture
 def model(folder, saved):
-    """The saved model in the user's folder."""
     return shutil.copy(saved, folder)
 
 
@@ -140,7 +138,6 @@ def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys, m
 
 
 def write_files(folder) -> None:
-    """Write a law, and files that hold none."""
     problem().explicit().save(folder / "law.npz")
     export(problem(), folder / "controller.npz")
     content = bytearray((folder / "law.npz").read_bytes())

@@ -31,7 +31,6 @@ FINDER = doctest.DocTestFinder(exclude_empty=True)
 
 
 def modules() -> Iterator[str]:
-    """Yield the names of all modules of the packages."""
     for package in PACKAGES:
         yield package
         found = pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")

@@ -34,8 +34,6 @@ def clock(monkeypatch) -> Clock:
 
 
 class Terminal(io.StringIO):
-    """A terminal as sys.stderr."""
-
     def isatty(self) -> bool:
         return True
 

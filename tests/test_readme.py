@@ -41,12 +41,10 @@ FOLDERS = ("benchmarks", "docs", "envs", "examples", "experiments", "sb3_yann", 
 
 
 def page(name: str) -> str:
-    """Return a page's text."""
     return (ROOT / name).read_text(encoding="utf-8")
 
 
 def blocks(text: str) -> list[str]:
-    """Return the Python blocks of a page."""
     return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
 
 

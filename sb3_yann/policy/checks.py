@@ -281,30 +281,20 @@ def require_theta(
 ) -> None:
     """Raise unless theta is what is observed, or what ``observation`` makes of it."""
     shape = observation_space.shape
+    if observation is None and shape == (problem.n_theta,):
+        return
     names = ", ".join(problem.labels())
     takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
     states_alone = shape == (problem.model.n_states,) != (problem.n_theta,)
-    if states_alone and (observation is None or observation.n_obs == problem.n_theta):
+    if observation is None or (states_alone and observation.n_obs == problem.n_theta):
+        more = 0 if shape is None or len(shape) != 1 else shape[0] - problem.n_theta
+        extra = f" Signals for networks alone are policy_kwargs={{'extra': {more}}}." * (more > 0)
         raise ValueError(
             f"The observation has shape {shape}, but the law of the problem {takes}. Wrap the env "
             "so that it shows all of theta: SetPoint, MeasuredDisturbance, ObserveDisturbance and "
-            "PreviousInput in sb3_yann.wrappers append what is missing. Or pass the map from an "
-            "observation to theta: policy_kwargs={'observation': AffineObservation(matrix, "
+            f"PreviousInput in sb3_yann.wrappers append what is missing.{extra} Or pass the map "
+            "from an observation to theta: policy_kwargs={'observation': AffineObservation(matrix, "
             "offset)}."
-        )
-    if observation is None:
-        if shape == (problem.n_theta,):
-            return
-        more = 0 if shape is None or len(shape) != 1 else shape[0] - problem.n_theta
-        advice = "Give the problem of this plant, or the map from an observation to theta: "
-        if more > 0:
-            advice = (
-                f"If the last {more} are extra signals for the networks, say policy_kwargs="
-                f"{{'extra': {more}}}. Else give the map from an observation to theta: "
-            )
-        raise ValueError(
-            f"The observation has shape {shape}, but the law of the problem {takes}. {advice}"
-            "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
         )
     given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"
     if shape is None or observation.n_obs != np.prod(shape):

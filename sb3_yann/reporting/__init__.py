@@ -18,7 +18,6 @@ from sb3_yann.improvement import Headroom
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.reporting.evidence_parts import (
     again_part,
-    cost_part,
     distance_part,
     guard_part,
     headroom_part,
@@ -37,7 +36,7 @@ __all__ = ["report"]
 TITLE = "Report on a policy that starts as an MPC"
 PARTS = (
     plant_part, constraints_part, law_part, loops_part, statistics_part, distance_part, guard_part,
-    improve_part, twin_part, headroom_part, cost_part, again_part,
+    improve_part, twin_part, headroom_part, again_part,
 )  # fmt: skip
 
 
@@ -57,8 +56,8 @@ def report(
     It is one HTML file without scripts, and loads nothing: pictures are part of it. It has the
     plant and the problem in plant units, the register of constraints, the law and how it was
     checked, closed loops against the MPC, what they prove, where and how far the policy leaves the
-    MPC, every decision of the guard, what `improve` did, the twin, the headroom, timing, versions
-    and seeds. A part without evidence is left out.
+    MPC, every decision of the guard, what `improve` did, the twin, the headroom, versions and
+    seeds. A part without evidence is left out.
 
     Parameters
     ----------

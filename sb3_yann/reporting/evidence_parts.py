@@ -1,16 +1,13 @@
-"""Closed loops, the guard's decisions, improve, twin, headroom, timing, and how to do it again."""
+"""Closed loops, the guard's decisions, improve, twin, headroom, and how to do it again."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from time import perf_counter
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -19,7 +16,6 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_states
 from sb3_yann.compare import INPUT_STEP, less_safe
-from sb3_yann.control import PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.evaluation.plots import (
     inputs_of,
@@ -108,10 +104,6 @@ def loops_part(subject: Subject) -> Part:
         for seed, a, b, v, w in each
     ]
     head = ["seed", "MPC", "policy", "change", "MPC: violations", "policy: violations"]
-    apart = np.abs(policy.costs - mpc.costs) > FLOAT32_ROUNDING * np.abs(mpc.costs)
-    same: Html | str = ""
-    if not apart.any() and np.array_equal(mpc.violations, policy.violations):
-        same = paragraph("Each costs what it costs with the MPC, and violates as often.")
     content = join(
         [
             paragraph(how, warning if known else ""),
@@ -119,7 +111,7 @@ def loops_part(subject: Subject) -> Part:
             picture(partial(plot_gains, loops), gains),
             picture(partial(loops_figure, subject.problem, subject.shown_loops), caption),
             tag("h3", "Every episode"),
-            same if same else table(head, single[:1000]),
+            table(head, single[:1000]),
         ]
     )
     less = less_safe(policy.unsafe(), mpc.unsafe())[:, :INPUT_STEP]  # the next part has the bounds
@@ -148,55 +140,39 @@ def statistics_part(subject: Subject) -> Part:
     mpc = subject.loops[OF_MPC]
     policy = subject.loops[OF_POLICY]
     change = policy.costs - mpc.costs
-    count = len(policy.costs)
+    count = len(change)
     if not np.all(np.isfinite(change)):
         text = "Some costs are not finite: no average says anything."
         return Part(title, paragraph(text), (make_finding(False, text),))
-    mean, finding = _mean_in_words(change, float(np.mean(mpc.costs)))
-    rounding = FLOAT32_ROUNDING * np.abs(mpc.costs)
-    less = int(np.sum(change < -rounding))
-    more = int(np.sum(change > rounding))
-    worst = int(np.argmax(np.where(change > rounding, change, 0.0)))
-    largest = f"{change[worst]:.4g}, from seed {subject.seeds[worst]}" if more else "0"
+    scale = abs(float(np.mean(mpc.costs))) or 1.0
+    mean = 100 * float(change.mean()) / scale
+    passed: bool | None = None
+    text = f"On average the policy costs {abs(mean):.2f} % {'less' if mean < 0 else 'more'} than "
+    text += "the MPC. One episode says nothing about others."
+    if np.all(np.abs(change) <= FLOAT32_ROUNDING * scale):
+        text = "From these starts the policy costs what the MPC costs."
+    elif count > 1:
+        error = 100 * change.std(ddof=1) / count**0.5 / scale
+        width = float(stats.t.ppf(0.975, count - 1) * error)
+        passed = True if mean + width < 0 else False if mean - width > 0 else None
+        text = (
+            f"On average the cost changes by {mean:+.2f} %; the change lies between "
+            f"{mean - width:+.2f} and {mean + width:+.2f} % with a confidence of 95 %, by "
+            f"Student's interval of the {count} paired differences."
+        )
+        if passed is None:
+            text += " That it differs from the MPC at all is not shown."
     # The upper limit of Clopper and Pearson: how often a violation may still happen.
     bad = int(np.sum(policy.violations > 0))
     most = 1.0 if bad == count else float(stats.beta.ppf(0.95, bad + 1, count - bad))
     sentences = [
-        mean,
-        f"It costs less from {less} starts and more from {more} of {count}; the largest "
-        f"increase is {largest}.",
+        text,
         f"{bad} of {count} episodes violate a limit ({int(np.sum(mpc.violations > 0))} with the "
         f"MPC): with a confidence of 95 % fewer than {100 * most:.1f} % of such starts do.",
         "These statements hold for starts that are drawn as these are, and for a plant that "
         "behaves as this env does.",
     ]
-    return Part(title, join(map(paragraph, sentences)), (finding,))
-
-
-def _mean_in_words(change: Array, typical: float) -> tuple[str, Finding]:
-    """Return what the mean difference and its t interval say."""
-    mean = float(change.mean())
-    count = len(change)
-    scale = abs(typical) or 1.0
-    if np.all(np.abs(change) <= FLOAT32_ROUNDING * scale):
-        text = "From these starts the policy costs what the MPC costs."
-        return text, Finding("note", text)
-    word = "less" if mean < 0 else "more"
-    text = f"On average the policy costs {100 * abs(mean) / scale:.2f} % {word} than the MPC"
-    if count < 2:
-        return f"{text}. One episode says nothing about others.", Finding("note", f"{text}.")
-    width = float(stats.t.ppf(0.975, count - 1) * change.std(ddof=1) / count**0.5)
-    low = 100 * (mean - width) / scale
-    high = 100 * (mean + width) / scale
-    text += f"; the change lies between {low:+.2f} and {high:+.2f} % with a confidence of 95 %."
-    passed = True if high < 0 else False if low > 0 else None
-    if passed is None:
-        text += " That it differs from the MPC at all is not shown."
-    method = (
-        f"The interval is Student's, of the {count} differences of paired episodes; it takes their "
-        "mean for nearly normal."
-    )
-    return f"{text} {method}", make_finding(passed, text)
+    return Part(title, join(map(paragraph, sentences)), (make_finding(passed, text),))
 
 
 def distance_part(subject: Subject) -> Part:
@@ -245,7 +221,6 @@ def distance_part(subject: Subject) -> Part:
             keeps,
         ),
         table(head, rows),
-        _farthest(subject),
         *_pictures(subject),
     ]
     u = inputs_of(problem, policy, theta)
@@ -270,25 +245,6 @@ def _distance(subject: Subject, theta: Array) -> Array:
     """Return the distance of the policy's inputs from the law's (batch, m)."""
     finite = theta[np.isfinite(theta).all(axis=1)]
     return np.abs(inputs_of(subject.problem, subject.policy, finite) - subject.law(finite))
-
-
-def _farthest(subject: Subject) -> Html:
-    """Return at which random point the policy is farthest from the MPC."""
-    problem = subject.problem
-    theta = subject.samples
-    apart = (_distance(subject, theta) / problem.u_half).max(axis=1)
-    if apart.max() < FLOAT32_ROUNDING:
-        return paragraph(
-            "At the random points the policy is the MPC: nothing has been learnt there."
-        )
-    far = problem.units.to_plant(theta[int(np.argmax(apart))])
-    named = zip(problem.labels(units=True), far, strict=True)
-    point = ", ".join(f"{name} = {value:.4g}" for name, value in named)
-    rest = float(_distance(subject, problem.theta_rest[None]).max())
-    return paragraph(
-        f"Of the random points it is farthest from the MPC at {point}.",
-        f"At the operating point it differs by {rest:.2g}.",
-    )
 
 
 def _pictures(subject: Subject) -> list[Html]:
@@ -480,55 +436,7 @@ def headroom_part(subject: Subject) -> Part:
     return Part(title, join([lines(found.report()), shown]), (finding,))
 
 
-# ---- Timing, and what it takes to do it again ----
-
-
-def cost_part(subject: Subject) -> Part:
-    """Return how long a call takes on this machine, and how large things are."""
-    policy = subject.policy
-    law = subject.law
-    calls = 200
-    space = policy.observation_space
-    theta = subject.problem.theta_rest
-    observation = np.zeros(space.shape or (1,), space.dtype)
-
-    def times(call: Callable[[], Any]) -> tuple[str, str]:
-        call()
-        taken = []
-        for _ in range(calls):
-            begun = perf_counter()
-            call()
-            taken.append(1e6 * (perf_counter() - begun))
-        return f"{np.median(taken):.1f}", f"{np.percentile(taken, 99):.1f}"
-
-    checked = policy.first_obs_checked
-    policy.first_obs_checked = True  # no observation of the env
-    rows = [
-        [
-            "model.predict, one observation",
-            *times(lambda: subject.model.predict(observation, deterministic=True)),
-        ],
-        ["the MPC's law, one theta", *times(lambda: law(theta))],
-    ]
-    policy.first_obs_checked = checked
-    tensors = policy.actor.state_dict().values()
-    sizes = {
-        "the actor's weights and constants": sum(t.numel() * t.element_size() for t in tensors)
-    }
-    if isinstance(law, PiecewiseAffine):
-        sizes["the law, with what finds its regions"] = sum(each.nbytes for each in law.packed)
-    if sys.platform != "win32":
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        sizes["this process at its largest"] = peak if sys.platform == "darwin" else 1024 * peak
-    how = f"{calls} calls each, one after the other, at the operating point, on this machine."
-    content = [
-        paragraph(how),
-        table(["what", "median (µs)", "99 % are below (µs)"], rows),
-        table(["what", "size (MB)"], [[what, f"{n / 1e6:.3g}"] for what, n in sizes.items()]),
-    ]
-    return Part("Timing and memory", join(content))
+# ---- What it takes to do it again ----
 
 
 def again_part(subject: Subject) -> Part:

@@ -30,7 +30,6 @@ from weights import is_mpc
 
 
 def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioning:
-    """Return a short commissioning of the cart."""
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
     options = {"batch": 5, "updates": 1000, "max_correction": 0.2} | options
     return Commissioning(model, env, log_path=path, **options)
@@ -282,24 +281,6 @@ def test_a_strangers_file_is_left_alone(tmp_path) -> None:
     with pytest.raises(ValueError, match="no record"):
         commission(path)
     assert path.read_text() == '{"my": "settings"}'
-
-
-def test_two_runs_on_one_record_are_noticed(tmp_path) -> None:
-    one = commission(tmp_path)
-    other = commission(tmp_path)
-    one.run(1)
-    with pytest.raises(RuntimeError, match="somebody else"):
-        other.run(1)
-
-
-def test_another_cost_is_another_commissioning(tmp_path) -> None:
-    commission(tmp_path)
-    model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
-    other = replace(problem(), Q=np.diag([1.5, 0.1]))
-    model = DDPG(YannPolicy, Cart(), policy_kwargs={"problem": other}, device="cpu")
-    options = {"batch": 5, "updates": 1000, "max_correction": 0.2}
-    with pytest.raises(ValueError, match="begun with problem"):
-        Commissioning(model, Cart, log_path=tmp_path, **options)
 
 
 def costs(more: float, error: float, pairs: int, look: int = 1) -> Costs:

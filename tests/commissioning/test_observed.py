@@ -6,7 +6,6 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import Commissioning, Improvement, PlantTwin, YannPolicy, improve
 from sb3_yann.commissioning import commissioning
-from sb3_yann.commissioning.commissioning import predicted_costs
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement.confirmation import Trial
@@ -23,20 +22,6 @@ def plant() -> StageCost:
 def model() -> DDPG:
     mpc = offset_free_problem()[0]
     return DDPG(YannPolicy, plant(), policy_kwargs={"problem": mpc}, seed=0, device="cpu")
-
-
-def test_the_twin_predicts_what_episodes_cost_that_it_has_not_seen() -> None:
-    found = observed()
-    law = law_of(offset_free_problem()[0])
-    played = evaluate(offset_free_problem()[0].explicit(), plant, range(700, 705))
-
-    class Episode:
-        def __init__(self, thetas: np.ndarray, actions: np.ndarray) -> None:
-            self.thetas = thetas.astype(float)
-            self.actions = actions
-
-    episodes = [Episode(*each) for each in zip(played.observations, played.actions, strict=True)]
-    np.testing.assert_allclose(predicted_costs(found, episodes, law), played.costs, rtol=2e-3)
 
 
 @pytest.mark.nightly
@@ -85,23 +70,6 @@ def test_commissioning_takes_the_observer_of_the_env(monkeypatch) -> None:
 def trial() -> Trial:
     """Return one of a plant whose set-points change amid an episode."""
     return Trial.draw(observed(), 12, np.random.default_rng([0, 1]))
-
-
-def test_every_other_start_goes_on_with_the_set_points_of_a_logged_episode() -> None:
-    found = trial()
-    part = observed().dynamics.row.given
-    assert (found.follow >= 0).tolist() == [False, True] * 6 + [False] * 12
-    assert set(found.follow[found.follow >= 0]) == set(range(5))  # all of them
-    for given, number, start in zip(
-        np.swapaxes(found.given, 0, 1), found.follow, found.starts[0], strict=True
-    ):
-        if number < 0:
-            np.testing.assert_array_equal(given, np.tile(start[part], (60, 1)))
-        else:
-            np.testing.assert_array_equal(given, observed().episodes[number].thetas[:-1, part])
-            assert np.ptp(given) > 0
-    rows, _ = found._run(law_of(observed().problem))
-    np.testing.assert_array_equal(rows[:-1, 2][..., part], found.given)
 
 
 def test_what_loses_on_episodes_like_the_logs_is_refused() -> None:

@@ -53,7 +53,6 @@ def drive(
 
 
 def barks(dog: Watchdog, episode: list[Transition]) -> tuple[int, Alarm] | None:
-    """Return the first alarm, with its step."""
     dog.start(episode[0][0])
     alarms = ((k, dog.watch(*each)) for k, each in enumerate(episode))
     return next(((k, each) for k, each in alarms if each is not None), None)
@@ -130,13 +129,6 @@ def test_the_first_alarm_of_an_episode_stays_until_the_next_begins() -> None:
     assert dog.watch(*drive(1)[1]) is alarm and not dog.quiet
     dog.start(drive(1)[0][0])
     assert dog.quiet and dog.watch(*drive(1)[0]) is None
-
-
-def test_where_the_log_tells_little_the_band_is_wider() -> None:
-    known = watchdog().bands.known
-    near = known.doubt(np.array([0.3, 0.0]), np.array([0.0]))
-    far = known.doubt(np.array([2.8, 2.5]), np.array([0.0]))
-    assert np.all(far > 10 * near)
 
 
 def test_what_cannot_be_calibrated_is_refused() -> None:

@@ -19,7 +19,7 @@ from deployed import (
     policy_of,
     self_test,
 )
-from sample_laws import reactor_in_plant_units, solved
+from sample_laws import solved
 from sb3_yann import Checks, Controller, LinearModel, LinearMPC, export
 from sb3_yann.deployment.code import insensitive
 from sb3_yann.deployment.controller import Status
@@ -138,18 +138,6 @@ def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_header_tells_plant_units(tmp_path):
-    for problem, shown in (
-        (solved("reactor"), ["T (K), 0 at rest", "U (kJ/(h m2 K)), -55 to 55"]),
-        (reactor_in_plant_units(), ["T (K), 475 at rest", "U (kJ/(h m2 K)), 0 to 110"]),
-    ):
-        export(problem.explicit(), tmp_path / "plant.c")
-        export(problem.explicit(), tmp_path / "plant.st")
-        for suffix in ("h", "st"):
-            text = (tmp_path / f"plant.{suffix}").read_text()
-            assert all(each in text for each in shown)
-
-
 def test_code_names_units_limits_and_the_time_of_a_step(tmp_path):
     units = {"units": {"level": "cm", "flow": "L/s"}, "time_unit": "min"}
     names = {"state_names": ["level"], "input_names": ["flow"], "x_ss": [12], "u_ss": [3]}
@@ -162,29 +150,6 @@ def test_code_names_units_limits_and_the_time_of_a_step(tmp_path):
             text = (tmp_path / file).read_text()
             assert "A step is 2 min." in text and "[0]  flow (L/s), 0 to 10" in text
             assert "obs[0]  level (cm), 12 at rest, good within 0 to 20" in text
-
-
-def test_steps_are_counted_by_what_they_found(tmp_path):
-    export(policy_of("reactor"), tmp_path / "plant.c")
-    (tmp_path / "main.c").write_text(
-        """#include <math.h>
-#include "plant.h"
-int main(void)
-{
-    plant_state s;
-    double obs[4] = {0.0, 0.0, 0.0, 0.0}, action[1];
-    plant_init(&s);
-    for (int k = 0; k < 5; k++) {
-        obs[1] = k < 2 ? (double)NAN : 0.0;
-        plant_step(&s, obs, k == 3 ? 9.0 : 1.0, PLANT_POLICY, 0, action);
-    }
-    return s.found[0] == 2 && s.found[1] == 0 && s.found[3] == 1 && s.steps == 5 ? 0 : 1;
-}
-"""
-    )
-    built = [COMPILERS[0], *STRICT, "main.c", "plant.c", "-lm", "-o", "main"]
-    subprocess.run(built, cwd=tmp_path, check=True)
-    assert subprocess.run([str(tmp_path / "main")]).returncode == 0
 
 
 HOSTILE_STEPS = os.environ.get("HOSTILE_STEPS")
@@ -254,7 +219,6 @@ int main(int argc, char **argv)
 
 
 def sanitizers(folder) -> list[str]:
-    """Return the flags of gcc's sanitizers; skip where it has none."""
     (folder / "one.c").write_text("int main(void) { return 0; }\n")
     flags = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     built = [COMPILERS[0], *flags, "one.c", "-o", "one"]

@@ -375,7 +375,6 @@ def heated() -> LinearMPC:
 
 
 def texts(folder: Path) -> str:
-    """Return all that files say, those in archives too."""
     found = []
     for path in folder.iterdir():
         if path.suffix in (".fmu", ".npz"):
@@ -415,8 +414,6 @@ def test_an_export_without_its_observer_is_refused_or_says_so(suffix, kind, tmp_
 
 
 class Silent(gym.Env):
-    """Spaces, and nothing else."""
-
     def __init__(self, observation_space: Any, action_space: Any) -> None:
         self.observation_space = observation_space
         self.action_space = action_space

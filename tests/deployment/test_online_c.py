@@ -1,6 +1,5 @@
 """Online laws as C: the same answers, within bounded steps, without memory of the heap."""
 
-import time
 from pathlib import Path
 from typing import Any
 
@@ -81,37 +80,16 @@ def test_the_self_test_passes_under_sanitizers_and_nothing_is_allocated(tmp_path
 
 @needs_compiler
 @pytest.mark.nightly
-def test_a_large_program_is_solved_as_by_daqp(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_large_program_is_solved_as_by_daqp(tmp_path: Path) -> None:
     mpc = problem(12, 3, 20)
     mpc.law("online")
     built = Compiled(mpc, tmp_path)
     program = mpc.condensed()
     theta = np.random.default_rng(3).uniform(mpc.theta_min, mpc.theta_max, (10_000, mpc.n_theta))
     theta = mpc.theta_ss + np.linspace(0.02, 1, 10_000)[:, None] * (theta - mpc.theta_ss)
-    own = []
-    daqp = []
-    worst = 0.0
-    active = 0
-    for row in theta:
-        began = time.perf_counter()
-        action = built.at(row[None])[0][0]
-        middle = time.perf_counter()
-        U = program.solve(row - mpc.theta_ss)
-        daqp.append(time.perf_counter() - middle)
-        own.append(middle - began)
-        wanted = U[:3] + mpc.model.u_ss
-        active += bool(np.any(np.abs(wanted) > 1 - 1e-9))
-        worst = max(worst, float(np.abs(action - wanted).max()))
-    with capsys.disabled():
-        print(
-            f"\n12 states, 3 inputs, N = 20, 10,000 points ({active} at bounds): largest "
-            f"difference {worst:.1e} half-ranges; C at worst {1e6 * max(own):.0f} us, median "
-            f"{1e6 * np.median(own):.0f} us; DAQP called from Python {1e6 * max(daqp):.0f} us, "
-            f"median {1e6 * np.median(daqp):.0f} us"
-        )
-    assert worst < 1e-8
+    wanted = np.array([program.solve(row - mpc.theta_ss)[:3] for row in theta]) + mpc.model.u_ss
+    assert np.any(np.abs(wanted) > 1 - 1e-9, axis=1).sum() > 1000  # at bounds
+    np.testing.assert_allclose(built.at(theta)[0], wanted, atol=1e-8, rtol=0)
 
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=f"no {', '.join(missing())}")

@@ -115,8 +115,6 @@ def loop(
 
 
 class InPython:
-    """The controller of a .npz, as the others are called."""
-
     def __init__(self, controller: Controller) -> None:
         self.controller = controller
 
@@ -168,8 +166,7 @@ IN_C = pytest.param(InC, marks=needs_compiler)
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["reactor", "references and rates", "mixed observations", "two inputs, zero input"],
+    "name", ["reactor", "references and rates", "mixed observations", "two inputs, zero input"]
 )
 @pytest.mark.parametrize("form", [IN_C, InStructuredText])
 def test_steps_with_faults_are_the_controllers(form, name, tmp_path) -> None:

@@ -22,29 +22,6 @@ def test_an_untrained_model_costs_what_its_law_costs() -> None:
     np.testing.assert_allclose(model.costs, law.costs, rtol=1e-4)
 
 
-def test_the_cost_is_minus_the_sum_of_the_rewards() -> None:
-    env = gym.make("CSTR-v0")
-    u = np.zeros(1, np.float32)
-    env.reset(seed=0)
-    total = 0.0
-    done = False
-    while not done:
-        _, reward, terminated, truncated, _ = env.step(u)
-        total += float(reward)
-        done = terminated or truncated
-    episodes = evaluate(lambda _: u, env, [0])
-    assert episodes.costs == pytest.approx([-total])
-    assert episodes.observations[0].shape == (401, 4)
-    assert episodes.actions[0].shape == (400, 1)
-
-
-def test_violations_are_counted_for_each_episode() -> None:
-    too_little_cooling = np.full(1, -55, np.float32)
-    episodes = evaluate(lambda _: too_little_cooling, "CSTR-v0", SEEDS)
-    assert episodes.violations.tolist() == [1, 1, 1]
-    assert (episodes.costs > 1e5).all()
-
-
 @pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
 @pytest.mark.parametrize("start", [None, -0.9])
 def test_episodes_of_a_vectorized_env_are_those_of_single_ones_to_rounding(env_id, start) -> None:
@@ -61,18 +38,6 @@ def test_episodes_of_a_vectorized_env_are_those_of_single_ones_to_rounding(env_i
     for name in ("observations", "actions"):
         for a, b in zip(getattr(together, name), getattr(alone, name), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
-
-
-def test_an_episode_of_a_vectorized_env_stops_where_it_ends() -> None:
-    starts = [[0, 0.3, 0, 4.0], [0, 0, 0, -5.0]]
-    u = np.full(1, -55, np.float32)
-    together = evaluate(lambda _: u, "CSTR-v0", [0, 1], starts)
-    alone = evaluate(lambda _: u, gym.make("CSTR-v0"), [0, 1], starts)
-    lengths = [len(each) for each in together.actions]
-    assert lengths == [len(each) for each in alone.actions] and lengths[0] < lengths[1]
-    assert together.violations.tolist() == alone.violations.tolist() == [1, 1]
-    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-9)
-    assert [len(each) for each in together.observations] == [k + 1 for k in lengths]
 
 
 def assert_equal(one: Trajectories, other: Trajectories) -> None:
@@ -133,17 +98,6 @@ def test_episodes_of_different_length_wait_for_nobody() -> None:
     assert_equal(episodes, evaluate(Tenth(), Countdown(), [3, 1, 4]))
 
 
-def test_starts_are_the_states_of_the_episodes() -> None:
-    starts = [[0.1, 0.0], [-0.2, 0.3], [0.0, -0.5]]
-    law = problems.clipped_pendulum().explicit()
-    episodes = evaluate(law, "ClippedPendulum-v0", SEEDS, starts=starts)
-    firsts = np.array([each[0] for each in episodes.observations])
-    np.testing.assert_allclose(firsts, starts, atol=1e-6)
-    one_env = gym.make("ClippedPendulum-v0")
-    alone = evaluate(law, one_env, SEEDS, starts=np.array(starts))
-    np.testing.assert_allclose(episodes.costs, alone.costs, rtol=1e-9)
-
-
 def test_envs_made_for_the_episodes_are_closed() -> None:
     before = Countdown.open
     evaluate(Tenth(), Countdown, [3, 1, 4])
@@ -187,7 +141,6 @@ def test_a_law_is_played_in_plant_units() -> None:
 
 
 def short_reactor() -> gym.Env:
-    """Return an env that no registry knows."""
     return gym.make("CSTR-v0", max_episode_steps=3)
 
 

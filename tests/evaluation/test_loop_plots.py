@@ -65,18 +65,6 @@ def test_of_many_episodes_the_median_and_a_band_are_drawn() -> None:
     np.testing.assert_allclose(spans, [high - low])
 
 
-def test_episodes_that_have_ended_count_no_more() -> None:
-    long = episodes(8)
-    short = episodes(8, steps=2)
-    both = Trajectories(
-        np.ones(16), np.zeros(16, int), (*long.observations, *short.observations),
-        (*long.actions, *short.actions), np.zeros(16, bool),
-    )  # fmt: skip
-    axes = plot_loop(tank(), {"MPC": both}, 0)
-    (median,) = (line for line in axes.lines if len(line.get_ydata()) == 6)
-    assert np.isfinite(median.get_ydata()).all()
-
-
 def test_limits_are_drawn_near_the_data_alone() -> None:
     axes = plot_loop(tank(x_max=13.2), {"MPC": episodes(4)}, "level")
     drawn = [line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1]
@@ -136,11 +124,6 @@ def test_gains_are_sorted_and_in_percent_of_the_first_one_s_mean() -> None:
     axes = plot_gains({"MPC": before, "policy": after})
     assert [bar.get_height() for bar in axes.patches] == [-75, -50, 50]
     assert axes.get_ylabel() == "policy minus MPC\n(% of MPC's mean cost)"
-
-
-def test_few_episodes_of_all_controllers_share_a_panel() -> None:
-    figure = loops_figure(tank(), {"before": episodes(2), "after": episodes(2)})
-    assert len(figure.axes) == 2
 
 
 def test_what_is_no_quantity_and_no_episodes_are_refused() -> None:

@@ -119,7 +119,6 @@ def test_the_report_does_without(missing, tmp_path) -> None:
 
 @pytest.fixture
 def catalog(monkeypatch, tmp_path):
-    """Offer experiments that take no time, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     outcomes = reactor(seeds=1)
     module = types.ModuleType("experiments.catalog")
@@ -288,17 +287,6 @@ def test_a_failing_run_is_reported_and_the_others_are_kept(results, capfd) -> No
 
     assert list(run_all(RUNS, counts, results, jobs=1, progress=False)) == RUNS
     assert done == [RUNS[1]]
-
-
-def test_the_longest_run_starts_first(results) -> None:
-    order = []
-
-    def notes(run: Run) -> Outcome:
-        order.append(run.seed)
-        return outcome(run)
-
-    run_all(RUNS, notes, results, jobs=1, progress=False)
-    assert order == [2, 1, 0]
 
 
 def test_an_interruption_leaves_what_is_finished(results) -> None:

@@ -35,6 +35,7 @@ from guard_samples import (
     verdicts,
     worse,
 )
+from sample_plants import Sampled
 from sb3_yann import (
     ImprovementGuard,
     LinearModel,
@@ -253,22 +254,15 @@ KINDS: dict[str, Any] = {
 }
 
 
-class Carriage(gym.Env[Any, Any]):
-    """A double integrator whose info says nothing."""
+class Carriage(Sampled):
+    """A double integrator whose info says nothing; it begins at rest."""
 
     observation_space = gym.spaces.Box(-20, 20, (2,), np.float64)
     action_space = gym.spaces.Box(-2, 2, (1,), np.float64)
+    starts = ([1.5, 0.0], [2.5, 0.0])
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """Begin at rest."""
-        super().reset(seed=seed)
-        self.x = np.array([self.np_random.uniform(1.5, 2.5), 0.0])
-        return self.x.copy(), {}
-
-    def step(self, action: Any) -> Any:
-        """Move."""
-        self.x = A @ self.x + B @ np.clip(action, -2, 2)
-        return self.x.copy(), 0.0, False, False, {}
+    def moved(self, u: Any) -> Any:
+        return A @ self.x + B @ np.clip(u, -2, 2)
 
 
 def carriage(kind: str) -> tuple[LinearMPC, Any]:

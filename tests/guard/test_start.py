@@ -146,15 +146,6 @@ def test_costs_of_the_mpc_that_differ_by_more_than_a_millionth_cannot_be_compare
         begun(partial(Wobbly, lost=1_000_003))
 
 
-def test_starts_that_are_all_the_same_are_told_and_one_alone_is_not() -> None:
-    same = partial(Slide, low=2.0, high=2.0)
-    with pytest.warns(
-        UserWarning, match="All 10 starts of the guard's env .* are one and the same"
-    ):
-        begun(same)
-    begun(same, n_eval_episodes=1)
-
-
 def test_a_fault_while_the_first_episodes_are_played_leaves_the_next_learn_a_clean_start() -> None:
     class Busy(Slide):
         calls = 0

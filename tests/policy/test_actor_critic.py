@@ -43,7 +43,6 @@ def test_actor_and_critic_are_those_of_sb3_with_yann_networks(algorithm, critic,
 
 
 def first_step(network) -> float:
-    """Return the length of Adam's first step, which is the learning rate itself."""
     before = [p.clone() for p in network.parameters()]
     for p in network.parameters():
         p.grad = th.ones_like(p)

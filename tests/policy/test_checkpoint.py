@@ -13,9 +13,6 @@ from stable_baselines3 import DDPG, PPO, SAC, TD3
 
 from guard_samples import RIGHT, build, correct, randomize
 from sb3_yann import retarget
-from sb3_yann.compare import Scores, Starts, Tolerance
-from sb3_yann.guard import state
-from sb3_yann.guard.state import Evidence
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 
 
@@ -52,28 +49,6 @@ def test_a_shrunk_correction_is_a_share_of_what_the_networks_add() -> None:
         ]
         assert len(changed) == 1
     assert whole.is_confined_as(before)
-
-
-def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(monkeypatch) -> None:
-    policy, mpc, _ = pair()
-    some = []
-    for value in (0.1, 0.2, 0.3, 0.4):
-        correct(policy, RIGHT, value)
-        some.append(ActorCheckpoint.of(policy))
-    scores = Scores(np.zeros(1), np.zeros((1, 9)), np.zeros((1, 3), bool))
-    evidence = Evidence(mpc, mpc, Starts((0,), scores, Tolerance(1.0)), scores, next_seed=1)
-    for each in (*some[:3], some[0], mpc):  # the MPC is always there
-        evidence = evidence.with_passed(each)
-    assert [*evidence.passed] == [some[1], some[2], some[0]]
-    evidence = evidence.without_passed(some[2])
-    assert [*evidence.passed] == [some[1], some[0]]
-    monkeypatch.setattr(state, "MAX_PASSED", 2)
-    evidence = evidence.with_passed(some[3])
-    assert [*evidence.passed] == [some[0], some[3]]
-    for room, left in ((2.0, 2), (1.99, 1), (0.1, 1)):
-        monkeypatch.setattr(state, "MAX_PASSED_BYTES", int(room * mpc.size))
-        found = evidence.with_passed(some[1]).with_passed(some[2])
-        assert [*found.passed] == [some[1], some[2]][-left:]
 
 
 # ---- Another MPC for a model, with what a shared network has learnt ----

@@ -29,6 +29,10 @@ EXPLORING = pytest.mark.parametrize("algorithm", [SAC, TQC, PPO])
 SMALL = {PPO: {"n_steps": 32, "batch_size": 16}}
 
 
+def short() -> gym.Env:
+    return gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)
+
+
 def build(algorithm, env=None, **policy_kwargs):
     if env is None:
         env = LinearPlant(scalar_mpc())
@@ -128,11 +132,9 @@ def test_it_learns_and_a_saved_model_goes_on(algorithm, tmp_path) -> None:
 def test_a_guard_keeps_what_is_no_worse_and_the_export_is_the_deterministic_policy(
     algorithm, tmp_path
 ) -> None:
-    env = gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)
-    model = build(algorithm, env, problem=scalar_mpc(), actor_lr_mult=1.0, critic_warmup=0)
-    make = lambda: gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)  # noqa: E731
+    model = build(algorithm, short(), problem=scalar_mpc(), actor_lr_mult=1.0, critic_warmup=0)
     callbacks = [
-        ImprovementGuard(make, n_eval_episodes=20, n_new_starts=5),
+        ImprovementGuard(short, n_eval_episodes=20, n_new_starts=5),
         ControlDiagnostics(),
         CostAudit(steps=20),
     ]
@@ -187,11 +189,10 @@ def test_exploring_without_a_guard_on_what_may_be_a_plant_warns_once(algorithm) 
 
 
 def test_a_guard_of_before_does_not_silence_that_nobody_confirms_now() -> None:
-    make = lambda: gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)  # noqa: E731
-    model = build(SAC, make(), problem=scalar_mpc(), simulator=False)
+    model = build(SAC, short(), problem=scalar_mpc(), simulator=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model.learn(32, callback=ImprovementGuard(make, n_eval_episodes=5, n_new_starts=2))
+        model.learn(32, callback=ImprovementGuard(short, n_eval_episodes=5, n_new_starts=2))
     with pytest.warns(UserWarning, match="That belongs into a simulator"):
         model.learn(8)
 

@@ -11,6 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
+from sample_plants import Sampled
 from sb3_yann import (
     AffineObservation,
     Controller,
@@ -33,6 +34,7 @@ from sb3_yann import (
     with_extra,
 )
 from sb3_yann._validation import Array
+from sb3_yann.evaluation import evaluate
 from sb3_yann.wrappers import EstimateState, MeasuredDisturbance, PreviousInput
 
 FEED = 280.0, 310.0
@@ -45,56 +47,41 @@ def tank(**options: Any) -> LinearMPC:
     return LinearMPC(model, Q=[[1]], R=[[0.1]], horizon=3, **limits, **options)
 
 
-class Tank(gym.Env[Array, Array]):
-    """The tank: its feed, 280 to 310, moves it, and is shown last."""
+class Tank(Sampled):
+    """The tank: its feed, 280 to 310, moves it, wanders, and is shown last."""
 
-    def __init__(self, effect: float = 0.02, steps: int = 25) -> None:
+    observation_space = spaces.Box(np.array([0, FEED[0]]), np.array([20, FEED[1]]), dtype=float)
+    action_space = spaces.Box(0.0, 6.0, (1,), np.float64)
+    starts = ([8, FEED[0]], [12, FEED[1]])
+    steps = 25
+
+    def __init__(self, effect: float = 0.02) -> None:
         self.effect = effect
-        self.steps = steps
-        self.observation_space = spaces.Box(
-            np.array([0, FEED[0]]), np.array([20, FEED[1]]), dtype=np.float64
-        )
-        self.action_space = spaces.Box(0.0, 6.0, (1,), np.float64)
 
-    def _shown(self) -> Array:
-        return np.array([self.x, self.feed])
+    def cost(self, u: Array) -> float:
+        return float((self.x[0] - 10) ** 2 + 0.1 * (u[0] - 3) ** 2)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start anywhere, with another feed."""
-        super().reset(seed=seed)
-        self.x = float(self.np_random.uniform(8, 12))
-        self.feed = float(self.np_random.uniform(*FEED))
-        self.k = 0
-        return self._shown(), {"disturbance": self.feed}
+    def moved(self, u: Array) -> Array:
+        level, feed = self.x
+        level = 10 + 0.8 * (level - 10) + 0.5 * (u[0] - 3) + self.effect * (feed - 295)
+        return np.clip([level, feed + self.np_random.normal()], [0, FEED[0]], [20, FEED[1]])
 
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Step the plant; the feed wanders."""
-        cost = (self.x - 10) ** 2 + 0.1 * (action[0] - 3) ** 2
-        moved = 0.8 * (self.x - 10) + 0.5 * (action[0] - 3) + self.effect * (self.feed - 295)
-        self.x = float(np.clip(10 + moved, 0, 20))
-        self.feed = float(np.clip(self.feed + self.np_random.normal(), *FEED))
-        self.k += 1
-        info = {"disturbance": self.feed}
-        return self._shown(), -cost, False, self.k == self.steps, info
+    def info(self) -> dict[str, Any]:
+        return {"disturbance": self.x[1]}
 
 
 def build(kind: Any = DDPG, env: Any = None, **options: Any) -> Any:
-    """Return a model that sees the feed."""
     given = {"problem": tank(), "extra": 1, **options}
     env = Tank() if env is None else env
     return kind("YannPolicy", env, policy_kwargs=given, device="cpu", seed=0)
 
 
 def observations(count: int = 200) -> Array:
-    """Return observations within and beyond the box of the feed."""
     rng = np.random.default_rng(0)
     return np.column_stack([rng.uniform(0, 20, count), rng.normal(295, 100, count)])
 
 
 def perturbed(model: Any, size: float = 0.3) -> Any:
-    """Return the model with weights that are no longer zero."""
     generator = th.Generator().manual_seed(1)
     with th.no_grad():
         for each in model.actor.mu.network.weights():
@@ -179,7 +166,6 @@ def test_bounds_are_kept_whatever_the_networks_make_of_a_signal() -> None:
 
 
 def test_signals_come_last_whatever_else_theta_holds() -> None:
-    """Behind the previous input and estimates, too; a map is of what comes before them."""
     slow = tank(rate=RateLimits(-1, 1))
 
     class Last(gym.ObservationWrapper[Array, Array, Array]):
@@ -240,7 +226,6 @@ def test_a_signal_that_is_lost_leaves_the_law() -> None:
 
 @pytest.mark.parametrize("suffix", [".npz", ".onnx"])
 def test_exports_take_the_signals_after_theta(suffix: str, tmp_path: Any) -> None:
-    """They are the policy, to rounding."""
     model = perturbed(build())
     path = tmp_path / f"controller{suffix}"
     export(model, path)
@@ -280,50 +265,20 @@ def test_improve_learns_what_a_signal_does(tmp_path: Any) -> None:
     Headroom is that of who knows it, the guard keeps what was learnt, the page names the signal.
     """
     mpc = with_extra(tank(), *FEED)
+    told = LinearModel([[0.8]], [[0.5]], dt=1.0, x_ss=[10], u_ss=[3], E=[[0.02]], d_ss=[295])
+    oracle = replace(tank(), model=told, disturbances=DisturbanceBounds(*FEED))
     model = build(problem=mpc, extra=0)
     found = improve(model, Tank, rounds=2, updates=1500)
-    assert found.accepted
-    costs = []
-    told = LinearModel([[0.8]], [[0.5]], dt=1.0, x_ss=[10], u_ss=[3], E=[[0.02]], d_ss=[295])
-    limits = {"x_min": 0, "x_max": 20, "u_min": 0, "u_max": 6}
-    load = DisturbanceBounds(*FEED)
-    oracle = LinearMPC(told, Q=[[1]], R=[[0.1]], horizon=3, disturbances=load, **limits)
-
-    def cost(act: Any) -> float:
-        total = 0.0
-        for seed in range(40):
-            env = Tank()
-            shown = env.reset(seed=seed)[0]
-            over = False
-            while not over:
-                u = act(shown)
-                total += (shown[0] - 10) ** 2 + 0.1 * (u[0] - 3) ** 2
-                shown, _, _, over, _ = env.step(u)
-        return total
-
-    law = mpc.law()
-    best = oracle.law()
-    log = []
-    for seed in range(100, 115):
-        env = Tank()
-        rng = np.random.default_rng(seed)
-        rows = [env.reset(seed=seed)[0]]
-        inputs = []
-        while len(inputs) < 25:
-            u = np.clip(law.plant_input(rows[-1]) + rng.uniform(-1, 1), 0, 6)
-            inputs.append(u)
-            rows.append(env.step(u)[0])
-        log.append((np.array(rows), np.array(inputs)))
-    twin = PlantTwin.fit(mpc, log, residuals=["linear"])
+    law = mpc.law().plant_input
+    rng = np.random.default_rng(100)
+    log = evaluate(lambda x: np.clip(law(x) + rng.uniform(-1, 1), 0, 6), Tank, range(100, 115))
+    twin = PlantTwin.fit(mpc, log.pairs, residuals=["linear"])
     learnt = improve(mpc, twin, rounds=2, n_starts=20, updates=1500)
-    assert learnt.accepted
-    base = cost(law.plant_input)
-    least = cost(best.plant_input)
-    for each in (found, learnt):
-        costs.append(cost(lambda shown, model=each.model: model.predict(shown)[0]))
+    assert found.accepted and learnt.accepted
+    acting = mpc.law(), oracle.law(), found.model, learnt.model
+    base, least, *costs = (evaluate(each, Tank, range(40)).costs.sum() for each in acting)
     assert least < 0.8 * base
-    for each in costs:
-        assert base - each > 0.5 * (base - least)
+    assert base - max(costs) > 0.5 * (base - least)
     room = headroom(mpc, Tank, n_starts=5)
     assert room.total > 0.2
     guard = ImprovementGuard(Tank, n_eval_episodes=10, n_new_starts=0, n_final_starts=10)
@@ -340,8 +295,6 @@ def test_an_observer_is_told_what_its_model_ignores() -> None:
     observer = DisturbanceObserver(mpc.model, state_noise=10, measurement_noise=10)
 
     class Hidden(gym.ObservationWrapper[Array, Array, Array]):
-        """Shows the level alone."""
-
         def __init__(self) -> None:
             super().__init__(Tank(effect=0.0))
             self.observation_space = spaces.Box(0.0, 20.0, (1,), np.float64)

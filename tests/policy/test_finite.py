@@ -76,7 +76,6 @@ def is_finite(model) -> bool:
 
 
 def told(learn, *args, **kwargs) -> list[str]:
-    """Return what is said of numbers that are not finite."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         learn(*args, **kwargs)

@@ -1,6 +1,5 @@
 """Policies of problems with each feature start exactly, with a critic that is theirs."""
 
-from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import DDPG, TD3
 
 from deployed import Compiled, disturbed, needs_compiler
-from general_problems import LOADED, solved
+from general_problems import solved
 from policy_samples import POLICIES, build, scalar_mpc, starts, updates, with_full_buffer
 from sample_plants import LinearPlant
 from sb3_yann import (
@@ -25,16 +24,9 @@ from sb3_yann import (
     YannPolicy,
     export,
 )
-from sb3_yann.control import DisturbanceObserver, OnlineLaw
+from sb3_yann.control import OnlineLaw
 from sb3_yann.control.mpc import linear_mpc
 from sb3_yann.networks import SharedYannLayer
-from sb3_yann.wrappers import (
-    MeasuredDisturbance,
-    ObserveDisturbance,
-    PreviousInput,
-    SetPoint,
-    StageCost,
-)
 from sparse_qp import FEATURES, draw
 from structured_text import FunctionBlock
 from weights import is_mpc
@@ -110,35 +102,6 @@ def test_a_critic_with_prices_learns_compiled_and_not() -> None:
             not th.equal(a, b) for a, b in zip(before, model.critic.parameters(), strict=True)
         )
     assert not model.policy.pin_equilibrium
-
-
-def test_wrappers_show_what_lies_ahead() -> None:
-    class Told(gym.Wrapper[Any, Any, Any, Any]):
-        steps = 0
-
-        def told(self) -> dict[str, Any]:
-            return {"disturbance": [[self.steps], [self.steps + 1]]}
-
-        def reset(self, **kwargs: Any) -> Any:
-            self.steps = 0
-            return self.env.reset(**kwargs)[0], self.told()
-
-        def step(self, action: Any) -> Any:
-            self.steps += 1
-            return (*self.env.step(action)[:4], self.told())
-
-    plant = Told(gym.make("CSTR-v0"))
-    env = SetPoint(plant, 0, 99, schedule=lambda step: 10 * step, preview=2)
-    both: Any = PreviousInput(MeasuredDisturbance(env, 0, 50, preview=1))
-    assert both.reset(seed=0)[0][4:].tolist() == [0, 10, 20, 0, 1, 0]
-    assert both.step(np.float32([0.5]))[0][4:].tolist() == [10, 20, 30, 1, 2, 0.5]
-
-    held: Any = SetPoint(gym.make("CSTR-v0"), 0, 1, hold=2, preview=3)
-    shown = [held.reset(seed=1)[0][4:]]
-    shown += [held.step(np.float32([0]))[0][4:] for _ in range(6)]
-    assert np.unique(shown).size == 5  # 10 samples, changed at each other one
-    for one, later in pairwise(shown):
-        assert one[1:].tolist() == later[:-1].tolist()
 
 
 @pytest.mark.slow
@@ -295,58 +258,6 @@ def test_networks_per_region_need_regions() -> None:
         build(policy_kwargs={"networks": "each"})
     with pytest.raises(ValueError, match="law = 'none' must be one of"):
         build(policy_kwargs={"law": "none"})
-
-
-def test_observations_that_are_sampled_again_are_not_solved_again() -> None:
-    model = with_full_buffer(law="online", critic_warmup=0)
-    solved = []
-    known = model.policy.problem.online().known
-    answers = known.function
-    updates(model, 50)  # of 100 transitions
-    known.function = lambda rows: solved.append(len(rows)) or answers(rows)
-    updates(model, 20)
-    assert sum(solved) < 0.05 * 20 * 2 * 16
-
-
-class LoadedPlant(gym.Env):
-    """The linear plant with a load that nobody measures; a plain regulator's observation."""
-
-    def __init__(self, load: float = 0.2) -> None:
-        self.load = np.array([load])
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-        self.action_space = gym.spaces.Box(np.float32([-1]), np.float32([2]))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = np.zeros(2)
-        return self.x.astype(np.float32), {}
-
-    def step(self, action):
-        self.x = LOADED.step(self.x, np.asarray(action, np.float64), self.load)
-        return self.x.astype(np.float32), 0.0, False, False, {}
-
-
-def wrapped(mpc: LinearMPC, reference: float = 0.5) -> gym.Env:
-    env = SetPoint(LoadedPlant(), [-1], [1], schedule=lambda step: [reference])
-    env = ObserveDisturbance(
-        env, DisturbanceObserver(LOADED), mpc.disturbances.d_min, mpc.disturbances.d_max
-    )
-    return StageCost(PreviousInput(env), mpc)
-
-
-def test_a_wrapped_plant_starts_as_offset_free_mpc_in_sb3() -> None:
-    mpc = solved("servo with all of it")
-    env = wrapped(mpc)
-    model = DDPG(YannPolicy, env, policy_kwargs={"problem": mpc})
-    theta, _ = env.reset(seed=0)
-    for _ in range(150):
-        action, _ = model.predict(theta)
-        error = np.abs(action - mpc.explicit()(theta)) / (mpc.u_max - mpc.u_min)
-        assert np.max(error) < 1e-5
-        theta, reward, *_ = env.step(action)
-    np.testing.assert_allclose(theta, [*mpc.steady_state([0.5], [0.2])[0], 0.5, 0.2, action[0]],
-                               atol=1e-5)  # fmt: skip
-    assert abs(reward) < 1e-9
 
 
 @pytest.mark.parametrize(

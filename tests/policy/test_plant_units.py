@@ -3,7 +3,7 @@
 import re
 import warnings
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import gymnasium as gym
@@ -18,7 +18,6 @@ import unit_samples as units
 from sb3_yann import (
     ControlDiagnostics,
     CostAudit,
-    ImprovementGuard,
     LinearModel,
     LinearMPC,
     NoActionNoise,
@@ -27,7 +26,6 @@ from sb3_yann import (
     YannPolicy,
 )
 from sb3_yann.commissioning.plant import Plant
-from sb3_yann.evaluation import evaluate
 from sb3_yann.wrappers import SetPoint, StageCost
 from sb3_yann_envs import problems
 
@@ -80,17 +78,6 @@ def test_cost_critic_and_logs_count_from_the_operating_point(shows: str, takes: 
     assert logged["yann/critic_error"] < 0.02
 
 
-@both
-def test_the_critic_is_the_value_of_the_law_in_any_units(shows: str, takes: str) -> None:
-    env = units.plant(shows, takes)
-    policy = build(env, units.SAYS[shows]).policy
-    x = units.states(50, seed=4, reach=0.01)
-    seen = th.as_tensor(env.unwrapped.shows(x))
-    q = policy.critic.q1_forward(seen, policy.actor(seen)).detach().numpy()[:, 0]
-    P = MPC.value_matrix(0.99)
-    np.testing.assert_allclose(q, -np.sum((x @ P) * x, axis=1), rtol=1e-4, atol=1e-9)
-
-
 @pytest.mark.parametrize(("shows", "takes"), [("plant", "plant"), ("normalized",) * 2])
 def test_a_model_that_is_loaded_reads_the_same(shows: str, takes: str, tmp_path: Any) -> None:
     env = units.plant(shows, takes)
@@ -111,16 +98,6 @@ def test_commissioning_plays_the_plant_in_its_units(shows: str, takes: str) -> N
     np.testing.assert_allclose(episode.actions, law, atol=1e-5)
     moved = MPC.deviations.predict(episode.thetas[:-1], episode.actions)
     np.testing.assert_allclose(episode.thetas[1:], moved, atol=1e-5)
-
-
-def test_the_guard_s_simulator_shows_what_the_plant_shows() -> None:
-    make = partial(units.plant, "plant", "plant")
-    model = build(make())
-    guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=4)
-    model.learn(100, callback=[NoActionNoise(), guard])
-    evidence = guard.state.evidence
-    expected = evaluate(MPC.explicit(), make, evidence.starts.seeds)
-    np.testing.assert_allclose(evidence.starts.mpc.costs, expected.costs, rtol=1e-5)
 
 
 def refused(env: Any, observation: Any = None, mpc: LinearMPC = MPC) -> str:

@@ -14,14 +14,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_yann
-from policy_samples import (
-    actions,
-    build,
-    make_policy,
-    scalar_mpc,
-    unbounded,
-)
-from sample_plants import LinearPlant
+from policy_samples import actions, build, make_policy, scalar_mpc, unbounded
+from sample_plants import LinearPlant, Sampled
 from sb3_yann import AffineObservation, LinearModel, LinearMPC, YannPolicy
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann_envs import problems
@@ -47,22 +41,14 @@ def test_spaces_that_do_not_fit_are_named(observation_space, action_space, error
         make_policy(observation_space, action_space, problem=scalar_mpc())
 
 
-class Heater(gym.Env):
+class Heater(Sampled):
     """A temperature about its steady state, heated with 0 to 10 V, of which 3 hold it."""
 
-    def __init__(self) -> None:
-        self.observation_space = unbounded()
-        self.action_space = spaces.Box(0, 10, (1,), np.float32)
+    observation_space = unbounded()
+    action_space = spaces.Box(0, 10, (1,), np.float32)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform(-1, 1, 1)
-        return self.x.astype(np.float32), {}
-
-    def step(self, action):
-        reward = -float(self.x @ self.x + 0.1 * (action - 3) @ (action - 3))
-        self.x = 0.9 * self.x + 0.2 * (np.asarray(action, np.float64) - 3)
-        return self.x.astype(np.float32), reward, False, False, {}
+    def moved(self, u):
+        return 0.9 * self.x + 0.2 * (u - 3)
 
 
 def heater_mpc(u_min: float, u_max: float) -> LinearMPC:

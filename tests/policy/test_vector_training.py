@@ -10,7 +10,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sample_plants import LinearPlant, two_input_mpc
+from sample_plants import LinearPlant, Sampled, two_input_mpc
 from sb3_yann import (
     ActionRepeat,
     AffineObservation,
@@ -38,7 +38,6 @@ def build(env, algorithm=DDPG, policy=None, **kwargs):
 
 
 def transitions(model, name: str) -> np.ndarray:
-    """Return what the replay buffer has stored so far, (steps, envs, ...)."""
     return getattr(model.replay_buffer, name)[: model.replay_buffer.pos]
 
 
@@ -157,22 +156,19 @@ def test_an_end_by_the_env_is_one_to_the_critic() -> None:
 # --- action repeat --------------------------------------------------------------------------------
 
 
-class Continuous(gym.Env):
+class Continuous(Sampled):
     """A cart, x'' = u, sampled every 0.02 s."""
 
     model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], 0.02)
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    starts = (-0.5, 0.5)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform(-0.5, 0.5, 2)
-        return self.x.astype(np.float32), {}
+    def cost(self, u):
+        return self.x @ self.x + 0.1 * u @ u
 
-    def step(self, action):
-        cost = float(self.x @ self.x + 0.1 * action @ action)
-        self.x = self.model.step(self.x, action)
-        return self.x.astype(np.float32), -cost, False, False, {}
+    def moved(self, u):
+        return self.model.step(self.x, u)
 
 
 def test_a_model_of_k_times_the_sampling_time_is_right_for_k_repetitions() -> None:
@@ -180,14 +176,7 @@ def test_a_model_of_k_times_the_sampling_time_is_right_for_k_repetitions() -> No
     dt = Continuous.model.dt
     model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], k * dt)
     mpc = LinearMPC(
-        model,
-        Q=k * np.eye(2),
-        R=[[k * 0.1]],
-        horizon=5,
-        x_min=-3,
-        x_max=3,
-        u_min=-1,
-        u_max=1,
+        model, Q=k * np.eye(2), R=[[k * 0.1]], horizon=5, x_min=-3, x_max=3, u_min=-1, u_max=1
     )
     learner = DDPG(
         YannPolicy,

@@ -81,13 +81,21 @@ OTHER = dataclasses.replace(MPC, Q=np.diag([1, 2, 3]), R=MPC.R / 2, terminal=Non
 LOW = MPC.u_min.astype(np.float32)
 HIGH = MPC.u_max.astype(np.float32)
 
-# What is done to the env, what it is taken for, what else is said.
-WRONG = {
-    "NormalizeReward": (
-        lambda: wrappers.NormalizeReward(plant()),
-        "unknown",
-        "step by step: weights, units",
+# What is done to the env; of those below also what it is taken for, and what else is said.
+UNKNOWN = {
+    "NormalizeReward": lambda: wrappers.NormalizeReward(plant()),
+    "ClipReward": lambda: wrappers.ClipReward(plant(), -1.0),
+    "DelayObservation by two": lambda: wrappers.DelayObservation(plant(), 2),
+    "StickyAction": lambda: wrappers.StickyAction(plant(), 0.3),
+    "ActionRepeat": lambda: ActionRepeat(plant(), 2),
+    "RescaleAction": lambda: wrappers.RescaleAction(with_other_inputs(), LOW, HIGH),
+    "RescaleObservation": lambda: wrappers.RescaleObservation(
+        boxed(), np.float32(-1), np.float32(1)
     ),
+    "other weights": lambda: plant(OTHER),
+}
+WRONG = {
+    **{kind: (make, "unknown", "step by step: weights, units") for kind, make in UNKNOWN.items()},
     "TransformReward: sign": (
         lambda: wrappers.TransformReward(plant(), lambda reward: -reward),
         "sign flipped",
@@ -113,32 +121,5 @@ WRONG = {
         "unknown",
         "R² = 0.9",
     ),
-    "ClipReward": (
-        lambda: wrappers.ClipReward(plant(), -1.0),
-        "unknown",
-        "step by step: weights, units",
-    ),
-    "DelayObservation by two": (
-        lambda: wrappers.DelayObservation(plant(), 2),
-        "unknown",
-        "step by step: weights, units",
-    ),
-    "StickyAction": (
-        lambda: wrappers.StickyAction(plant(), 0.3),
-        "unknown",
-        "step by step: weights, units",
-    ),
-    "ActionRepeat": (lambda: ActionRepeat(plant(), 2), "unknown", "step by step: weights, units"),
-    "RescaleAction": (
-        lambda: wrappers.RescaleAction(with_other_inputs(), LOW, HIGH),
-        "unknown",
-        "step by step: weights, units",
-    ),
-    "RescaleObservation": (
-        lambda: wrappers.RescaleObservation(boxed(), np.float32(-1), np.float32(1)),
-        "unknown",
-        "step by step: weights, units",
-    ),
     "the next state": (lambda: Changed(plant(), at_the_next_state), "next state", "c(s', u)"),
-    "other weights": (lambda: plant(OTHER), "unknown", "step by step: weights, units"),
 }

@@ -1,6 +1,7 @@
 """Linear plants with the problems they stand for, feasible states, and a record of an episode."""
 
 import dataclasses
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -52,28 +53,59 @@ class Settable(Plant):
         return super().reset(seed=seed)
 
 
-class LinearPlant(gym.Env):
+class Sampled(gym.Env[Any, Any]):
+    """A plant whose state x is drawn evenly at first; a subclass says how it is ``moved``.
+
+    It shows x, costs nothing and has no end, unless a subclass says otherwise.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    starts: tuple[Any, Any] = (-1.0, 1.0)
+    steps = 0
+    """Of an episode."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(*self.starts, self.observation_space.shape)
+        self.t = 0
+        return self.shown(), self.info()
+
+    def step(self, action):
+        u = np.asarray(action, np.float64)
+        cost = self.cost(u)
+        self.x = self.moved(u)
+        self.t += 1
+        return self.shown(), -float(cost), False, self.t == self.steps, self.info()
+
+    def info(self) -> dict[str, Any]:
+        return {}
+
+    def shown(self) -> np.ndarray:
+        return self.x.astype(self.observation_space.dtype)
+
+    def cost(self, u: np.ndarray) -> float:
+        return 0.0
+
+    def moved(self, u: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+
+class LinearPlant(Sampled):
     """The prediction model itself as the plant, with the cost of the MPC, in float64."""
 
     def __init__(self, mpc: LinearMPC, start: float = 1.0) -> None:
         self.mpc = mpc
-        self.start = start
-        n = mpc.n_theta
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (n,), np.float32)
+        self.starts = (-start, start)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (mpc.n_theta,), np.float32)
         self.action_space = gym.spaces.Box(
             mpc.u_min.astype(np.float32), mpc.u_max.astype(np.float32)
         )
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.start * self.np_random.uniform(-1, 1, self.mpc.n_theta)
-        return self.x.astype(np.float32), {}
+    def cost(self, u):
+        return self.mpc.stage_cost(self.x, u)
 
-    def step(self, action):
-        u = np.asarray(action, dtype=np.float64)
-        reward = -float(self.mpc.stage_cost(self.x, u))
-        self.x = self.mpc.predict(self.x, u)
-        return self.x.astype(np.float32), reward, False, False, {}
+    def moved(self, u):
+        return self.mpc.predict(self.x, u)
 
 
 def two_input_mpc(**changes) -> LinearMPC:

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sample_plants import Sampled
 from sb3_yann import (
     DisturbanceObserver,
     LinearModel,
@@ -34,31 +35,27 @@ def problem() -> LinearMPC:
     )  # fmt: skip
 
 
-class Cart(gym.Env[Any, Any]):
+class Cart(Sampled):
     """The plant: theta is observed, the reward is minus the stage cost."""
+
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    starts = ([-1.5, -0.5], [1.5, 0.5])
 
     def __init__(self, steps: int = 60) -> None:
         mpc = problem()
         low = np.float32(mpc.theta_min)
         high = np.float32(mpc.theta_max)
         self.observation_space = ProblemBox(low, high, problem=mpc)
-        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-        self.length = steps
+        self.steps = steps
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform([-1.5, -0.5], [1.5, 0.5])
-        self.t = 0
-        return self.x.astype(np.float32), {}
+    def cost(self, u):
+        return problem().stage_cost(self.x, np.clip(u, -1, 1))
 
-    def step(self, action):
-        u = np.clip(np.asarray(action, float), -1, 1)
-        cost = float(problem().stage_cost(self.x, u))
+    def moved(self, u):
         place, speed = self.x
         pull = 0.3 * place**2 - 0.8 * place
-        self.x = np.array([place + DT * speed, 0.9 * speed + DT * (2.0 * u[0] - pull)])
-        self.t += 1
-        return self.x.astype(np.float32), -cost, False, self.t >= self.length, {}
+        force = np.clip(u, -1, 1)[0]
+        return np.array([place + DT * speed, 0.9 * speed + DT * (2.0 * force - pull)])
 
 
 def log(episodes: int, noise: float = 0.0, first: int = 0, act: Any = None) -> list[Any]:

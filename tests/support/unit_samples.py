@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import TimeLimit
 
+from sample_plants import Sampled
 from sb3_yann import LinearModel, LinearMPC
 
 X_SS = np.array([350.0, 2.0])
@@ -29,32 +30,30 @@ SAYS = {"plant": None, "normalized": {"center": CENTER.tolist(), "scale": SCALE.
 TAKES = {"deviation": (-2.0, 5.0, 0.0), "plant": (38.0, 45.0, 40.0), "normalized": (-1, 1, None)}
 
 
-class OwnUnits(gym.Env):
+class OwnUnits(Sampled):
     """The model as a plant; it shows and takes what it is asked to."""
 
     def __init__(self, shows: str, takes: str, dtype: type = np.float64) -> None:
         self.shows = SHOWS[shows]
         self.takes = takes
-        self.dtype = dtype
         low, high, _ = TAKES[takes]
         self.action_space = gym.spaces.Box(dtype(low), dtype(high), (1,), dtype)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), dtype)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform(-1, 1, 2)
-        return self.shows(self.x).astype(self.dtype), {}
+    def shown(self) -> np.ndarray:
+        return self.shows(self.x).astype(self.observation_space.dtype)
 
     def input(self, action) -> np.ndarray:
         """Return the input in deviations."""
         action = np.asarray(action, np.float64)
         return 1.5 + 3.5 * action if self.takes == "normalized" else action - TAKES[self.takes][2]
 
-    def step(self, action):
+    def cost(self, action):
         u = self.input(action)
-        cost = self.x @ self.x + 0.1 * u @ u
-        self.x = MODEL.step(self.x, u)
-        return self.shows(self.x).astype(self.dtype), -float(cost), False, False, {}
+        return self.x @ self.x + 0.1 * u @ u
+
+    def moved(self, action):
+        return MODEL.step(self.x, self.input(action))
 
 
 def plant(shows: str, takes: str, dtype: type = np.float64) -> gym.Env:

@@ -9,7 +9,6 @@ from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import alignment
 from sb3_yann_envs import cstr, problems
-from twin_samples import log, problem
 
 GAINS = np.array([1.5, 0.7])
 SELECT = ["none", "linear"]
@@ -17,7 +16,6 @@ SELECT = ["none", "linear"]
 
 @cache
 def mpc() -> LinearMPC:
-    """Two coupled lags."""
     model = LinearModel([[0.9, 0.15], [0.0, 0.7]], [[0.1, 0.0], [0.05, 0.3]], 1.0)
     return LinearMPC(
         model, Q=np.diag([2.0, 1.0]), R=0.2 * np.eye(2), horizon=3, u_min=-1, u_max=1,
@@ -303,10 +301,3 @@ def test_the_input_of_an_mpc_in_a_closed_loop_is_not_its_own() -> None:
     rng = np.random.default_rng(0)
     dithered = [(x, np.clip(u + rng.normal(0, 10, u.shape), -55, 55)) for x, u in reactor()]
     assert PlantTwin.fit(problems.cstr(), dithered).trust.excitation > 0.02
-
-
-def test_an_episode_cut_in_two_is_one() -> None:
-    (x, u), *_ = log(1)
-    found = PlantTwin.fit(problem(), [(x[:31], u[:30]), (x[30:], u[30:])])
-    assert not found.trusted and "There is one episode" in found.report()
-    assert PlantTwin.fit(problem(), log(3)).trusted

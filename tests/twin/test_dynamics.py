@@ -6,7 +6,7 @@ import pytest
 from general_problems import solved
 from sb3_yann import DisturbanceBounds, LinearModel, LinearMPC, RateLimits, Tracking
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
-from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
+from sb3_yann.twin.log import Episode, as_episodes, without_copies
 from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import problem
 from twin_samples import random_episode as episode
@@ -118,43 +118,6 @@ def test_a_step_is_the_model_with_its_disturbance_and_the_residual_inside_the_bo
             np.testing.assert_allclose(after[member, i], expected, rtol=1e-10, atol=1e-10)
 
 
-def test_a_replay_takes_inputs_set_points_and_disturbances_of_the_log_and_nothing_else() -> None:
-    mpc = solved("servo with all of it")
-    dynamics, log = bent(mpc)
-    starts = np.array([0, 3, 7])
-    given = mpc.layout.constant
-    found = dynamics.replay(log, starts, 5)
-    assert found.shape == (2, 3, 6, 2)
-    for member in range(2):
-        for i, start in enumerate(starts):
-            theta = log.thetas[start].copy()
-            for k in range(6):
-                np.testing.assert_allclose(found[member, i, k], theta[:2], rtol=1e-10, atol=1e-12)
-                if k < 5:
-                    theta[given] = log.thetas[start + k, given]
-                    theta = stepped(dynamics, member, theta, log.actions[start + k])
-
-
-def test_in_a_closed_loop_the_logged_inputs_are_corrected_by_the_law() -> None:
-    mpc = solved("servo with all of it")
-    dynamics, log = bent(mpc)
-    law = mpc.explicit()
-    given = mpc.layout.constant
-    expected = np.zeros(2)
-    corrected = 0
-    for member in range(2):
-        theta = log.thetas[0].copy()
-        for k, logged in enumerate(log.actions):
-            theta[given] = log.thetas[k, given]
-            wanted = logged + law(theta) - law(log.thetas[k])
-            u = np.clip(wanted, mpc.u_min, mpc.u_max)
-            corrected += int(np.any(u != wanted))
-            expected[member] += mpc.stage_cost(theta, u)
-            theta = stepped(dynamics, member, theta, u)
-    assert corrected  # on a bound, at times
-    np.testing.assert_allclose(dynamics.replay_in_closed_loop(log), expected, rtol=1e-9)
-
-
 X = np.zeros((11, 2))
 U = np.full((10, 1), 0.1)
 HOLED = np.where(np.arange(11)[:, None] == 4, np.nan, X)
@@ -176,29 +139,6 @@ HOLED = np.where(np.arange(11)[:, None] == 4, np.nan, X)
 def test_what_is_no_log_is_refused_by_name(episodes, error, message) -> None:
     with pytest.raises(error, match=message):
         as_episodes(problem(), episodes)
-
-
-def test_the_parts_of_theta_come_from_beside_the_states_or_with_them() -> None:
-    model = LinearModel([[0.9]], [[1.0]], 1.0, E=[[0.5]])
-    mpc = LinearMPC(
-        model, Q=[[1]], R=[[1]], horizon=2, u_min=-1, u_max=1, theta_min=-5, theta_max=5,
-        tracking=Tracking([0], -1, 1), disturbances=DisturbanceBounds(-1, 1),
-        rate=RateLimits(-0.5, 0.5),
-    )  # fmt: skip
-    x = np.zeros((8, 1))
-    u = np.linspace(-0.3, 0.3, 7)[:, None]
-    rng = np.random.default_rng(0)
-    r = 0.5
-    d = rng.uniform(-1, 1, (8, 1))
-    (episode,) = as_episodes(mpc, [(x, u)], [r], [d], [[0.2]])
-    expected = np.column_stack([x, np.full(8, r), d, np.r_[0.2, u[:, 0]]])
-    np.testing.assert_array_equal(episode.thetas, expected)
-    (same,) = as_episodes(mpc, [(expected, u)])
-    np.testing.assert_array_equal(same.thetas, expected)
-    with pytest.raises(ValueError, match="theta holds 1 references: pass references="):
-        as_episodes(mpc, [(x, u)])
-    with pytest.raises(ValueError, match="references has 2 entries for 1 episodes"):
-        as_episodes(mpc, [(x, u)], [r, r], [d])
 
 
 @pytest.mark.parametrize("previous", [None, [[0.2]]])
@@ -287,26 +227,3 @@ def test_a_copy_is_left_out_and_what_differs_in_its_inputs_alone_is_not() -> Non
     assert [each is other for each, other in zip(kept, (given[4], given[1], given[3]), strict=True)]
     assert len(kept) == 3 and notes == ("Left out 2 copies of other episodes.",)
     assert without_copies(kept) == (kept, ())
-
-
-@pytest.mark.parametrize(
-    ("lengths", "least", "parts"),
-    [
-        ((60, 60), 5, [20, 20, 20] * 2),  # a piece has twenty steps at least
-        ((60, 60), 4, [30, 30] * 2),
-        ((200, 59, 19), 5, [100, 100, 29, 30, 19]),
-        ((200, 200), 40, [20] * 20),
-        ((60, 60, 60), 3, [60, 60, 60]),
-        ((60,), 5, [60]),
-    ],
-)  # fmt: skip
-def test_pieces_are_as_many_as_are_asked_for_and_none_is_too_short(lengths, least, parts) -> None:
-    rng = np.random.default_rng(0)
-    whole = tuple(
-        Episode(rng.uniform(-1, 1, (n + 1, 2)), rng.uniform(-1, 1, (n, 1))) for n in lengths
-    )
-    found = pieces(whole, least)
-    assert [len(each) for each in found] == parts
-    actions = np.concatenate([each.actions for each in found])
-    np.testing.assert_array_equal(actions, np.concatenate([each.actions for each in whole]))
-    assert all(len(each.thetas) == len(each) + 1 for each in found)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
+from sample_plants import Sampled
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import plant_twin
@@ -27,31 +28,28 @@ MPC = LinearMPC(
 )  # fmt: skip
 
 
-class Lagging(gym.Env[Any, Any]):
+class Lagging(Sampled):
     """A part of the gain behind a first-order actuator, and sensor noise."""
 
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+    starts = (-1.3, 1.3)
+    steps = 40
 
     def __init__(self, lag: float, gain: float, noise: float = 0.006) -> None:
         self.lag = lag
         self.gain = gain
         self.noise = noise
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform(-1.3, 1.3, 1)
-        self.u = np.zeros(1)
-        self.k = 0
-        return self.x + self.noise * self.np_random.normal(size=1), {}
+    def shown(self):
+        return self.x + self.noise * self.np_random.normal(size=1)
 
-    def step(self, action):
-        a = np.asarray(action, float)
-        self.k = self.k + 1
-        cost = float(MPC.stage_cost(self.x, a))
-        self.u = self.lag * self.u + (1 - self.lag) * a
-        self.x = 0.92 * self.x + 0.25 * self.gain * self.u
-        return self.x + self.noise * self.np_random.normal(size=1), -cost, False, self.k >= 40, {}
+    def cost(self, u):
+        return MPC.stage_cost(self.x, u)
+
+    def moved(self, u):
+        before = self.u if self.t else np.zeros(1)
+        self.u = self.lag * before + (1 - self.lag) * u
+        return 0.92 * self.x + 0.25 * self.gain * self.u
 
 
 def twin(plant: Lagging, episodes: int = 6) -> PlantTwin:
@@ -129,27 +127,26 @@ def motor() -> LinearMPC:
     )  # fmt: skip
 
 
-class Motor(gym.Env[Any, Any]):
+class Motor(Sampled):
     """The motor with dry friction. Its MPC's input is on a bound but near the target."""
+
+    action_space = gym.spaces.Box(-12, 12, (1,), np.float32)
+    starts = ([-3, -5], [3, 5])
+    steps = 100
 
     def __init__(self, mpc: LinearMPC) -> None:
         low = np.float32(mpc.theta_min)
         high = np.float32(mpc.theta_max)
         self.mpc = mpc
         self.observation_space = ProblemBox(low, high, problem=mpc)
-        self.action_space = gym.spaces.Box(-12, 12, (1,), np.float32)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform([-3, -5], [3, 5])
-        self.t = 0
-        return self.x.astype(np.float32), {}
+    def cost(self, u):
+        return self.mpc.stage_cost(self.x, u)
 
-    def step(self, action):
-        cost = float(self.mpc.stage_cost(self.x, np.asarray(action, float)))
+    def moved(self, u):
         place, speed = self.x
         for _ in range(10):
-            drive = 2.0 * float(action[0]) - 1.5 * speed
+            drive = 2.0 * float(u[0]) - 1.5 * speed
             if abs(speed) < 1e-3 and abs(drive) <= FRICTION:
                 speed = 0.0
             else:
@@ -157,9 +154,7 @@ class Motor(gym.Env[Any, Any]):
                 after = speed + DT / 10 * (drive - FRICTION * way)
                 speed = 0.0 if speed * after < 0 else after
             place += DT / 10 * speed
-        self.x = np.array([place, speed])
-        self.t += 1
-        return self.x.astype(np.float32), -cost, False, self.t >= 100, {}
+        return np.array([place, speed])
 
 
 def episodes(mpc: LinearMPC, act: Any, seeds: range) -> tuple[list[Any], np.ndarray]:

@@ -177,19 +177,6 @@ def test_of_one_record_what_is_lacking_are_rows_and_hours() -> None:
     assert more_of(unit, (*pieces, *log), 3) == more_of(unit, log, 3) == "3 episodes"
 
 
-@pytest.mark.parametrize(
-    ("ratio", "n", "problem", "advice"),
-    [(1.9, 5, "", ""), (2.1, 5, "", "worse than 'nothing moves'"), (2.1, 1, "one episode", "Log"),
-     (9.9, 5, "", "order of the columns"), (10.1, 5, "far worse than", "operating point")],
-)  # fmt: skip
-def test_a_model_of_another_plant_is_told_by_what_moves(ratio, n, problem, advice) -> None:
-    found = judged(runs([ratio * 0.3, 0.1]), standing=(0.3, 50.0), n_episodes=n)
-    assert problem in found[0] and advice in found[1]
-    assert bool(problem) == bool(found[0]) and bool(advice) == bool(found[1])
-    if ratio > 2 and n > 1:
-        assert f"({0.3 * ratio:.3g} against 0.3 standard deviations)" in " ".join(found)
-
-
 def test_the_edges_of_what_is_trusted() -> None:
     assert judged(runs(GOOD), beyond=(0.049, "x[0]")) == ("", "")
     assert "6 % of the logged x[0] lie beyond" in judged(runs(GOOD), beyond=(0.06, "x[0]"))[0]
@@ -240,24 +227,6 @@ def test_the_report_counts_what_it_leaves_out_and_says_what_the_log_does_not_sho
 def lines(axes: Axes) -> dict[str, np.ndarray]:
     """Return what is drawn, by its label or its colour."""
     return {str(each.get_label()): np.array(each.get_data()) for each in axes.lines}
-
-
-def test_the_picture_of_costs_has_a_band_of_a_quarter_of_the_mean() -> None:
-    predicted = np.array([8.0, 18.0, 1e6])
-    actual = np.array([10.0, 20.0, 30.0])
-    given = dataclasses.replace(twin().trust, predicted=predicted, actual=actual)
-    costs, runs = plot_twin(given)
-    drawn = lines(costs)
-    ends = np.array([8 - 0.08 * 22, 30 + 0.08 * 22])  # without the run that blew up
-    np.testing.assert_allclose(drawn["as predicted"], [ends, ends])
-    np.testing.assert_allclose(drawn["25 % of the mean off"], [ends, ends - 5])
-    (above,) = (each for each in costs.lines if str(each.get_label()).startswith("_"))
-    np.testing.assert_allclose(np.array(above.get_data()), [ends, ends + 5])
-    np.testing.assert_allclose(drawn["held-out episode"], [predicted, actual])
-    np.testing.assert_allclose([costs.get_xlim(), costs.get_ylim()], [ends, ends])
-    assert runs.get_xscale() == runs.get_yscale() == "log"
-    assert runs.get_xticks().tolist() == given.runs.horizons.tolist()
-    np.testing.assert_allclose(lines(runs)["nothing moves"], [given.runs.horizons, given.standing])
 
 
 def test_without_a_second_episode_the_pictures_are_empty() -> None:

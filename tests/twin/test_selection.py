@@ -119,15 +119,6 @@ def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() ->
         assert np.abs(x.mean() - r[0]) < 0.01 < np.abs(old[-10:, 0].mean() - r[0])
 
 
-def test_bounds_that_were_given_as_the_plant_shows_them_are_shown_so() -> None:
-    mpc = LinearMPC(
-        tank().model, Q=[[1.0]], R=[[0.1]], horizon=3, u_min=1, u_max=5, theta_min=2, theta_max=8,
-        tracking=Tracking([0], 4, 6),
-    )  # fmt: skip
-    found = PlantTwin.fit(mpc, worn_log(mpc)).reidentified()
-    assert "u_min=[1], u_max=[5], r_min=[4], r_max=[6]" in repr(found)
-
-
 def test_where_the_model_is_right_the_mpc_is_the_given_one() -> None:
     mpc = tank()
     assert PlantTwin.fit(mpc, worn_log(mpc, pump=0.1, leak=0.0)).reidentified() is mpc

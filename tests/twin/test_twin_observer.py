@@ -10,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sample_plants import Sampled
 from sb3_yann import (
     DisturbanceBounds,
     DisturbanceObserver,
@@ -24,12 +25,7 @@ from sb3_yann import (
 from sb3_yann._validation import Array
 from sb3_yann.plan import TwinPlant
 from sb3_yann.twin.dynamics import Dynamics
-from sb3_yann.twin.log import (
-    Episode,
-    EstimatedDisturbanceWarning,
-    observer_of,
-    warn_of_estimates,
-)
+from sb3_yann.twin.log import Episode, EstimatedDisturbanceWarning, observer_of, warn_of_estimates
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.wrappers import EstimateState, SetPoint
 from twin_samples import (
@@ -51,14 +47,12 @@ class Same(Cart):
         super().__init__()
         self.dynamics = dynamics
 
-    def step(self, action: Any) -> Any:
-        u = np.clip(np.asarray(action, float), -1, 1)
-        n = self.dynamics.problem.n_theta
-        row = self.dynamics.row.begin(np.array([*self.x, *np.zeros(n - 2)]))
-        after = self.dynamics.step(row[None, None], u[None, None])[0, 0]
-        self.x = after[self.dynamics.row.state]
-        self.t += 1
-        return self.x.astype(np.float32), 0.0, False, self.t >= self.length, {}
+    def moved(self, u: Any) -> Any:
+        row = self.dynamics.row
+        rest = np.zeros(self.dynamics.problem.n_theta - 2)
+        before = row.begin(np.array([*self.x, *rest]))
+        after = self.dynamics.step(before[None, None], np.clip(u, -1, 1)[None, None])
+        return after[0, 0, row.state]
 
 
 def test_the_twin_s_env_is_the_wrapped_plant_step_by_step() -> None:
@@ -167,7 +161,6 @@ def followed(steps: int, noise: float = 0.0, still: bool = False) -> Episode:
 
 
 def warned(*episodes: Episode) -> bool:
-    """Return whether the disturbances are said to be an observer's estimate."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         warn_of_estimates(offset_free_problem()[0], episodes)
@@ -274,32 +267,27 @@ BASE = LinearMPC(
 )
 
 
-class Valve(gym.Env[Array, Array]):
+class Valve(Sampled):
     """A level behind a valve that nobody measures: far open it opens less and less."""
 
     observation_space = spaces.Box(-9.0, 9.0, (1,), np.float64)
     action_space = spaces.Box(-2.0, 2.0, (1,), np.float64)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Begin near rest."""
-        super().reset(seed=seed)
+    def reset(self, **given: Any) -> tuple[Array, dict[str, Any]]:
+        super().reset(**given)
         self.x = self.np_random.uniform(-0.5, 0.5, 2)
-        self.load = float(self.np_random.uniform(-1, 1))
-        return self.x[1:].copy(), {"disturbance": self.load}
+        return self.shown(), {}
 
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Step the plant."""
+    def shown(self) -> Array:
+        return self.x[1:].copy()
+
+    def moved(self, u: Array) -> Array:
         valve, level = self.x
-        after = 0.7 * valve + 0.3 * float(action[0])
-        moved = 0.8 * level + 0.5 * np.tanh(0.9 * valve) + 0.0 * self.load
-        self.x = np.array([after, moved])
-        return self.x[1:].copy(), 0.0, False, False, {"disturbance": self.load}
+        after = 0.7 * valve + 0.3 * float(u[0])
+        return np.array([after, 0.8 * level + 0.5 * np.tanh(0.9 * valve)])
 
 
 def plant() -> gym.Env[Any, Any]:
-    """Return the plant with set-points."""
     return TimeLimit(SetPoint(Valve(), -1.5, 1.5, hold=20), 40)
 
 
@@ -307,7 +295,6 @@ MPC, ESTIMATOR = offset_free(BASE, d_max=1.0)
 
 
 def seen() -> gym.Env[Any, Any]:
-    """Return the plant as the policy sees it."""
     return EstimateState(plant(), ESTIMATOR, -1, 1)
 
 
@@ -331,7 +318,6 @@ def played(policy: Any, seed: int, push: float = 0.0) -> tuple[Array, Array, Arr
 
 
 def law(theta: Array) -> Array:
-    """Return the MPC's input."""
     return MPC.law().plant_input(np.asarray(theta, np.float64))
 
 
@@ -421,12 +407,10 @@ def test_a_policy_from_outputs_alone_is_no_worse_on_the_plant(hidden: Any) -> No
 
 
 def learnt(found: Any) -> Any:
-    """Return what was accepted as a function of theta."""
     return lambda theta: found.model.predict(theta)[0]
 
 
 def cost(policy: Any, seed: int) -> float:
-    """Return what an episode costs, by its true outputs."""
     thetas, outputs, inputs, _ = played(policy, seed)
     thetas[:, 1] = outputs
     return float(MPC.stage_cost(thetas[:-1], inputs).sum())

@@ -41,7 +41,6 @@ WEIGHTS: dict[str, Any] = {"Q": [[1]], "R": [[1]], "horizon": 3, "gamma": 0.99}
 
 
 def full() -> LinearMPC:
-    """Return an MPC whose theta has a set-point and the previous input."""
     return LinearMPC(
         TANK, **WEIGHTS, **BOX, tracking=Tracking([0], 340, 360), rate=RateLimits(-1, 1)
     )

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from general_problems import servo
-from sample_plants import LinearPlant, two_input_mpc
+from sample_plants import LinearPlant, Sampled, two_input_mpc
 from sb3_yann import (
     AffineObservation,
     DisturbanceBounds,
@@ -151,14 +151,6 @@ def test_the_estimate_takes_the_place_of_the_measurement() -> None:
     assert env.observer.d_hat[0] > 0.5
 
 
-def test_the_reward_is_minus_the_stage_cost_where_the_action_was_chosen() -> None:
-    mpc = two_input_mpc()
-    env = StageCost(LinearPlant(mpc), mpc)
-    theta, _ = env.reset(seed=0)
-    _, reward, *_ = env.step(np.array([0.3, 5.0]))
-    assert reward == pytest.approx(-float(mpc.stage_cost(theta, [0.3, 0.7])))
-
-
 def test_an_input_that_moves_faster_than_its_bounds_is_a_violation() -> None:
     mpc = servo(tracking=None, rate=RateLimits(-0.5, 0.7))
     env = StageCost(PreviousInput(LinearPlant(servo(tracking=None))), mpc)
@@ -291,24 +283,21 @@ def test_what_lies_on_a_bound_stays_inside_when_it_is_rounded(sign) -> None:
         assert sign * law([0, 0, shown[2]])[0] > 0.01
 
 
-class Loaded(gym.Env):
+class Loaded(Sampled):
     """A tank with a gain that its model does not know, a load that it reports, and a leak."""
 
     observation_space = gym.spaces.Box(-50, 50, (1,), np.float64)
     action_space = gym.spaces.Box(-30, 30, (1,), np.float64)
+    starts = (0.0, 0.0)
 
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = np.zeros(1)
-        self.k = 0
-        return self.x.copy(), {"disturbance": np.array([2.0])}
+    def load(self) -> float:
+        return 2.0 if self.t < 60 else -3.0
 
-    def step(self, u):
-        load = 2.0 if self.k < 60 else -3.0
-        self.k += 1
-        self.x = 0.8 * self.x + 0.25 * u + 0.1 * load - 0.7
-        told = 2.0 if self.k < 60 else -3.0
-        return self.x.copy(), 0.0, False, False, {"disturbance": np.array([told])}
+    def moved(self, u):
+        return 0.8 * self.x + 0.25 * u + 0.1 * self.load() - 0.7
+
+    def info(self):
+        return {"disturbance": np.array([self.load()])}
 
 
 def loaded(E, **given) -> LinearMPC:
@@ -372,28 +361,16 @@ MPC = LinearMPC(
 )  # fmt: skip
 
 
-class Reactor(gym.Env):
-    """The model, as a plant that shows temperatures and takes flows, and perhaps more."""
+class Reactor(Sampled):
+    """The model, as a plant that shows temperatures and takes flows."""
 
-    def __init__(self, extra: int = 0) -> None:
-        low = [300.0, 0.0, *[-1.0] * extra]
-        high = [400.0, 4.0, *[1.0] * extra]
-        self.observation_space = gym.spaces.Box(np.array(low), np.array(high), dtype=np.float64)
-        self.action_space = gym.spaces.Box(np.float32([8]), np.float32([15]))
-        self.extra = extra
+    observation_space = gym.spaces.Box(np.array([300.0, 0.0]), np.array([400.0, 4.0]), dtype=float)
+    action_space = gym.spaces.Box(np.float32([8]), np.float32([15]))
+    starts = ([355.0, 2.5], [355.0, 2.5])
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = X_SS + np.array([5.0, 0.5])
-        return self._show(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        self.x = X_SS + MODEL.step(self.x - X_SS, action - U_SS)
-        return self._show(), 0.0, False, False, {}
-
-    def _show(self) -> np.ndarray:
-        return np.r_[self.x, np.full(self.extra, 0.5)]
+    def moved(self, u):
+        assert self.action_space.contains(np.float32(u))
+        return X_SS + MODEL.step(self.x - X_SS, u - U_SS)
 
 
 def test_a_map_that_does_not_fit_is_named() -> None:

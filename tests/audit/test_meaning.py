@@ -1,12 +1,15 @@
-"""States that an env shows in another order than the model has are told, and nothing else is."""
+"""Other orders, units and signs of an env than the model's are told, and nothing else is."""
 
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
+from sample_plants import Sampled
 from sb3_yann import (
     CostAudit,
     ImprovementGuard,
@@ -29,40 +32,40 @@ MPC = LinearMPC(
 )
 
 
-class Shuffled(gym.Env):
+class Shuffled(Sampled):
     """The model, its states shown in some order, with noise of sensors and another gain."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+    starts = (-3, 3)
+    steps = 20
 
     def __init__(self, order: list[int], noise: float = 0.0, gain: float = 1.0) -> None:
         self.order = order
         self.noise = noise
         self.gain = gain
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform(-3, 3, 3)
-        self.t = 0
-        return self.shown(), {}
+    def cost(self, u):
+        return MPC.stage_cost(self.x, u)
 
-    def step(self, action):
-        cost = float(MPC.stage_cost(self.x, action))
-        self.x = MODEL.step(self.x, self.gain * action)
-        self.t += 1
-        return self.shown(), -cost, False, self.t == 20, {}
+    def moved(self, u):
+        return MODEL.step(self.x, self.gain * u)
 
     def shown(self) -> np.ndarray:
         return self.x[self.order] + self.noise * self.np_random.normal(size=3)
 
 
+def said(run: Callable[[], object], words: str = "") -> list[str]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        run()
+    return [str(each.message) for each in found if words in str(each.message)]
+
+
 def told(env: gym.Env, mpc: LinearMPC = MPC, episodes: int = 3) -> list[str]:
     played = rollout(of_law(mpc), lambda: env, [0], problem=mpc)
     steps = [np.concatenate([part] * episodes) for part in played.steps()]
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        warn_of_order(mpc, *steps)
-    return [str(each.message) for each in found]
+    return said(lambda: warn_of_order(mpc, *steps))
 
 
 @pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0], [1, 2, 0], [2, 0, 1]])
@@ -87,29 +90,26 @@ IN_PLANT_UNITS = LinearMPC(
 )
 
 
-class Tanks(gym.Env):
+class Tanks(Sampled):
     """The model, which shows its states as somebody writes them down."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
     action_space = gym.spaces.Box(0, 10, (1,), np.float32)
+    starts = ([8, 325], [16, 335])
+    steps = 20
 
     def __init__(self, shown) -> None:
-        self.shown = shown
+        self.shows = shown
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = self.np_random.uniform([8, 325], [16, 335])
-        self.t = 0
-        return self.shown(self.x), {}
+    def shown(self) -> np.ndarray:
+        return self.shows(self.x)
 
-    def step(self, action):
-        self.x = TANKS.x_ss + TANKS.A @ (self.x - TANKS.x_ss) + TANKS.B @ (action - TANKS.u_ss)
-        self.t += 1
-        return self.shown(self.x), 0.0, False, self.t == 20, {}
+    def moved(self, u):
+        return TANKS.x_ss + TANKS.A @ (self.x - TANKS.x_ss) + TANKS.B @ (u - TANKS.u_ss)
 
 
-def guarded(make) -> None:
-    options = {"problem": IN_PLANT_UNITS}
+def guarded(mpc: LinearMPC, make: Callable[[], gym.Env]) -> None:
+    options = {"problem": mpc}
     model = DDPG("YannPolicy", make(), policy_kwargs=options, seed=0, learning_starts=10**6)
     guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=2, n_final_starts=2)
     model.learn(20, callback=[NoActionNoise(), guard])
@@ -128,11 +128,11 @@ def guarded(make) -> None:
     ],
 )
 def test_a_guard_tells_other_units_of_an_env(shown, words: str) -> None:
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        guarded(lambda: StageCost(Tanks(shown), IN_PLANT_UNITS))
-    told = [str(each.message) for each in found if "seems to show" in str(each.message)]
-    assert len(told) == bool(words) and all(words in each for each in told)
+    def run() -> None:
+        guarded(IN_PLANT_UNITS, lambda: StageCost(Tanks(shown), IN_PLANT_UNITS))
+
+    found = said(run, "seems to show")
+    assert len(found) == bool(words) and all(words in each for each in found)
 
 
 @pytest.mark.parametrize("factor", [1, 100])
@@ -189,13 +189,6 @@ def test_the_built_in_plants_show_theirs(name: str) -> None:
     assert not told(gym.make(name), made[name]())
 
 
-def test_headroom_tells_it_and_points_to_the_call() -> None:
-    with pytest.warns(UserWarning) as found:
-        headroom(MPC, Shuffled([1, 0, 2]), n_starts=2)
-    (order,) = [each for each in found if "in the order" in str(each.message)]
-    assert order.filename == __file__
-
-
 def test_states_that_begin_beyond_the_box_are_named() -> None:
     mpc = problems.cstr()
     theta = np.zeros((10, mpc.n_theta))
@@ -203,3 +196,64 @@ def test_states_that_begin_beyond_the_box_are_named() -> None:
     theta[:6, 3] += 273.15
     with pytest.warns(UserWarning, match=r"T reads beyond theta's box, .* 60% of .* another unit"):
         warn_of_box(mpc, theta)
+
+
+# ---- Inputs that move the env against the model ----
+
+COUPLED = LinearModel(
+    [[0.9, 0.2], [0.0, 0.7]], [[0.3, 0.0], [0.1, 0.5]], dt=1.0, input_names=["valve", "heater"]
+)
+STEERED = LinearMPC(
+    COUPLED, Q=np.eye(2), R=np.eye(2), horizon=2, theta_min=-4, theta_max=4, u_min=-1, u_max=1
+)
+
+
+class Plant(Sampled):
+    """The model with other gains, a noise that the seed repeats, and a curve."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    starts = (-3, 3)
+    steps = 12
+
+    def __init__(self, gains: Any, late: bool = False) -> None:
+        self.gains = np.array(gains)
+        self.late = late
+
+    def moved(self, u: Any) -> Any:
+        before = self.before if self.t else np.zeros(2)
+        self.before = u
+        acts = self.gains * (before if self.late else u)
+        noise = 0.3 * self.np_random.normal(size=2)
+        return COUPLED.step(self.x, acts) - 0.1 * self.x**3 / 9 + noise
+
+
+def against(run: Callable[[], object]) -> list[str]:
+    return said(run, "against the sign")
+
+
+def of_signs(plant: Callable[[], Plant]) -> list[str]:
+    return against(lambda: guarded(STEERED, lambda: StageCost(plant(), STEERED)))
+
+
+@pytest.mark.parametrize("gains", [(1, -0.6), (-2, 1)])
+def test_a_guard_names_an_input_of_the_other_sign(gains: Any) -> None:
+    (message,) = of_signs(lambda: Plant(gains))
+    name = ["valve", "heater"][int(np.argmin(gains))]
+    assert message.startswith(f"{name} moves the env against the sign of the model's B: ")
+    assert f"{min(gains):.2g} times as far in a step, from 4 starts" in message
+
+
+@pytest.mark.parametrize("plant", [{"gains": (3, 0.2)}, {"gains": (1, 1), "late": True}])
+def test_another_gain_and_dead_time_are_no_other_sign(plant: Any) -> None:
+    assert not of_signs(lambda: Plant(**plant))
+
+
+def test_headroom_tells_it_too() -> None:
+    assert len(against(lambda: headroom(STEERED, lambda: Plant((-1, -1)), n_starts=3))) == 2
+
+
+def test_a_plant_that_is_not_linear_has_the_signs_of_its_model() -> None:
+    model = DDPG("YannPolicy", "ClippedPendulum-v0", seed=0, learning_starts=10**6)
+    guard = ImprovementGuard("ClippedPendulum-v0", n_eval_episodes=6, n_final_starts=2)
+    assert not against(lambda: model.learn(20, callback=[NoActionNoise(), guard]))
