@@ -43,7 +43,7 @@ def build(env: Any, observation: Any = None, mpc: LinearMPC = MPC, **kwargs: Any
 def error(model: Any, env: Any, x: np.ndarray) -> float:
     """Return how far `predict` is from the law on the plant, as a fraction of the input range."""
     plain = env.unwrapped
-    actions, _ = model.predict(plain.shows(x).astype(plain.dtype))
+    actions, _ = model.predict(plain.shows(x).astype(plain.observation_space.dtype))
     return float(np.max(np.abs(plain.input(actions) - MPC.explicit()(x)))) / 7
 
 
