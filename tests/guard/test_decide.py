@@ -52,7 +52,7 @@ class OftenRight(Slide):
         self.indifferent = seed == FIRST
         left = seed is not None and seed >= self.after and seed % self.left_of == 0
         left |= self.indifferent
-        self.starts = (-4.0, -2.0) if left else (2.0, 4.0)
+        self.low, self.high = (-4.0, -2.0) if left else (2.0, 4.0)
         return super().reset(seed=seed, options=options)
 
     def step(self, action):
@@ -268,7 +268,7 @@ class LateLosses(Slide):
         self.left = late and seed % 5 < 2
         self.touchy = late and seed % 5 == 2
         self.indifferent = seed == FIRST  # a known start on the left, where all inputs cost alike
-        self.starts = (-4.0, -2.0) if self.left or self.indifferent else (2.0, 4.0)
+        self.low, self.high = (-4.0, -2.0) if self.left or self.indifferent else (2.0, 4.0)
         return super().reset(seed=seed, options=options)
 
     def step(self, action):

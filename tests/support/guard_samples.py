@@ -11,7 +11,6 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from sample_plants import Sampled
 from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
 from weights import last_layer
 
@@ -24,8 +23,16 @@ FIRST = 1_000_000
 
 def slide_mpc() -> LinearMPC:
     """Three regions: the input is saturated to the left and to the right of |x| = about 1.4."""
-    bounds = {"u_min": -1, "u_max": 1, "theta_min": -5, "theta_max": 5}
-    return LinearMPC(LinearModel([[1.1]], [[1]], 1), Q=[[1]], R=[[1]], horizon=1, **bounds)
+    return LinearMPC(
+        LinearModel([[1.1]], [[1]], 1),
+        Q=[[1]],
+        R=[[1]],
+        horizon=1,
+        u_min=-1,
+        u_max=1,
+        theta_min=-5,
+        theta_max=5,
+    )
 
 
 MPC = slide_mpc()
@@ -34,37 +41,40 @@ _SIDES = [int(LAW.locate(np.array([x]))) for x in (-4.0, 0.0, 4.0)]
 REGION = dict(zip((LEFT, CENTER, RIGHT), _SIDES, strict=True))
 
 
-class Slide(Sampled):
+class Slide(gym.Env):
     """x halves at each step whatever the input is; a step costs 1 + (u - best input)^2.
 
     The best input is half the MPC's where that is saturated, and the MPC's own near the origin.
     A step with ``u`` beyond the limits given is a violation. Starts are uniform in [low, high].
     """
 
-    observation_space = gym.spaces.Box(-5, 5, (1,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    steps = STEPS
-    played = 0
-
     def __init__(
         self, limits: tuple[float, float] = (-1.1, 1.1), low: float = -4.0, high: float = 4.0
     ) -> None:
         self.limits = limits
-        self.starts = (low, high)
+        self.low = low
+        self.high = high
+        self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float32)
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+        self.played = 0
 
-    def cost(self, u):
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(self.low, self.high, 1)
+        self.t = 0
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        u = float(np.asarray(action)[0])
         if np.isnan(u):
             raise ValueError("nan is not an input")
         best = float(LAW(self.x)[0])
-        return 1 + float(u[0] - (best / 2 if abs(best) > 0.999 else best)) ** 2
-
-    def moved(self, u):
-        self.violates = not self.limits[0] <= u[0] <= self.limits[1]
+        cost = 1 + (u - (best / 2 if abs(best) > 0.999 else best)) ** 2
+        info = {"violation": not self.limits[0] <= u <= self.limits[1]}
+        self.x = self.x / 2
+        self.t += 1
         self.played += 1
-        return self.x / 2
-
-    def info(self):
-        return {"violation": self.violates} if self.t else {}
+        return self.x.astype(np.float32), -cost, False, self.t == STEPS, info
 
 
 class CutOff(Slide):
