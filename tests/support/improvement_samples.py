@@ -45,12 +45,8 @@ class Spring(Cart):
         pull = self.stiffness * place + 0.2 * place**2 + 0.3 * place**3
         return place + DT * speed, 0.9 * speed + DT * (2.0 * u - pull)
 
-    def step(self, action: Any) -> Any:
-        u = np.clip(np.asarray(action, float), -1, 1)
-        cost = float(problem().stage_cost(self.x, u))
-        self.x = np.array(self.after(*self.x, float(u[0])))
-        self.t += 1
-        return self.x.astype(np.float32), -cost, False, self.t >= self.length, {}
+    def moved(self, u: np.ndarray) -> np.ndarray:
+        return np.array(self.after(*self.x, float(np.clip(u, -1, 1)[0])))
 
 
 class Plain(Spring):
