@@ -152,13 +152,13 @@ class Teacher:
                 self._keep(key, *taught, lambda near: self.law(near.reshape(-1, near.shape[-1])))
 
     def _sharp(self, plan: Plans, t: int) -> float:
-        """Return how much it costs to do otherwise at a step of a plan; NaN where plants are alike.
+        """Return how much it costs to do otherwise at a step of a plan, where plants differ.
 
         What is best for each of several plants is not known from theta: their mean, so weighted, is
         best for all of them.
         """
         if not isinstance(self.scenarios.model, ModelOfEach) or plan.curvatures is None:
-            return np.nan
+            return 1.0
         half = self.problem.u_half
         return float(half**2 @ np.diag(plan.curvatures[t, 0]))
 
@@ -202,10 +202,8 @@ class Teacher:
         weighed = [each for key, each in self.taught.items() for _ in range(self.weights[key[0]])]
         shown = zip(*self.earlier, *weighed, strict=True)
         thetas, inputs, counts = map(np.concatenate, shown)
-        weights = None
-        if np.isfinite(counts).any():
-            counts = np.nan_to_num(counts / np.nanmedian(counts), nan=1.0)
-            weights = np.clip(counts, 1 / WEIGHED, WEIGHED)
+        typical = np.median(counts[np.isfinite(counts)]) if np.isfinite(counts).any() else 1.0
+        weights = np.clip(np.nan_to_num(counts / typical, nan=1.0), 1 / WEIGHED, WEIGHED)
         fit_layer(layer, self.problem, thetas, inputs, self.rng, updates, weights)
 
     def hardest(self, played: Imagined) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
@@ -315,21 +313,18 @@ def fit_layer(
     wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
     to = th.as_tensor(wanted[finite], dtype=th.float32)
-    weight = None
-    if weights is not None:
-        weight = th.as_tensor(weights[finite, None] / weights.mean(), dtype=th.float32)
+    counts = np.ones(len(rows)) if weights is None else weights
+    weight = th.as_tensor(counts[finite, None] / counts.mean(), dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
     for k in bar("the policy learns from plans: steps of Adam", range(updates if len(at) else 0)):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()
-        kind_of_mean = "mean" if weight is None else "none"
-        loss = th.nn.functional.smooth_l1_loss(
-            layer(at[chosen]), to[chosen], beta=HUBER, reduction=kind_of_mean
+        errors = th.nn.functional.smooth_l1_loss(
+            layer(at[chosen]), to[chosen], beta=HUBER, reduction="none"
         )
-        if weight is not None:
-            loss = (weight[chosen] * loss).mean()
+        loss = (weight[chosen] * errors).mean()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     optimizer.zero_grad()
