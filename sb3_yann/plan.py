@@ -224,8 +224,7 @@ class Plans:
     """Trajectories of k starts, with feedback and costs, which hold what is beyond bounds.
 
     thetas (T + 1, k, n_theta), inputs (T, k, m), gains (T, k, m, n_theta). ``turn`` (n_theta,) is a
-    full turn for each entry that is an angle and jumps by it, 0 for the others. ``curvatures`` (T,
-    k, m, m) are those of the cost to go by the input, where they are known.
+    full turn for each entry that is an angle and jumps by it, 0 for the others.
     """
 
     thetas: Array
@@ -233,7 +232,6 @@ class Plans:
     gains: Array
     costs: Array
     turn: Array | None = None
-    curvatures: Array | None = None
 
     def of(self, chosen: Rows | Mask) -> Plans:
         """Return some of the starts."""
@@ -243,7 +241,6 @@ class Plans:
             self.gains[:, chosen],
             self.costs[chosen],
             self.turn,
-            None if self.curvatures is None else self.curvatures[:, chosen],
         )
 
 
@@ -288,8 +285,8 @@ def planned(
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
     plans = improved(plant, task, hard, rows, SWEEPS)
     # The last search may have been damped, and its feedback with it.
-    _, gains, curvatures = _backward(plant, task, plans, rows, np.zeros(len(rows)))
-    return dataclasses.replace(plans, gains=gains, curvatures=curvatures)
+    _, gains = _backward(plant, task, plans, rows, np.zeros(len(rows)))
+    return dataclasses.replace(plans, gains=gains)
 
 
 def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
@@ -306,7 +303,7 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
     failed: Rows = np.zeros(k, dtype=np.intp)
     for _ in bar(f"{k} plans: rounds, at most", range(rounds)):
         old = plans.of(active)
-        corrections, gains, _ = _backward(plant, task, old, rows[active], damping[active])
+        corrections, gains = _backward(plant, task, old, rows[active], damping[active])
         plans.gains[:, active] = gains
         waiting: Rows = np.arange(len(active))
         for size in SIZES:
@@ -338,8 +335,8 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
 
 def _backward(
     plant: TwinPlant, task: Task, plans: Plans, rows: Rows, damping: Array
-) -> tuple[Array, Array, Array]:
-    """Return corrections (T, k, m), gains (T, k, m, n_theta) and curvatures (T, k, m, m)."""
+) -> tuple[Array, Array]:
+    """Return corrections (T, k, m) and gains (T, k, m, n_theta)."""
     problem = task.problem
     thetas = plans.thetas
     inputs = plans.inputs
@@ -366,7 +363,6 @@ def _backward(
     V = np.tile(2 * task.end, (len(rows), 1, 1))
     corrections = np.empty_like(inputs)
     gains = np.empty_like(plans.gains)
-    curvatures = np.empty((*inputs.shape, inputs.shape[-1]))
     damped = damping[:, None, None] * W[size:, size:]
     for t in reversed(range(len(inputs))):
         v[:, states] += gradient[t]
@@ -388,8 +384,7 @@ def _backward(
         V = (V + V.swapaxes(1, 2)) / 2
         corrections[t] = move
         gains[t] = K
-        curvatures[t] = Huu
-    return corrections, gains, curvatures
+    return corrections, gains
 
 
 def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:

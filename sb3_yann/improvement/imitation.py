@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback, Mask
 from sb3_yann.compare import RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
-from sb3_yann.improvement.simulator import Imagined, ModelOfEach, Scenarios, of_law, task_of
+from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.plan import PAUSE, Planning, Plans, follow
@@ -31,7 +31,6 @@ HUBER = 0.1
 """Errors of an action, in half-ranges, from which they count by their size rather than its square:
 where plans go one way or the other, their mean goes nowhere. Labels on a bound lie as far beyond
 it, so that the slope does not vanish on the way."""
-WEIGHED = 30.0  # times as much as a typical row one may count, or as little
 VAIN_FITS = 3  # fits in a row that may bring no policy that is better by half of `NEAR`
 FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
 HARDEST = 40  # scenarios that are planned anew after a fit or a check, at most
@@ -76,9 +75,8 @@ class Teacher:
         finite = self.mpc.costs[np.isfinite(self.mpc.costs)]
         unit = max(float(np.median(np.abs(finite))) / self.steps, 1e-300) if len(finite) else 1.0
         self.task = task_of(model, unit, priced=scenarios.members is None)
-        # Theta, inputs, and how much each row counts: of others, and by scenario and first step.
-        self.earlier: list[tuple[Array, Array, Array]] = []
-        self.taught: dict[tuple[int, int], tuple[Array, Array, Array]] = {}
+        self.earlier: list[tuple[Array, Array]] = []  # theta and inputs that others have shown
+        self.taught: dict[tuple[int, int], tuple[Array, Array]] = {}  # by scenario and first step
         self.weights: NDArray[np.int64] = np.ones(len(scenarios), dtype=np.int64)
 
     @property
@@ -145,31 +143,12 @@ class Teacher:
                     each = enumerate(zip(acting, near, strict=True))
                     return np.array([follow(plan, t - at, x) for t, ((at, plan, _), x) in each])
 
-                counts = [self._sharp(plan, t - at) for t, (at, plan, _) in enumerate(acting)]
-                self._keep(key, shown.thetas[:-1, i], shown.inputs[:, i], answers, counts)
+                self._keep(key, shown.thetas[:-1, i], shown.inputs[:, i], answers)
             elif not begins[i]:
                 taught = mpc.thetas[:-1, i], mpc.inputs[:, i]
                 self._keep(key, *taught, lambda near: self.law(near.reshape(-1, near.shape[-1])))
 
-    def _sharp(self, plan: Plans, t: int) -> float:
-        """Return how much it costs to do otherwise at a step of a plan, where plants differ.
-
-        What is best for each of several plants is not known from theta: their mean, so weighted, is
-        best for all of them.
-        """
-        if not isinstance(self.scenarios.model, ModelOfEach) or plan.curvatures is None:
-            return 1.0
-        half = self.problem.u_half
-        return float(half**2 @ np.diag(plan.curvatures[t, 0]))
-
-    def _keep(
-        self,
-        key: tuple[int, int],
-        thetas: Array,
-        inputs: Array,
-        answers: Feedback,
-        counts: Sequence[float] | None = None,
-    ) -> None:
+    def _keep(self, key: tuple[int, int], thetas: Array, inputs: Array, answers: Feedback) -> None:
         """Keep inputs (T, m) at thetas (T, n_theta), and the answers to states near each."""
         near = np.repeat(thetas[:, None], NEARBY, axis=1)
         states = near[..., self.problem.layout.state]
@@ -177,12 +156,7 @@ class Teacher:
         rows = near.reshape(-1, near.shape[-1])
         answered = np.clip(answers(near).reshape(len(rows), -1), *self.task.limits(rows))
         self.scenarios.model.dynamics.coordinates.wrap(rows)
-        count = np.full(len(inputs), np.nan) if counts is None else np.array(counts)
-        self.taught[key] = (
-            np.concatenate([thetas, rows]),
-            np.concatenate([inputs, answered]),
-            np.concatenate([count, np.repeat(count, NEARBY)]),
-        )
+        self.taught[key] = np.concatenate([thetas, rows]), np.concatenate([inputs, answered])
 
     @property
     def attainable(self) -> Array:
@@ -201,10 +175,8 @@ class Teacher:
         """Fit a layer to all that was shown."""
         weighed = [each for key, each in self.taught.items() for _ in range(self.weights[key[0]])]
         shown = zip(*self.earlier, *weighed, strict=True)
-        thetas, inputs, counts = map(np.concatenate, shown)
-        typical = np.median(counts[np.isfinite(counts)]) if np.isfinite(counts).any() else 1.0
-        weights = np.clip(np.nan_to_num(counts / typical, nan=1.0), 1 / WEIGHED, WEIGHED)
-        fit_layer(layer, self.problem, thetas, inputs, self.rng, updates, weights)
+        thetas, inputs = (np.concatenate(each) for each in shown)
+        fit_layer(layer, self.problem, thetas, inputs, self.rng, updates)
 
     def hardest(self, played: Imagined) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Return the scenarios in which a policy lacks most, and the steps to plan from next.
@@ -299,12 +271,10 @@ def fit_layer(
     inputs: Array,
     rng: np.random.Generator,
     updates: int,
-    weights: Array | None = None,
 ) -> None:
     """Fit a layer to inputs (rows, m) at theta: Huber's loss on actions in [-1, 1], with Adam.
 
-    Rows count by ``weights`` (rows,), by default all alike; those that are not finite are left out.
-    The networks go on from where they are.
+    Rows that are not finite are left out. The networks go on from where they are.
     """
     low = problem.deviations.u_min
     half = problem.u_half
@@ -313,18 +283,13 @@ def fit_layer(
     wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
     to = th.as_tensor(wanted[finite], dtype=th.float32)
-    counts = np.ones(len(rows)) if weights is None else weights
-    weight = th.as_tensor(counts[finite, None] / counts.mean(), dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
     for k in bar("the policy learns from plans: steps of Adam", range(updates if len(at) else 0)):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()
-        errors = th.nn.functional.smooth_l1_loss(
-            layer(at[chosen]), to[chosen], beta=HUBER, reduction="none"
-        )
-        loss = (weight[chosen] * errors).mean()
+        loss = th.nn.functional.smooth_l1_loss(layer(at[chosen]), to[chosen], beta=HUBER)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     optimizer.zero_grad()

@@ -567,8 +567,7 @@ class _Work:
         model = model_of(
             self.problem, simulator.episodes, simulator.row.estimator, self.seed + number
         )
-        if simulator.row.observer is not None:
-            model = with_constants(model, self.seed + number)
+        model = with_constants(model, self.seed + number)
         order = self.rng.permutation(len(simulator.episodes))
         # Twice each: as it began, and elsewhere with the same references.
         chosen = [each for one in lost[: self.n_starts // 4] for each in (one, one)]

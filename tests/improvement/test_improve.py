@@ -131,7 +131,7 @@ def test_where_there_is_nothing_to_gain_the_model_stays_bit_for_bit() -> None:
 
 @pytest.mark.parametrize("share", [0.3, -0.3])
 def test_whatever_is_taught_nothing_worse_is_accepted(monkeypatch, share) -> None:
-    def wrong(layer, problem, rows, inputs, rng, updates, weights):
+    def wrong(layer, problem, rows, inputs, rng, updates):
         for each in layer.network.weights():
             with th.no_grad():
                 each.add_(share)
