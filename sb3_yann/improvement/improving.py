@@ -47,7 +47,6 @@ from sb3_yann.improvement.simulator import (
     Simulator,
     model_of,
     one_step_error,
-    with_constants,
 )
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.plan import value_at_end
@@ -567,7 +566,6 @@ class _Work:
         model = model_of(
             self.problem, simulator.episodes, simulator.row.estimator, self.seed + number
         )
-        model = with_constants(model, self.seed + number)
         order = self.rng.permutation(len(simulator.episodes))
         # Twice each: as it began, and elsewhere with the same references.
         chosen = [each for one in lost[: self.n_starts // 4] for each in (one, one)]

@@ -32,11 +32,11 @@ from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.env_pool import EnvPool, Source, maker, pool_of
 from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import Controller, Rows, Trajectories, joined, of_episode, rollout
-from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual, law_of
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import SHORTEST, Episode, observer_of
 from sb3_yann.twin.row_layout import RowLayout
-from sb3_yann.twin.selection import fit_constants, fit_ensemble
+from sb3_yann.twin.selection import fit_ensemble
 
 FIRST = 3_000_000  # seed of the first episode: far from those that people try first
 APART = 1_000_000  # how far the episodes of two seeds are apart
@@ -301,7 +301,6 @@ class Excited:
 
 MEMBERS = 2  # networks of a model of a simulator, which repeats its steps
 NOISE = 0.01  # standard deviations of the states: what errs less in most steps has no noise
-EXPLAINED = 0.5  # share of its errors that a model may keep where each episode has a constant
 LACKING = 0.5  # share of the errors of neighboring steps that is not alike: more is noise
 DOUBT = 10.0  # mean costs of a step for members that differ by a standard deviation of a state
 
@@ -326,33 +325,6 @@ def model_of(
     coordinates = Coordinates.of(problem, episodes, observer)
     members = fit_ensemble(coordinates, [episodes] * MEMBERS, seed)
     return LearntModel(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ModelOfEach(LearntModel):
-    """A model with a member for each episode: the plant has a constant that nothing shows."""
-
-
-def with_constants(model: LearntModel, seed: int) -> LearntModel:
-    """Return a model of each episode, where a constant explains most of what the model misses."""
-    coordinates = model.dynamics.coordinates
-    rows = [coordinates.regression(each) for each in model.episodes]
-
-    def misses(members: Sequence[Sequence[Residual]]) -> float:
-        errors = [
-            (y - np.mean([m.predict(z) for m in some], axis=0)) / coordinates.units
-            for (z, y), some in zip(rows, members, strict=True)
-        ]
-        return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-
-    without = misses([model.dynamics.members] * len(rows))
-    if without < NOISE:
-        return model
-    members = fit_constants(coordinates, model.episodes, seed)
-    if misses([[each] for each in members]) > EXPLAINED * without:
-        return model
-    dynamics = Dynamics(model.problem, coordinates, tuple(members))
-    return ModelOfEach(model.problem, model.episodes, dynamics)
 
 
 def lacks(model: LearntModel) -> tuple[bool, bool]:
@@ -495,11 +467,7 @@ class Scenarios:
             e.thetas[np.minimum(t + np.arange(steps), len(e)), row.given]
             for e, t in zip(episodes, first, strict=True)
         ]
-        members = None
-        if isinstance(model, ModelOfEach):
-            number = {id(each): i for i, each in enumerate(model.episodes)}
-            members = np.array([number[id(each)] for each in episodes])
-        return cls(model, members, row.begin(thetas), np.stack(given, axis=1))
+        return cls(model, None, row.begin(thetas), np.stack(given, axis=1))
 
     @cached_property
     def plant(self) -> TwinPlant:

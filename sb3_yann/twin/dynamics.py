@@ -60,12 +60,8 @@ class Residual:
 
     @classmethod
     def stack(cls, members: Sequence[Residual]) -> Residual:
-        """Return several as one, from z (members, batch, k) to (members, batch, n).
-
-        Weights that all share are held once.
-        """
-        each_kind = zip(*(m.weights for m in members), strict=True)
-        return cls([np.array(w[:1] if all(a is w[0] for a in w) else w) for w in each_kind])
+        """Return several as one, from z (members, batch, k) to (members, batch, n)."""
+        return cls([np.array(each) for each in zip(*(m.weights for m in members), strict=True)])
 
     def _hidden(self, z: Array) -> tuple[Array, Array]:
         W1, b1, W2, b2 = self.weights[:4]

@@ -63,22 +63,6 @@ def fit_ensemble(
     return networks.residuals()
 
 
-def fit_constants(
-    coordinates: Coordinates, episodes: Sequence[Episode], seed: int, updates: int = 3000
-) -> list[Residual]:
-    """Return a network for each episode, alike but for a constant of its own that nothing shows.
-
-    It moves the biases of the first layer, as another input of the network would.
-    """
-    generator = th.Generator().manual_seed(seed)
-    rows = [coordinates.regression(each) for each in episodes]
-    pairs = [[np.concatenate(part) for part in zip(*rows, strict=True)]]
-    networks = _Networks(pairs, FLOAT32_ROUNDING * coordinates.units, generator, th.float64)
-    networks.give_constants([len(each) for each in episodes])
-    networks.fit_steps(pairs, updates)
-    return networks.residuals()
-
-
 class _Networks:
     """The networks while they are fitted, in standardized coordinates.
 
@@ -115,23 +99,14 @@ class _Networks:
         for each in self.weights:
             each.requires_grad_()
 
-    def give_constants(self, lengths: Sequence[int]) -> None:
-        """Give each episode of so many rows a constant."""
-        constants = th.zeros((len(lengths), 1), dtype=self.dtype)
-        reach = th.randn((1, HIDDEN), generator=self.generator, dtype=self.dtype)
-        self.owners = th.repeat_interleave(th.arange(len(lengths)), th.as_tensor(lengths))
-        self.weights += [each.requires_grad_() for each in (constants, reach)]
-
     def tensor(self, parts: Any) -> th.Tensor:
         """Return arrays as one tensor."""
         return th.as_tensor(np.asarray(parts), dtype=self.dtype)
 
-    def __call__(self, z: th.Tensor, rows: th.Tensor | None = None) -> th.Tensor:
-        """Return what the networks make of z (members, batch, k), with the constants of rows."""
-        W1, b1, W2, b2, W3, b3, L, *own = self.weights
+    def __call__(self, z: th.Tensor) -> th.Tensor:
+        """Return what the networks make of z (members, batch, k)."""
+        W1, b1, W2, b2, W3, b3, L = self.weights
         z = (z - self.center) / self.width
-        if own:
-            b1 = b1 + own[0][self.owners[rows]] @ own[1]
         first = th.tanh(z @ W1 + b1)
         out: th.Tensor = (th.tanh(first @ W2 + b2) @ W3 + b3 + z @ L) * self.unit
         return out
@@ -141,7 +116,7 @@ class _Networks:
         z, y = (self.tensor(_same_length([each[i] for each in pairs])) for i in (0, 1))
         for _ in self._steps(FIT_RATE, updates):
             chosen = th.randint(z.shape[1], (ROWS_OF_STEP,), generator=self.generator)
-            (((self(z[:, chosen], chosen) - y[:, chosen]) / self.unit) ** 2).mean().backward()  # type: ignore[no-untyped-call]
+            (((self(z[:, chosen]) - y[:, chosen]) / self.unit) ** 2).mean().backward()  # type: ignore[no-untyped-call]
 
     def fit_windows(
         self, coordinates: Coordinates, logs: Sequence[Sequence[Episode]], ahead: int, updates: int
@@ -192,17 +167,15 @@ class _Networks:
     def residuals(self) -> list[Residual]:
         """Return them in scaled coordinates, one by one."""
         with th.no_grad():
-            W1, b1, W2, b2, W3, b3, L, *own = self.weights
+            W1, b1, W2, b2, W3, b3, L = self.weights
             first = W1 / self.width.mT
             L = L * self.unit / self.width.mT
             b1 = b1 - self.center @ first
-            if own:
-                b1 = b1 + (own[0] @ own[1])[:, None]
             b3 = b3 * self.unit - self.center @ L
             parts = [first, b1, W2, b2, W3 * self.unit, b3, L]
             parts.append(th.zeros((len(L), L.shape[1], L.shape[1] * L.shape[2])))
-            arrays = [[*each.double().numpy().copy()] for each in parts]
-        return [Residual([each[i % len(each)] for each in arrays]) for i in range(len(b1))]
+            arrays = [each.double().numpy().copy() for each in parts]
+        return [Residual([each[i] for each in arrays]) for i in range(len(arrays[0]))]
 
 
 def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:

@@ -15,19 +15,17 @@ from sb3_yann.improvement.imitation import Teacher, controller_of, policy_of
 from sb3_yann.improvement.improving import _Progress, _Work
 from sb3_yann.improvement.simulator import (
     Disagreement,
-    ModelOfEach,
     Scenarios,
     lacks,
     model_of,
     of_law,
     one_step_error,
-    with_constants,
 )
 from sb3_yann.plan import TwinPlant
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.selection import fit_constants, fit_ensemble
+from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import POLYNOMIALS, Cart, log, observed, problem, rated
 
 
@@ -111,41 +109,6 @@ def test_some_scenarios_begin_where_logged_episodes_had_got_to() -> None:
         logged = found.episodes[i].thetas[:, parts.state]
         assert np.abs(logged - state).max(axis=1).min() < 1e-12
         assert not np.allclose(logged[0], state)
-
-
-def of_slopes(slopes: np.ndarray) -> list[Episode]:
-    """Return episodes of the MPC on slopes that nothing shows, with inputs moved at random."""
-    rng = np.random.default_rng(0)
-    law = problem().explicit()
-    found = []
-    for slope in slopes:
-        rows = [rng.uniform(-0.5, 0.5, 2)]
-        inputs = []
-        for _ in range(40):
-            inputs.append(np.clip(law(rows[-1]) + rng.uniform(-0.5, 0.5, 1), -1, 1))
-            pull = slope * (1 + rows[-1][0] ** 2)
-            rows.append(problem().deviations.predict(rows[-1], inputs[-1]) - [0, 0.1 * pull])
-        found.append(Episode(np.array(rows), np.array(inputs)))
-    return found
-
-
-def test_where_a_constant_is_hidden_each_episode_has_a_member(monkeypatch) -> None:
-    monkeypatch.setattr(module, "fit_ensemble", partial(fit_ensemble, updates=300))
-    monkeypatch.setattr(module, "fit_constants", partial(fit_constants, updates=1000))
-    same = model_of(problem(), of_slopes(np.full(12, 0.3)), None, seed=0)
-    assert with_constants(same, 0) is same
-    slopes = np.linspace(-0.5, 0.5, 12)
-    plain = model_of(problem(), of_slopes(slopes), None, seed=0)
-    found = with_constants(plain, 0)
-    assert isinstance(found, ModelOfEach) and len(found.dynamics.members) == 12
-    # An episode from the same place, with the same inputs, is that of its own slope.
-    at = np.zeros((12, 1, 2))
-    accelerated = found.dynamics.step(at, np.zeros((12, 1, 1)))[:, 0, 1]
-    np.testing.assert_allclose(accelerated, -0.1 * slopes, atol=0.01)
-    chosen = [found.episodes[i] for i in (3, 0, 3)]
-    like = Scenarios.like(found, chosen, np.random.default_rng(0))
-    np.testing.assert_array_equal(like.members, [3, 0, 3])
-    assert Scenarios.like(plain, chosen, np.random.default_rng(0)).members is None
 
 
 def test_a_scenario_that_is_planned_again_is_shown_anew() -> None:
