@@ -74,7 +74,7 @@ class RowLayout:
     def _n_disturbances(self) -> int:
         return self.problem.layout.n_disturbances
 
-    @property
+    @cached_property
     def _estimated(self) -> slice:
         """The entries of disturbances that the estimator moves, where it is the plant's memory."""
         part = self.problem.layout.disturbance
@@ -83,12 +83,12 @@ class RowLayout:
         known = self._n_disturbances - self.estimator.n_estimated
         return slice(part.start + known, part.stop)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of entries of a row."""
         return self.problem.n_theta if self.observer is None else self._raw.stop
 
-    @property
+    @cached_property
     def state(self) -> slice:
         """The entries of the plant's own state."""
         parts = self.problem.layout
@@ -96,7 +96,7 @@ class RowLayout:
             return parts.state
         return slice(parts.size, parts.size + parts.n_states)
 
-    @property
+    @cached_property
     def given(self) -> slice:
         """The entries that an episode prescribes: references, and disturbances if measured."""
         parts = self.problem.layout
@@ -106,7 +106,7 @@ class RowLayout:
             return parts.constant
         return slice(parts.constant.start, self._estimated.start)
 
-    @property
+    @cached_property
     def _raw(self) -> slice:
         """The entries of the estimate of d before it is clipped."""
         return slice(self.state.stop, self.state.stop + self.problem.layout.n_disturbances)
@@ -117,7 +117,7 @@ class RowLayout:
         assert self.observer is not None
         return np.asarray(np.linalg.pinv(self.observer.C) @ self.observer.C)
 
-    @property
+    @cached_property
     def _d(self) -> tuple[Array, Array]:
         """The bounds (d,) of the disturbance."""
         part = self.problem.layout.disturbance

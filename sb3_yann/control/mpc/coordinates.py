@@ -48,7 +48,7 @@ class ThetaLayout:
     previews: tuple[int, int] = (0, 0)
     bounds: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of entries of theta."""
         return int(self.previous.stop)
@@ -58,32 +58,32 @@ class ThetaLayout:
         """Whether theta holds a reference or a disturbance: it has many steady states then."""
         return self.n_references + self.n_disturbances > 0
 
-    @property
+    @cached_property
     def state(self) -> slice:
         """The entries of x."""
         return slice(0, self.n_states)
 
-    @property
+    @cached_property
     def reference(self) -> slice:
         """The entries of r, with those of the preview."""
         return _after(self.state, self.n_references * (1 + self.previews[0]))
 
-    @property
+    @cached_property
     def disturbance(self) -> slice:
         """The entries of d, with those of the preview."""
         return _after(self.reference, self.n_disturbances + self.previews[1] * self._loads)
 
-    @property
+    @cached_property
     def limits(self) -> slice:
         """The entries of the bounds that change at run time."""
         return _after(self.disturbance, len(self.bounds))
 
-    @property
+    @cached_property
     def constant(self) -> slice:
         """The entries of r, d and bounds, which an episode prescribes."""
         return slice(self.n_states, self.limits.stop)
 
-    @property
+    @cached_property
     def previous(self) -> slice:
         """The entries of the previous input."""
         return _after(self.limits, self.n_previous)
