@@ -245,9 +245,8 @@ def imitate(
         saved = teacher.saved(played.costs, teacher.usual)
         objection = teacher.objection(played)
         say(
-            f"fit {fit + 1}: in the model the policy gains {round(100 * saved, 3) + 0.0:g} %, "
-            f"plans {round(100 * teacher.gain, 3) + 0.0:g} %"
-            f"{'; ' * bool(objection)}{objection}"
+            f"fit {fit + 1}: in the model the policy gains {in_percent(saved)}, plans "
+            f"{in_percent(teacher.gain)}{'; ' * bool(objection)}{objection}"
         )
         if score > most + NEAR / 2 * teacher.gain:
             since = fit
@@ -262,6 +261,11 @@ def imitate(
         layer.load_state_dict(fitted)
     layer.load_state_dict(best)
     return promised
+
+
+def in_percent(gain: float) -> str:
+    """Return a gain to a thousandth of a percent, without a sign of zero."""
+    return f"{round(100 * gain, 3) + 0.0:g} %"
 
 
 def fit_layer(

@@ -37,6 +37,7 @@ from sb3_yann.improvement.imitation import (
     Teacher,
     controller_of,
     imitate,
+    in_percent,
     policy_of,
     refit_critic,
 )
@@ -449,7 +450,7 @@ class _Work:
                 scenarios = self._of_estimates(scenarios, episodes, self.seed + number)
             teacher = Teacher(scenarios, self.seed + number)
             teacher.show()
-            gain = f"{round(100 * teacher.gain, 3) + 0.0:g} %"
+            gain = in_percent(teacher.gain)
             if shown is None and not teacher.gain > RULE.least_gain / 10:
                 return improvement(False, f"plans gain {gain} in the twin, too little to teach")
             if shown is not None:
@@ -459,7 +460,7 @@ class _Work:
             self.say.end_of_round()
             self.say(
                 f"round {number + 1} of at most {self.rounds}: in the twin the policy gains "
-                f"{round(100 * gained, 3) + 0.0:g} %, plans {gain}"
+                f"{in_percent(gained)}, plans {gain}"
             )
             if passes(1.0):
                 return improvement(True)

@@ -104,6 +104,10 @@ def loops_part(subject: Subject) -> Part:
         for seed, a, b, v, w in each
     ]
     head = ["seed", "MPC", "policy", "change", "MPC: violations", "policy: violations"]
+    apart = np.abs(policy.costs - mpc.costs) > FLOAT32_ROUNDING * np.abs(mpc.costs)
+    episodes = table(head, single[:1000])
+    if not apart.any() and np.array_equal(mpc.violations, policy.violations):
+        episodes = paragraph("Each costs what it costs with the MPC, and violates as often.")
     content = join(
         [
             paragraph(how, warning if known else ""),
@@ -111,7 +115,7 @@ def loops_part(subject: Subject) -> Part:
             picture(partial(plot_gains, loops), gains),
             picture(partial(loops_figure, subject.problem, subject.shown_loops), caption),
             tag("h3", "Every episode"),
-            table(head, single[:1000]),
+            episodes,
         ]
     )
     less = less_safe(policy.unsafe(), mpc.unsafe())[:, :INPUT_STEP]  # the next part has the bounds
@@ -162,11 +166,18 @@ def statistics_part(subject: Subject) -> Part:
         )
         if passed is None:
             text += " That it differs from the MPC at all is not shown."
+    rounding = FLOAT32_ROUNDING * np.abs(mpc.costs)
+    less = int(np.sum(change < -rounding))
+    more = int(np.sum(change > rounding))
+    worst = int(np.argmax(change))
+    largest = f"{change[worst]:.4g}, from seed {subject.seeds[worst]}" if more else "0"
     # The upper limit of Clopper and Pearson: how often a violation may still happen.
     bad = int(np.sum(policy.violations > 0))
     most = 1.0 if bad == count else float(stats.beta.ppf(0.95, bad + 1, count - bad))
     sentences = [
         text,
+        f"It costs less from {less} starts and more from {more} of {count}; the largest "
+        f"increase is {largest}.",
         f"{bad} of {count} episodes violate a limit ({int(np.sum(mpc.violations > 0))} with the "
         f"MPC): with a confidence of 95 % fewer than {100 * most:.1f} % of such starts do.",
         "These statements hold for starts that are drawn as these are, and for a plant that "

@@ -14,6 +14,7 @@ import pytest
 import torch as th
 from gymnasium import Wrapper
 from stable_baselines3 import DDPG, PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import guard_samples
 import twin_samples
@@ -34,6 +35,7 @@ from sb3_yann.improvement.confirmation import Check
 from sb3_yann.improvement.improving import Improvement
 from sb3_yann.reporting import evidence_parts, problem_parts
 from sb3_yann.wrappers import PlantEnv
+from sb3_yann_envs import problems
 from weights import last_layer, unpin
 
 SEEDS = range(8)
@@ -427,3 +429,53 @@ def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
     with pytest.raises(TypeError, match=r"seeds = 20 must hold .* range\(20\)"):
         report(model, path, seeds=20)
     assert not path.exists()
+
+
+def test_observations_are_normalized_as_in_training(tmp_path) -> None:
+    from sb3_yann import AffineObservation
+
+    mpc = guard_samples.MPC
+    venv = VecNormalize(DummyVecEnv([Slide]), norm_reward=False, training=False)
+    venv.obs_rms.mean[:] = 0.5
+    venv.obs_rms.var[:] = 4.0
+    kwargs = {"problem": mpc, "observation": AffineObservation.from_vec_normalize(venv)}
+    model = DDPG("YannPolicy", venv, policy_kwargs=kwargs, device="cpu")
+    text = Outline(report(model, tmp_path / "r.html", env=Slide, seeds=range(3))).text
+    assert "From these starts the policy costs what the MPC costs." in text
+    mean = evaluate(guard_samples.LAW, Slide, range(3)).costs.mean()
+    assert f"mean cost {mean:.5g}" in text
+
+
+def test_a_law_that_is_solved_online_has_no_regions_to_show(tmp_path) -> None:
+    mpc = problems.clipped_pendulum()
+    kwargs = {"problem": mpc, "law": "online"}
+    model = DDPG("YannPolicy", "ClippedPendulum-v0", policy_kwargs=kwargs, device="cpu")
+    text = Outline(report(model, tmp_path / "r.html", env="ClippedPendulum-v0", seeds=[0])).text
+    assert "The MPC's law is solved at each point" in text
+    assert "A picture of regions needs an explicit law" in text
+
+
+def test_starts_that_the_guard_knows_are_named() -> None:
+    model, guard = guarded()
+    known = subject_of(model, guard=guard, seeds=range(999_995, 1_000_003))
+    text = evidence_parts.loops_part(known).content
+    assert "3 of these starts are known to the guard" in text
+    assert (
+        "known to the guard"
+        not in evidence_parts.loops_part(subject_of(model, guard=guard)).content
+    )
+
+
+def test_starts_of_the_mpc_itself_need_no_rows_and_those_of_a_policy_are_counted() -> None:
+    kwargs = {"problem": guard_samples.MPC}
+    subject = subject_of(DDPG("YannPolicy", Slide(), policy_kwargs=kwargs, device="cpu"), env=Slide)
+    assert "Each costs what it costs with the MPC" in evidence_parts.loops_part(subject).content
+    content = evidence_parts.statistics_part(subject).content
+    assert "It costs less from 0 starts and more from 0 of" in content
+    subject = subject_of(moved(), env=Slide)
+    both = evidence_parts.OF_POLICY, evidence_parts.OF_MPC
+    policy, mpc = (subject.loops[each].costs for each in both)
+    assert "Each costs what" not in evidence_parts.loops_part(subject).content
+    content = evidence_parts.statistics_part(subject).content
+    counted = f"less from {np.sum(policy < mpc)} starts and more from {np.sum(policy > mpc)} of"
+    assert f"It costs {counted} {len(mpc)}" in content
