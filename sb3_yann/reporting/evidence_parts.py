@@ -15,8 +15,9 @@ from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_states
-from sb3_yann.compare import INPUT_STEP, less_safe
+from sb3_yann.compare import INPUT_STEP, RULE, Scores, less_safe, mean_change, no_worse
 from sb3_yann.control.linear_system import with_units
+from sb3_yann.evaluation import change_in_percent
 from sb3_yann.evaluation.plots import (
     inputs_of,
     loops_figure,
@@ -183,7 +184,37 @@ def statistics_part(subject: Subject) -> Part:
         "These statements hold for starts that are drawn as these are, and for a plant that "
         "behaves as this env does.",
     ]
-    return Part(title, join(map(paragraph, sentences)), (make_finding(passed, text),))
+    beyond = _beyond(subject)
+    sentences.append(beyond.text)
+    return Part(title, join(map(paragraph, sentences)), (make_finding(passed, text), beyond))
+
+
+def _beyond(subject: Subject) -> Finding:
+    """Return in what box episodes begin, and what comes of starts beyond that the env can take."""
+    problem = subject.problem
+    part = problem.layout.state
+    begins = np.array([each[0] for each in subject.shown_loops[OF_MPC].observations])[:, part]
+    low = begins.min(axis=0)
+    high = begins.max(axis=0)
+    names = with_units(problem.model)[0]
+    box = ", ".join(map("{} {:.4g} to {:.4g}".format, names, low, high))
+    states = problem.units.to_plant(subject.samples)[:, part]
+    beyond = states[((states < low) | (states > high)).any(axis=1)]
+    loops = subject.loops_from(beyond)
+    mpc, policy = (Scores(loops[who].costs, loops[who].unsafe()) for who in (OF_MPC, OF_POLICY))
+    text = f"Episodes begin at {box}."
+    count = len(mpc.costs)
+    if not count:
+        taken = 'The env takes no reset(options={"state": x})'
+        return Finding("note", f"{text} {taken}: other starts are not tried.")
+    worst = (policy.costs - mpc.costs).max() / (abs(mpc.costs.mean()) or 1.0)
+    reason = no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
+    text += (
+        f" From {count} states beyond, anywhere in the box of parameters, the mean cost "
+        f"changes by {change_in_percent(mean_change(policy.costs - mpc.costs, mpc.costs))}, at "
+        f"worst by {change_in_percent(worst)} of it{'; ' * bool(reason)}{reason}."
+    )
+    return Finding("look" if reason else "note", text)
 
 
 def distance_part(subject: Subject) -> Part:

@@ -29,6 +29,7 @@ from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Controller, Trajectories, rollout
 from sb3_yann.twin import PlantTwin
+from sb3_yann.units import FLOAT32_ROUNDING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -190,6 +191,7 @@ def page(title: str, body: Iterable[Any]) -> str:
     return PAGE.substitute(title=clean(title), style=STYLE, body=join(body))
 
 
+TRIED = 5  # states for each seed that an env is asked to begin in
 OF_POLICY = "policy"
 OF_MPC = "MPC"
 
@@ -287,9 +289,33 @@ class Subject:
             return None
         with one_env(self.env) as env:
             require_state_shown(env, self.policy.observation_given)
+        return self._play()
+
+    def loops_from(self, states: Array) -> dict[str, Trajectories]:
+        """Return closed loops from those states (k, n) that the env takes, as many as seeds."""
+        assert self.env is not None
+        problem = self.problem
+        room = FLOAT32_ROUNDING * problem.theta_half
+        begins = []
+        with one_env(self.env) as env:
+            for state in states[: TRIED * len(self.seeds)]:
+                try:
+                    shown = env.reset(seed=0, options={"state": state})[0]
+                except Exception:  # whatever an env raises that has no such option or state
+                    continue
+                begun = problem.units.to_plant(self._theta(shown[None])[0])
+                apart = np.abs(begun[problem.layout.state] - state)
+                if np.all(apart <= room[problem.layout.state] + FLOAT32_ROUNDING * np.abs(state)):
+                    begins.append(state)
+        return self._play(begins[: len(self.seeds)])
+
+    def _play(self, states: Sequence[Array] | None = None) -> dict[str, Trajectories]:
+        """Return the closed loops of MPC and policy, from states (n,) of the plant if given."""
+        assert self.env is not None
         found = {}
+        seeds = self.seeds[: None if states is None else len(states)]
         for name, act in {OF_MPC: self.act_as_mpc, OF_POLICY: self.act_as_policy}.items():
-            played = rollout(_as_controller(act), self.env, self.seeds)
+            played = rollout(_as_controller(act), self.env, seeds, states)
             found[name] = replace(
                 played,
                 observations=tuple(map(self._theta, played.observations)),

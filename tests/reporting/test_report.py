@@ -275,6 +275,35 @@ def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
     assert f"fewer than {100 * (1 - 0.05 ** (1 / 8)):.1f} % of such starts do" in text
 
 
+@pytest.mark.parametrize("takes", [True, False])
+def test_starts_beyond_those_of_episodes_are_a_finding_of_their_own(takes) -> None:
+    tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3], units=["m", "A"])
+    mpc = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=3, x_min=0, x_max=20, u_min=0, u_max=10)
+
+    def make() -> gym.Env:
+        box = {"start_low": 11.5, "start_high": 12.5, "max_episode_steps": 20}
+        env = PlantEnv(lambda x, u: 0.1 * (12 - x) + 0.5 * (u - 3), mpc, **box)
+        return env if takes else OwnStarts(env)
+
+    model = DDPG("YannPolicy", make(), policy_kwargs={"problem": mpc, "networks": "shared"})
+    for moves in (False, True):
+        part = evidence_parts.statistics_part(subject_of(model, env=make))
+        found = part.findings[-1]
+        assert re.match(r"Episodes begin at x\[0\] \(m\) 11\.\d* to 12\.\d*\.", found.text)
+        assert ("From 8 states beyond" in found.text) is takes
+        assert ("takes no reset" in found.text) is not takes
+        assert found.verdict == ("look" if takes and moves else "note")
+        assert found.text in unescape(part.content)
+        with th.no_grad():
+            for weights in model.actor.mu.network.parameters():
+                weights += 0.3
+
+
+class OwnStarts(gym.Wrapper):
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed)
+
+
 @pytest.mark.parametrize("shows", ["plant", "normalized"])
 def test_the_mpc_is_played_through_the_policy_s_own_maps(shows, tmp_path) -> None:
     mpc = unit_samples.plant_mpc()
