@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._progress import bar
@@ -86,22 +85,13 @@ class Plant:
                     f"plant_env has {name} = {its}, the model {own}: it is another plant."
                 )
         self.law = law_of(self.problem)
-        self.device = self.yann.device
         self.range = self.problem.deviations.u_max - self.problem.deviations.u_min
         units = self.yann.action_units
         self.as_is = units.kind == "plant" and not np.any(units.shift)
 
     def policy(self, theta: Array) -> Array:
         """Return the policy's inputs (rows, m); the MPC's where they are not finite."""
-        layer = self.yann.actor.mu
-        if self.device.type == "cpu":
-            u = policy_of(layer, self.problem)(theta)
-        else:
-            with th.no_grad():
-                actions = layer(th.as_tensor(theta, device=self.device)).double().cpu().numpy()
-            u = (
-                self.problem.deviations.u_max + self.problem.deviations.u_min
-            ) / 2 + self.range / 2 * actions
+        u = policy_of(self.yann.actor.mu, self.problem)(theta)
         finite = np.isfinite(u)
         return u if finite.all() else np.where(finite, u, self.mpc(theta))
 

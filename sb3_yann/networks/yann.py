@@ -171,7 +171,7 @@ class LawLayer(nn.Module):
         return slopes
 
     def frozen(self) -> Callable[[Array], NDArray[Any]]:
-        """Return the layer of now, on the CPU, as a function of theta (batch, n): (batch, m).
+        """Return the layer of now as a function of theta (batch, n): (batch, m), both of numpy.
 
         It is faster for small batches where there is compiled code: it does without torch.
         """
@@ -183,7 +183,8 @@ class LawLayer(nn.Module):
 
         @th.no_grad()
         def act(theta: Array) -> NDArray[Any]:
-            found: NDArray[Any] = self(th.as_tensor(theta)).double().numpy()
+            points = th.as_tensor(theta, device=self.theta_half.device)
+            found: NDArray[Any] = self(points).double().cpu().numpy()
             return found
 
         return act
