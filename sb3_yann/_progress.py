@@ -34,7 +34,8 @@ def is_watched() -> bool:
 def shown(progress_bar: bool, parts: bool = False) -> Iterator[None]:
     """Show what takes long, unless it is False here or further out.
 
-    Bars of ``parts`` count and foretell nothing: `Progress` says how long all of them take.
+    Bars of ``parts`` count and foretell nothing, and leave nothing in a file: `Progress` says how
+    long all of them take.
     """
     check_bool("progress_bar", progress_bar)
     token = _silent.set(_silent.get() or not progress_bar)
@@ -56,15 +57,15 @@ _Bar.set_lock(threading.RLock())
 
 
 class _Lines:
-    """A file in which bars leave their state, a line every thirty seconds."""
+    """A file in which bars and details leave a line where there was none for thirty seconds."""
 
     def __init__(self) -> None:
         self.latest = -FILE_INTERVAL
 
-    def write(self, text: str) -> None:
-        """Write what a bar shows, unless there was a line of late."""
+    def write(self, text: str, detail: bool = True) -> None:
+        """Write a line, a detail only where there was none of late."""
         now = time.monotonic()
-        if text.strip() and now >= self.latest + FILE_INTERVAL:
+        if text.strip() and (not detail or now >= self.latest + FILE_INTERVAL):
             self.latest = now
             print(text.strip(), file=sys.stderr)
 
@@ -78,6 +79,7 @@ _LINES = _Lines()
 
 def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None) -> Any:
     """Return a bar over items, or one to ``update``; those inside each other share a line."""
+    watched = is_watched()
     return _Bar(
         items,
         desc=what,
@@ -86,8 +88,8 @@ def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None)
         leave=False,
         miniters=1,
         position=0,
-        file=sys.stderr if is_watched() else _LINES,
-        disable=_silent.get(),
+        file=sys.stderr if watched else _LINES,
+        disable=_silent.get() or (_parts.get() and not watched),
         bar_format="  {desc}: {n_fmt} of {total_fmt}" if _parts.get() else None,
     )
 
@@ -99,11 +101,18 @@ class Progress:
         self.begun = time.monotonic()
         self.steps = steps
 
-    def __call__(self, text: str, left: float = 0.0) -> None:
-        """Write a line; ``left`` are the seconds that the rest may take, 0 where nobody knows."""
+    def __call__(self, text: str, left: float = 0.0, detail: bool = False) -> None:
+        """Write a line; ``left`` are the seconds that the rest may take, 0 where nobody knows.
+
+        In a file a ``detail`` is left out, unless there was no other line for thirty seconds.
+        """
         passed = time.monotonic() - self.begun
         if _silent.get() or passed < DELAY:
             return
         steps = "" if self.steps is None else f" {self.steps():>9,} steps"
         most = f", up to about {left:.0f} s left" if left > 0 else ""
-        _Bar.write(f"[{passed:5.0f} s{steps}{most}] {text}", file=sys.stderr)
+        line = f"[{passed:5.0f} s{steps}{most}] {text}"
+        if is_watched():
+            _Bar.write(line, file=sys.stderr)
+        else:
+            _LINES.write(line, detail)

@@ -367,7 +367,8 @@ def no_worse(
     elif costly := tolerance.objection(excess, tail_errors):
         worst = int(np.argmax(excess))
         more = policy.costs[worst] - mpc.costs[worst]
-        reason = f"{costly} costs {more:.4g} more than with the MPC"
+        share = 100 * mean_change(more, of_mpc)
+        reason = f"{costly} costs {share:.3g} % of the mean cost more than with the MPC"
         reason = reason.replace(f"start {worst} ", f"start {names[worst]} ")
         if words := tolerance.exceeded(policy, worst, mpc):
             reason = f"{reason}: {words}"

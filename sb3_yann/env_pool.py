@@ -104,17 +104,20 @@ def is_vec_env(env: Any) -> bool:
 
 
 def name_of(env: Any) -> str:
-    """Return a name of a simulator that is the same in another process."""
+    """Return a name of a simulator that is the same in another process, "plant" for a lambda."""
     if isinstance(env, str):
         return env
     if is_vec_env(env):
         return f"{type(env.unwrapped).__name__} of {env.num_envs}"
     if isinstance(env, gym.Env):
         spec = env.spec
-        return type(env.unwrapped).__name__ if spec is None else f"{spec.id}{spec.kwargs or ''}"
+        plain = env.unwrapped  # of a `PlantEnv` it has the name of its function
+        own = str(getattr(plain, "plant_name", type(plain).__name__))
+        return own if spec is None else f"{spec.id}{spec.kwargs or ''}"
     if isinstance(env, partial):  # its repr holds an address, which the next process does not have
         return f"{name_of(env.func)}{env.args}{env.keywords}"
-    return getattr(env, "__qualname__", repr(env))
+    name: str = getattr(env, "__qualname__", type(env).__name__)
+    return "plant" if "<lambda>" in name else name
 
 
 class EnvPool:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, check_int, check_positive, to_float
+from sb3_yann._validation import Array, check_int, check_positive, to_float, warn
 
 Arrays = ArrayLike | Sequence[ArrayLike]
 """One array for each episode, or that of a single one."""
@@ -252,8 +252,11 @@ class Log:
     ) -> Log:
         """Return the log of a CSV file with a header, as a historian writes it.
 
-        A row holds the state at a sample and the inputs that act from there on. The inputs of an
-        episode's last row do not count.
+        A row holds the state at a sample and the inputs that act from there on. An episode ends
+        before the row in which ``episode`` changes, or where ``time`` jumps or a reading is
+        missing; it needs no mark in the file. Its last row is the state that the last inputs led
+        to: the inputs of that row do not count. Without ``episode`` and ``time`` all rows are one
+        episode, and a warning names the columns that may tell.
 
         Parameters
         ----------
@@ -265,7 +268,7 @@ class Log:
         dt : float
             Sampling time.
         episode : str, optional
-            A column that changes from one episode to the next.
+            A column that changes from one episode to the next, such as a batch's number.
         time : str, optional
             A column of times in the unit of ``dt``, or of ISO 8601 time stamps: then ``dt`` is in
             seconds, or in the ``time_unit`` "min", "h" or "d". An episode ends where a step takes
@@ -312,6 +315,12 @@ class Log:
         )
         if not len(table):
             raise ValueError(f"{path} has no rows below its header.")
+        unread = [each for each in header if each not in wanted]
+        if unread and episode is None and time is None:
+            warn(
+                f"All {len(table):,} rows of {path} are read as one episode without a gap. If one "
+                f"of its other columns, {unread}, tells where one ends, pass time= or episode=."
+            )
         n = len(states)
         sizes = (n, len(inputs), len(disturbances), len(references))
         x, *others = np.split(table, np.cumsum(sizes)[:-1], axis=1)
@@ -494,7 +503,8 @@ def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np
         if np.any(back):
             raise ValueError(
                 f"time of episode {i} does not increase after row {int(np.argmax(back))}. "
-                "Sort the log, and leave out rows that stand there twice."
+                "Sort the log, and leave out rows that stand there twice; where time begins anew "
+                "in each episode, name the column of episodes, episode=."
             )
     spans = [np.diff(each) for each in times]
     whole = np.concatenate(spans)

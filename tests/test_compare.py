@@ -94,14 +94,14 @@ def refusal(costs: Any, unsafe: Any = (), accepted: Any = (10, 20, 30), margin: 
     [
         ([10, 20, 30], ""),
         ([11, 19, 30], ""),  # one start worse by exactly the margin
-        ([11.01, 5, 5], "start 0 costs 1.01 more than with the MPC"),
-        ([5, 5, 31.5], "start 2 costs 1.5 more"),
+        ([11.01, 5, 5], "start 0 costs 5.05 % of the mean cost more than with the MPC"),
+        ([5, 5, 31.5], "start 2 costs 7.5 % of the mean cost more"),
         ([10, 20.5, 30], "mean cost 20.1667, accepted 20"),
         ([10, 20, 30.00003], ""),  # a relative difference of 5e-7 is rounding
         ([10, 20, 30.0003], "mean cost 20.0001, accepted 20"),
-        ([NAN, 1, 1], "start 0 costs nan more"),
-        ([1, 1, INF], "start 2 costs inf more"),
-        ([-INF, NAN, 1], "start 1 costs nan more"),
+        ([NAN, 1, 1], "start 0 costs nan % of"),
+        ([1, 1, INF], "start 2 costs inf % of"),
+        ([-INF, NAN, 1], "start 1 costs nan % of"),
     ],
 )
 def test_a_worse_mean_or_one_start_beyond_the_margin_is_refused(costs, why) -> None:
@@ -158,9 +158,9 @@ def test_with_a_cvar_the_worst_starts_count_on_average() -> None:
         return no_worse(scores(costs), scores(mpc), scores(mpc), tolerance).reason
 
     assert reason([0.9, 0.1]) == reason([1.9]) == ""  # (.9 + .1 - 3 * .5) / 5 is below .2
-    assert "start 0 costs 0.9 more" in reason([0.9, 0.1], Tolerance(0.2))
+    assert "start 0 costs 4.5 % of" in reason([0.9, 0.1], Tolerance(0.2))
     assert "the worst 5 % of the starts cost too much, start 4" in reason([0.9, 0.9, 0.9, 0.9, 1.0])
-    assert reason([2.1]).startswith("start 0 costs 2.1")  # ten times what the average may
+    assert reason([2.1]).startswith("start 0 costs 10.5 %")  # ten times what the average may
     assert "start 0" in reason([NAN])
 
 
@@ -234,7 +234,7 @@ def test_hard_starts_come_first_and_count_in_no_mean() -> None:
     dear = scores([6.5, 0.5, 1.5, 2.5])
     assert no_worse(dear, both.mpc, both.mpc, STRICT, n_hard=1).accepted
     verdict = no_worse(scores([7.5, 0, 0, 0]), both.mpc, both.mpc, STRICT, names=both.seeds)
-    assert verdict.reason == "start 101 costs 1.5 more than with the MPC"
+    assert verdict.reason == "start 101 costs 50 % of the mean cost more than with the MPC"
 
 
 def test_a_gain_is_sure_or_hopeless_by_the_pairs() -> None:

@@ -117,6 +117,12 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
     assert log.lost_steps == 3 and log.state_names == ("level", "T")
     assert log.every == (1, 1) and log.with_all_states() is log
     assert log.episodes[0].disturbances.tolist() == [[7], [7]]
+    with pytest.warns(
+        UserWarning, match=r"All 10 rows of .* one episode .*\['run', 't', 'T', 'load'\]"
+    ):
+        Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10)
+    with pytest.raises(ValueError, match=r"begins anew in each episode, name .* episode="):
+        Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, time="t")
 
 
 def test_set_points_and_loads_of_a_csv_file_reach_the_twin(write) -> None:
@@ -243,7 +249,7 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(wr
     rows = zip(10 * np.arange(60), x, u, strict=False)
     path = write("time [s],T [K],valve", *(f"{t},{a:.6f},{b:.6f}" for t, a, b in rows))
     log = Log.from_csv(path, ["T"], ["valve"], dt=10, time="time")
-    assert Log.from_csv(path, ["T [K]"], ["valve"], dt=10).state_names == ("T",)
+    assert Log.from_csv(path, ["T [K]"], ["valve"], dt=10, time="time").state_names == ("T",)
     assert repr(log) == "Log(1 episode, 59 steps of dt = 10 s; 1 state (T), 1 input (valve))"
     model = identify(log).model
     assert (model.state_names, model.units, model.time_unit) == (("T",), ("K", ""), "s")

@@ -92,10 +92,30 @@ def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     )
 
 
-def test_bars_of_parts_count_and_foretell_nothing(clock, capsys) -> None:
+def test_bars_of_parts_count_foretell_nothing_and_leave_nothing_in_a_file(
+    clock, capsys, monkeypatch
+) -> None:
     with shown(True, parts=True):
         counted(clock, each=1.0)
-    assert capsys.readouterr().err.splitlines()[0] == "plans: 3 of 100"
+        assert capsys.readouterr() == ("", "")
+        screen = Terminal()
+        monkeypatch.setattr(sys, "stderr", screen)
+        monkeypatch.setattr(sys, "__stderr__", screen)
+        counted(clock, each=1.0)
+    assert "plans: 3 of 100" in screen.getvalue()
+
+
+def test_a_detail_is_a_line_of_a_file_where_there_was_no_other_of_late(clock, capsys) -> None:
+    progress = Progress()
+    clock.now += 5.0
+    progress("a round is over")
+    for _ in range(4):
+        clock.now += 10.0
+        progress("a fit", detail=True)
+    assert [each.partition("] ")[2] for each in capsys.readouterr().err.splitlines()] == [
+        "a round is over",
+        "a fit",
+    ]
 
 
 def test_false_silences_all_that_is_called(clock, capsys) -> None:

@@ -243,7 +243,8 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:
     if share < EXPLAINED_REWARD:
         warn(
             f"The env has a reward of its own, and it is ignored: the MPC's stage cost explains "
-            f"{100 * share:.0f} % of it over {np.count_nonzero(known)} steps of the MPC. What "
+            f"{100 * share:.0f} % of it over {np.count_nonzero(known)} steps of the MPC. Weights "
+            "may differ, or the rest that distances count from, x_ss and u_ss of the model. What "
             "counts here is the MPC's stage cost. If the reward is what you want, state it in Q "
             "and R of the MPC, or learn under an ImprovementGuard or a Commissioning, which go by "
             "the reward; else wrap the env in sb3_yann.wrappers.StageCost(env, mpc).",

@@ -145,8 +145,9 @@ class Rewards(NamedTuple):
                 )
         return "unknown", (
             "none that the audit knows. Compare the env's reward with problem.stage_cost(theta, u) "
-            "step by step: weights, units, what an observation means, repeated actions, wrappers "
-            "that change rewards, observations, actions or time."
+            "step by step: weights, units, the rest (x_ss, u_ss) that distances count from, what "
+            "an observation means, repeated actions, wrappers that change rewards, observations, "
+            "actions or time."
         )
 
 

@@ -30,6 +30,7 @@ class LinearSystem(ReadOnlyArrays):
     d_ss: Array
     notes: tuple[str, ...] = ()
     drift: Array | None = None
+    gain_errors: Array | None = None
     state_names: tuple[str, ...] = ()
     input_names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()

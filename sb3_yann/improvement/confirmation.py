@@ -88,6 +88,13 @@ class Check:
     final: bool = False
     interval: tuple[float, float] | None = None
 
+    @property
+    def verdict(self) -> str:
+        """Whether it was accepted, or why not, in words."""
+        if self.accepted:
+            return "accepted" if self.final else "no objection"
+        return self.reason or "too little, or not sure"
+
 
 @dataclass
 class Trial:
@@ -195,7 +202,8 @@ class Trial:
             reason = "a start outside the log breaks a bound of the problem"
         beyond = (excess - self.room())[~known]
         if not reason and not np.all(beyond <= 0):
-            reason = f"a start outside the log costs {excess[~known][np.argmax(beyond)]:.4g} more"
+            more = 100 * excess[~known][np.argmax(beyond)] / mean
+            reason = f"a start outside the log costs {more:.3g} % of the mean cost more"
         change = float(excess[known].mean())
         worst = float(excess[known].max())
         shown = change / mean, worst / mean, safe, logged / mean, error / mean

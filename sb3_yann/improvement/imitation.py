@@ -14,6 +14,7 @@ from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback, Mask
 from sb3_yann.compare import RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
+from sb3_yann.evaluation import change_in_percent
 from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.yann import LawLayer
@@ -245,8 +246,8 @@ def imitate(
         saved = teacher.saved(played.costs, teacher.usual)
         objection = teacher.objection(played)
         say(
-            f"fit {fit + 1}: in the model the policy gains {in_percent(saved)}, plans "
-            f"{in_percent(teacher.gain)}{'; ' * bool(objection)}{objection}"
+            f"fit {fit + 1}, in the model: policy {change_in_percent(-saved)}, plans "
+            f"{change_in_percent(-teacher.gain)}{'; ' * bool(objection)}{objection}"
         )
         if score > most + NEAR / 2 * teacher.gain:
             since = fit
@@ -261,11 +262,6 @@ def imitate(
         layer.load_state_dict(fitted)
     layer.load_state_dict(best)
     return promised
-
-
-def in_percent(gain: float) -> str:
-    """Return a gain to a thousandth of a percent, without a sign of zero."""
-    return f"{round(100 * gain, 3) + 0.0:g} %"
 
 
 def fit_layer(

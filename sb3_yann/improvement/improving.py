@@ -37,7 +37,6 @@ from sb3_yann.improvement.imitation import (
     Teacher,
     controller_of,
     imitate,
-    in_percent,
     policy_of,
     refit_critic,
 )
@@ -83,7 +82,7 @@ class Improvement:
     Attributes
     ----------
     checks : tuple of Check
-        The comparisons with the MPC, in the twin or in the simulator.
+        The comparisons of candidates with the MPC, in the twin or in the simulator.
     change : float
         The accepted policy's mean cost there against the MPC's: -0.02 is 2 % less.
     accepted : bool
@@ -129,7 +128,8 @@ class Improvement:
     def interval(self) -> tuple[float, float]:
         """Where the last policy's change lies with 90 %: in the simulator, or on a twin's plant.
 
-        Infinite where no policy came so far that its change was estimated.
+        Ends are fractions of the MPC's mean cost: -0.02 is 2 % less. They are infinite where no
+        policy came so far that its change was estimated.
         """
         known = [each.interval for each in self.checks if each.interval is not None]
         return known[-1] if known else (-np.inf, np.inf)
@@ -143,13 +143,18 @@ class Improvement:
         """Why nothing was accepted; empty where something was."""
         if self.accepted:
             return ""
-        refused = [each for each in self.checks if each is not self.before]
-        final = [each for each in refused if each.final] or refused
-        said = self.note or (final[-1].reason if final else "")
-        if not said and final:
-            gained = -100 * final[-1].change
-            said = f"a gain of {gained:.2g} % in {self.where} is too small, or not sure"
-        return f"Nothing better was found: {said or f'no gain in {self.where}'}."
+        said = self.note or (self._last.reason if self._last else f"no gain in {self.where}")
+        if not said and self._last:
+            change = change_in_percent(self._last.change)
+            said = f"{change} in {self.where} is too little, or not sure"
+        return f"Nothing better was found: {said}."
+
+    @property
+    def _last(self) -> Check | None:
+        """The candidate that decided: the last one, of those that were confirmed if any was."""
+        tried = [each for each in self.checks if each is not self.before]
+        decided = [each for each in tried if each.final] or tried
+        return decided[-1] if decided else None
 
     def report(self) -> str:
         """Return in words what was accepted, or why nothing was, what it took, and what next."""
@@ -158,14 +163,11 @@ class Improvement:
         source = "twin" if self.where == "the twin" else "env"
         if not self.accepted:
             said = f"{self.reason} The model is as it was."
-            return summary_lines(said, steps=steps, next=self._next())
+            last = self._last
+            change = f"{self._change(last.change, last)}: not accepted" if last else ""
+            return summary_lines(said, change=change, steps=steps, next=self._next())
         last = next((each for each in reversed(self.checks) if each.accepted), None)
-        interval = last.interval if last is not None else None
-        change = change_in_percent(self.change, interval if source == "env" else None)
-        rows = {"change": f"{change} of the MPC's mean cost in {self.where}"}
-        if source == "twin" and interval is not None:
-            low, high = (100 * each for each in interval)
-            rows["change"] += f"; on the plant {low:+.2f} to {high:+.2f} % (90 %)"
+        rows = {"change": self._change(self.change, last)}
         if last is not None:
             rows["worst_start"] = f"{change_in_percent(last.worst)} of the MPC's mean cost"
             rows["worst_start"] += " in the twin: the plant's may be worse" * (source == "twin")
@@ -174,6 +176,15 @@ class Improvement:
         more = f'report(result.model, "report.html", {which}), then '
         more += "Commissioning(result.model, plant, shadow=True)"
         return summary_lines("Accepted: a better policy.", **rows, steps=steps, next=more)
+
+    def _change(self, change: float, check: Check | None) -> str:
+        """Return a change with the interval of its check: in the simulator, or on the plant."""
+        interval = None if check is None else check.interval
+        if self.where == "the twin" and interval is not None:
+            low, high = (100 * each for each in interval)
+            more = f"; on the plant {low:+.2f} to {high:+.2f} % (90 %)"
+            return f"{self._change(change, None)}{more}"
+        return f"{change_in_percent(change, interval)} of the MPC's mean cost in {self.where}"
 
     def _next(self) -> str:
         """Return what leads on after a refusal."""
@@ -341,8 +352,8 @@ class _Progress:
         self.simulator: Simulator | None = None
         self.ends: list[float] = []  # when the data were there, and when each round was over
 
-    def __call__(self, text: str, pairs: int = 0) -> None:
-        """Write a line; ``pairs`` of a confirmation have been played."""
+    def __call__(self, text: str, pairs: int = 0, detail: bool = False) -> None:
+        """Write a line; ``pairs`` of a confirmation have been played. Changes are of the cost."""
         left = 0.0
         if len(self.ends) > 1:
             each = (self.ends[-1] - self.ends[0]) / (len(self.ends) - 1)
@@ -350,7 +361,11 @@ class _Progress:
             left = max(each * (self.rounds - over) - (time.monotonic() - self.ends[-1]), 0.0)
             if self.simulator:
                 left += self.simulator.seconds_of(2 * max(LOOKS[-1] - pairs, 0))
-        self.write(text, left)
+        self.write(text, left, detail)
+
+    def detail(self, text: str) -> None:
+        """Write a line that a file can do without."""
+        self(text, detail=True)
 
     def begin(self, simulator: Simulator) -> None:
         """Count the steps of a simulator."""
@@ -450,17 +465,17 @@ class _Work:
                 scenarios = self._of_estimates(scenarios, episodes, self.seed + number)
             teacher = Teacher(scenarios, self.seed + number)
             teacher.show()
-            gain = in_percent(teacher.gain)
+            plans = f"plans {change_in_percent(-teacher.gain)}"
             if shown is None and not teacher.gain > RULE.least_gain / 10:
-                return improvement(False, f"plans gain {gain} in the twin, too little to teach")
+                return improvement(False, f"{plans} in the twin, too little to teach")
             if shown is not None:
                 teacher.earlier = [*shown.earlier, *shown.taught.values()]
-            gained = imitate(self.layer, teacher, self.updates, self.say)
+            gained = imitate(self.layer, teacher, self.updates, self.say.detail)
             shown = teacher
             self.say.end_of_round()
             self.say(
-                f"round {number + 1} of at most {self.rounds}: in the twin the policy gains "
-                f"{in_percent(gained)}, plans {gain}"
+                f"round {number + 1} of at most {self.rounds}, in the twin: policy "
+                f"{change_in_percent(-gained)}, {plans}"
             )
             if passes(1.0):
                 return improvement(True)
@@ -503,12 +518,14 @@ class _Work:
                 found = replace(found, accepted=False, reason=reason)
             else:
                 found = self._forecast(trial.twin, found)
-        self.checks.append(found)
-        self.say(
-            f"{share:.0%} of the correction: {100 * found.change:+.2f} %, "
-            f"{found.reason or 'no worse anywhere'}"
-        )
+        self.note(found, f"{share:.0%} of the correction", found.verdict)
         return found
+
+    def note(self, found: Check, how: str, verdict: str, pairs: int = 0) -> None:
+        """Keep a candidate's check, and write a line with its number."""
+        self.checks.append(found)
+        change = change_in_percent(found.change)
+        self.say(f"candidate {len(self.checks)}, {how}: {change}, {verdict}", pairs)
 
     def _forecast(self, twin: PlantTwin, check: Check) -> Check:
         """Return a check with what the layer changes on the plant; it must surely gain."""
@@ -540,7 +557,7 @@ class _Work:
             if self.has_learnt:
                 next(trial.stages(self.act(), [FIRST_LOOK]))
                 before, _ = trial.check(0, RULE.significance, final=False)
-                self.checks.append(before)
+                self.note(before, f"learnt before, {FIRST_LOOK} starts", before.verdict)
             else:
                 trial.extend(FIRST_LOOK)
                 assert trial.played is not None
@@ -592,18 +609,17 @@ class _Work:
         for number in range(self.rounds):
             model, teacher = self._taught(simulator, lost, number)
             if teacher.gain < RULE.least_gain:
-                note = f"plans gain {100 * teacher.gain:.2g} %, too little to teach"
+                note = f"plans {change_in_percent(-teacher.gain)}, too little to teach"
                 break
-            promised = imitate(self.layer, teacher, self.updates, self.say)
+            promised = imitate(self.layer, teacher, self.updates, self.say.detail)
             next(trial.stages(self.act(), [len(trial.starts.seeds)]))
             found, _ = trial.check(number + 1, RULE.significance, final=False)
-            self.checks.append(found)
             self.say.end_of_round()
-            self.say(
-                f"round {number + 1} of at most {self.rounds}: the model promises "
-                f"{-100 * promised:+.2f} %, the simulator shows {100 * found.logged:+.2f} %"
-                f" from {len(trial.scores.costs)} starts; plans gain {100 * teacher.gain:.2f} %"
-            )
+            changes = found.logged, -promised, -teacher.gain
+            own, modelled, planned = map(change_in_percent, changes)
+            how = f"round {number + 1} of at most {self.rounds}, {len(trial.scores.costs)} starts"
+            verdict = f"start by start {own}, in the model {modelled}, plans {planned}"
+            self.note(found, how, verdict)
             lost = trial.lost
             useful = found.safe and found.change < least
             stalls = least < best and found.change > (1 + LITTLE_MORE) * least
@@ -629,16 +645,12 @@ class _Work:
             found, trial = confirm(self.act(), simulator, len(self.checks) + 1, self.say, share)
             if found.accepted and not found.change < best:
                 found = replace(found, accepted=False, reason="the model's own policy is as good")
-            self.checks.append(found)
-            self.say(
-                f"confirmation on {len(trial.scores.costs)} new starts: "
-                f"{100 * found.change:+.2f} %, {found.reason or 'accepted'}",
-                pairs=LOOKS[-1],
-            )
+            how = f"confirmation on {len(trial.scores.costs)} new starts"
+            self.note(found, how, found.verdict, LOOKS[-1])
             if found.accepted:
                 self.accept(model)
                 return True
             if attempt < TRIES - 1:
                 model, teacher = self._taught(simulator, trial.lost, self.rounds + attempt)
-                imitate(self.layer, teacher, self.updates, self.say)
+                imitate(self.layer, teacher, self.updates, self.say.detail)
         return False

@@ -29,7 +29,7 @@ from sb3_yann.audit.meaning import (
 from sb3_yann.compare import NewSeeds, unsafe_columns
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import bound_excess
-from sb3_yann.env_pool import EnvPool, Source, maker, pool_of
+from sb3_yann.env_pool import EnvPool, Source, maker, name_of, pool_of
 from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import Controller, Rows, Trajectories, joined, of_episode, rollout
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
@@ -128,7 +128,7 @@ class Simulator:
             self.row = RowLayout(problem, observer_of(one))
             self.unaware = below_set_points(one)
             require_spaces(problem, one)
-            self.name = str(getattr(one.spec, "id", type(one.unwrapped).__name__))
+            self.name = name_of(one)
         self.new_seeds = NewSeeds(FIRST + APART * seed)
         self.longest = 0
         self.episodes: list[Episode] = []

@@ -428,6 +428,11 @@ def improve_part(subject: Subject) -> Part:
         checks = str(len(each.checks))
         place = f"{each.where}: {each.source}"
         rows.append([str(k), place, str(each.episodes), checks])
+    tried = [
+        [f"{k}.{j}", change_in_percent(of.change), change_in_percent(of.worst), of.verdict]
+        for k, each in enumerate(found, start=1)
+        for j, of in enumerate(each.checks, start=1)
+    ]
     settings = [
         [name, str(v), IMPROVE_SETTINGS.get(name, "")]
         for name, v in found[-1].settings.items()
@@ -443,6 +448,9 @@ def improve_part(subject: Subject) -> Part:
         paragraph(how),
         table(["", "in", "episodes", "candidates"], rows),
         *(lines(f"{k}. {each.report()}") for k, each in enumerate(found, start=1)),
+        tag("h3", "Every candidate"),
+        paragraph("What it changes of the MPC's mean cost; minus is cheaper."),
+        table(["", "change", "worst start", "verdict"], tried),
         tag("h3", "Settings of the last improvement"),
         table(["setting", "value", "what it is"], settings),
     ]

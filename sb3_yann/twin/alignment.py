@@ -504,7 +504,7 @@ def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
         return
     for i in np.flatnonzero(away > 0.5):
         yield (
-            f"Without inputs the logged plant rests at {names[i]} = {shown[i]:.4g}, the "
+            f"With inputs at u_ss the logged plant rests at {names[i]} = {shown[i]:.4g}, the "
             f"problem's at {x_ss[i]:.4g}: compare units and operating point of states and inputs. "
             f"{CONFIRM}"
         )

@@ -27,6 +27,10 @@ REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes wor
 TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
 EACH = 5  # episodes, at least, all of which speak against a judge
 MEMORY = 2  # earlier samples that a memory knows
+REMEMBERED = (
+    "errors that follow earlier inputs and errors, as in this log, perhaps because of a lag or a "
+    "load that lasts"
+)
 LESS = 0.02  # share of the errors of one step that it must explain on held-out episodes
 MEMORY_RIDGE = 1e-3  # of its standardized regressors
 MIN_RUNS = 100  # from new starts, at least
@@ -222,7 +226,7 @@ def forecast(
             replays = _Replays(judge, episodes, remembers)
             if surely_worse(replays.left - (own if remembers else plain).left):
                 continue
-            says = "hidden dynamics" if remembers else judge.says
+            says = REMEMBERED if remembers else judge.says
             for first in begins:
                 mpc, policy = (replays.costs(each, first) for each in (law, act))
                 found.append((*_changed(mpc, policy, independent), says))
@@ -278,10 +282,10 @@ def _cure(
     more: Callable[[int], str],
 ) -> str:
     """Return what would settle a change whose interval contains zero."""
-    if middle >= 0 or says == "hidden dynamics":
-        kind = " for longer than the actuator takes" if says == "hidden dynamics" else ""
-        which = f"; {says} says otherwise" if says else ""
-        return f"log held steps of {loosest}{kind}{which}"
+    if middle >= 0 or says == REMEMBERED:
+        kind = " for longer than the actuator takes" if says == REMEMBERED else ""
+        which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
+        return f"log held steps of {loosest}{kind}{which if says else ''}"
     if not np.isfinite(high - low):
         return "log more episodes"
     needed = independent * min(((high - middle) / middle) ** 2, 100.0)

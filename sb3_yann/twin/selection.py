@@ -423,7 +423,7 @@ def judges(
     for rival, setting, wrong in zip(rivals, others, worse, strict=True):
         assert setting.gain is not None
         j, times = setting.gain
-        says = f"a gain of {names[j]} {times:g} times the model's, which the log allows,"
+        says = f"a gain of {names[j]} {times:g} times the model's, which the log allows"
         found.append(Judge(Dynamics(problem, coordinates, rival.by_fold), says, bool(wrong)))
     return tuple(found)
 
@@ -454,7 +454,7 @@ def reidentified(
         x, u = _rest(problem, A, B, residual.predict(middle)[0])
     note = f"Re-identified from {len(log)} episodes: {choice.name}."
     own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
-    own |= {"notes": [*model.notes, note], "drift": None}
+    own |= {"notes": [*model.notes, note], "drift": None, "gain_errors": None}
     found = LinearModel(**{**vars(model), **own})
     terminal = Terminal(set="invariant" if len(problem.terminal.set[1]) else None)
     return replace(problem, model=found, terminal=terminal)

@@ -25,6 +25,7 @@ from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
+from sb3_yann.env_pool import name_of
 from sb3_yann.units import ActionUnits
 from sb3_yann.wrappers.theta import (
     Env,
@@ -160,8 +161,8 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     mpc : LinearMPC
         Without measured disturbances: those are the env's own, see :class:`MeasuredDisturbance`.
     start_low, start_high : array_like, shape (n,), or float, optional
-        The box that episodes begin in; by default half as wide as that of theta, about the
-        operating point.
+        The box that episodes begin in. By default it is a quarter of the width of theta's box to
+        either side of ``mpc.model.x_ss``, and ends where that box does.
     max_episode_steps : int, default 100
     hold : int, optional
         Steps after which another set-point is drawn, as of :class:`SetPoint`.
@@ -291,6 +292,7 @@ class Equations(gym.Env[Array, Array]):
 
     def __init__(self, f: Slope, mpc: LinearMPC, start: tuple[Array, Array], substeps: int) -> None:
         self.f = f
+        self.plant_name = name_of(f)
         self.start = start
         self.substeps = substeps
         self.dt = mpc.model.dt

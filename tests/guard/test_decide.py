@@ -70,7 +70,8 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     model, guard = tried(spoil_left, env=OftenRight, n_new_starts=20)
     decision = guard.decisions[0]
     assert decision.verdict == "accepted in part"
-    assert decision.reason == "on 5 new starts, start 1000011 costs 4 more than with the MPC"
+    said = "on 5 new starts, start 1000011 costs 89.9 % of the mean cost more than with the MPC"
+    assert decision.reason == said
     assert decision.regions == (REGION[RIGHT],)
     weights = last_layer(model)[:, :, -1]
     assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()

@@ -206,15 +206,17 @@ def test_a_given_env_is_copied_and_left_where_it_is() -> None:
 
 def test_lines_say_what_is_done_and_read_well_in_a_file(capsys, monkeypatch) -> None:
     monkeypatch.setattr("sb3_yann._progress.DELAY", 0)
-    improve(model_of(), Spring, **FEW)
+    found = improve(model_of(), Spring, **FEW)
     lines = [each for each in capsys.readouterr().err.splitlines() if each.startswith("[")]
     assert len(lines) >= 3
     assert not any("\r" in line or "\x1b" in line for line in lines)
     assert "episodes of the MPC, half with random inputs" in lines[0]
-    shown = next(line for line in lines if "the model promises" in line)
-    assert "the simulator shows" in shown and " s left]" in shown
+    shown = next(line for line in lines if "] candidate 1, round 1 of at most" in line)
+    assert ", in the model -" in shown and ", plans -" in shown and " s left]" in shown
     assert any(" pairs: -" in line for line in lines)
-    assert "confirmation on" in lines[-1] and lines[-1].endswith("accepted")
+    last = f"candidate {len(found.checks)}, confirmation on"
+    assert last in lines[-1] and lines[-1].endswith(f"{100 * found.change:+.2f} %, accepted")
+    assert not any("fit 1" in line or " of 30" in line for line in lines)  # of little use there
     improve(model_of(Plain), Plain, progress_bar=False, **FEW)
     assert capsys.readouterr() == ("", "")
 
@@ -427,8 +429,8 @@ def test_a_policy_of_a_twin_gains_on_the_plant(capsys, monkeypatch) -> None:
     assert found.accepted and found.where == "the twin" and found.source == repr(twin_of())
     assert found.change < -0.01 and found.episodes == 10 and found.steps == 0
     lines = [each for each in capsys.readouterr().err.splitlines() if each.startswith("[")]
-    assert "no worse anywhere" in lines[-1]
-    assert any("in the twin the policy gains" in line and "plans" in line for line in lines)
+    assert lines[-1].endswith("no objection")
+    assert any("in the twin: policy -" in line and ", plans -" in line for line in lines)
     assert relative(model).mean() < 0.995 and relative(model).max() < 1.01
     again = model_of()
     assert improve(again, twin_of(), **ENOUGH).checks == found.checks
@@ -552,12 +554,13 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     there = str(replace(twin, where="the simulator", steps=5000))
     assert "change       -2.10 % (-3.00 to -0.20 %, 90 %) of the MPC's mean cost" in there
     assert "steps        5,000 of the simulator, 1 candidate tried" in there
-    assert Improvement((refused,), 0.0, accepted=False).report().splitlines()[:2] == [
+    assert Improvement((refused,), 0.0, accepted=False).report().splitlines()[:3] == [
         "Nothing better was found: 2 starts with violations. The model is as it was.",
+        "  change       -3.00 % of the MPC's mean cost in the twin: not accepted",
         "  steps        1 candidate tried",
     ]
     small = Check(1, True, "", -4e-4, 0.0, True)
-    assert "a gain of 0.04 % in the twin is too small, or not sure" in str(
+    assert "-0.04 % in the twin is too little, or not sure" in str(
         Improvement((small,), 0.0, accepted=False)
     )
     assert Improvement((), 0.0, False).reason == "Nothing better was found: no gain in the twin."
@@ -573,7 +576,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
         ),
         (
             "the twin",
-            "plans gain 0 %, too little to teach",
+            "plans +0.00 %, too little to teach",
             "keep the MPC: there is little to gain",
         ),
         ("the twin", "2 starts with violations", "held steps of the inputs that twin.report()"),

@@ -333,9 +333,9 @@ def improved(tmp_path_factory):
     model = moved(0.1)
     settings = {"n_starts": 7, "updates": 1000}
     weights = evidence_parts.fingerprint(model.policy.actor.state_dict())
-    check = Check(1, True, "", -0.1, 0.01, True)
+    checks = Check(1, False, "it fell", -0.2, 0.07, True), Check(2, True, "", -0.1, 0.01, True)
     found = Improvement(
-        (check,), -0.1, True, source="a log", episodes=5, settings=settings, policy=weights
+        checks, -0.1, True, source="a log", episodes=5, settings=settings, policy=weights
     )
     model.improvements = (found,)
     folder = tmp_path_factory.mktemp("improved")
@@ -351,6 +351,7 @@ def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) ->
     for said in (
         "The policy is the one that improve accepted last, in the twin (5 episodes",
         *(line.split()[0] for line in found.report().splitlines()), found.source,
+        "1.1 -20.00 % +7.00 % it fell 1.2 -10.00 % +1.00 % no objection",
         "n_starts 7 episodes for which the best inputs are planned", "updates 1000 steps of the",
     ):  # fmt: skip
         assert said in text

@@ -13,7 +13,7 @@ from sb3_yann import LinearModel, LinearMPC, PlantTwin, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import plant_twin
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.forecast import _Replays
+from sb3_yann.twin.forecast import REMEMBERED, _cure, _Replays
 from sb3_yann.twin.trust import costs_of
 from sb3_yann_envs import ProblemBox
 from twin_samples import POLYNOMIALS, Cart, problem
@@ -100,6 +100,9 @@ def test_where_it_may_cost_more_it_is_said_what_would_settle_it() -> None:
     law = law_of(MPC)
     _, low, high, cure = found.forecast(lambda x: np.clip(1.05 * law(x), -1, 1))
     assert low < 0 < high and ("held steps of u[0]" in cure or "episodes more" in cure)
+    said = _cure(0.01, -0.01, 0.02, REMEMBERED, 9, "u[0]", str)
+    assert said.startswith("log held steps of u[0] for longer than the actuator takes; with errors")
+    assert said.endswith("perhaps because of a lag or a load that lasts, the change is -1 to +2 %")
 
 
 @pytest.mark.slow

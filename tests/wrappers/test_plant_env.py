@@ -26,7 +26,9 @@ from sb3_yann import (
     improve,
     offset_free,
 )
+from sb3_yann.env_pool import name_of
 from sb3_yann.evaluation import evaluate
+from sb3_yann.improvement.simulator import Simulator
 from sb3_yann.wrappers import SeededGlobals, TruncateAtTimeLimit
 
 
@@ -54,6 +56,14 @@ def test_it_rests_where_the_model_does_and_begins_in_its_box() -> None:
     assert info["state"].tolist() == x.tolist()
     starts = np.array([env.reset(seed=k)[0] for k in range(50)])
     assert 325 <= starts.min() < 335 and 365 < starts.max() <= 375
+
+
+def test_its_name_is_that_of_its_function_and_none_is_a_lambda_s() -> None:
+    mpc = LinearMPC(TANK, **WEIGHTS, **BOX)
+    make = lambda: PlantEnv(slope, mpc)  # noqa: E731
+    assert (name_of(make()), name_of(make)) == ("slope", "plant")
+    assert name_of(PlantEnv(lambda x, u: slope(x, u), mpc)) == "plant"
+    assert Simulator(mpc, make, 0).name == "slope"
 
 
 @pytest.mark.parametrize(("faster", "words"), [

@@ -22,6 +22,7 @@ from sb3_yann.control.identification.dead_time import (
 from sb3_yann.control.identification.least_squares import (
     EXTRAPOLATED,
     Regression,
+    gain_errors,
     operating_point,
     regress,
     regularized,
@@ -120,7 +121,9 @@ def system_of(
     away = np.flatnonzero(np.abs(x - found.center[:n]) > EXTRAPOLATED * found.spread[:n])
     if away.size:
         notes.append(f"x_ss[{away[0]}] lies far outside the data: the model is extrapolated.")
-    return LinearSystem(A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None)
+    return LinearSystem(
+        A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None, gain_errors(found, n, m)
+    )
 
 
 def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:

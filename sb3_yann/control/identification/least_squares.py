@@ -203,6 +203,21 @@ def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
     return values[order], errors[order]
 
 
+def gain_errors(found: Regression, n: int, m: int) -> Array | None:
+    """Return standard errors (n, m) of the steady gains G, None where an integrator has none.
+
+    To first order ``dG = (I - A)^-1 (dA G + dB)``, the delta method.
+    """
+    try:
+        settle = np.linalg.inv(np.eye(n) - found.coefficients[:, :n])
+    except np.linalg.LinAlgError:
+        return None
+    moved = np.vstack([settle @ found.coefficients[:, n : n + m], np.eye(m)])
+    part = found.correlation[: n + m, : n + m]
+    rows = np.sum((settle @ found.covariance) * settle, axis=1)
+    return np.asarray(np.sqrt(np.abs(np.outer(rows, np.sum(moved * (part @ moved), axis=0)))))
+
+
 def pole_note(found: Regression, n: int) -> str:
     """Return the 95 % intervals of the poles in words, one of each complex pair."""
     values, errors = pole_errors(found, n)

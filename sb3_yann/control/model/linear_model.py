@@ -60,6 +60,8 @@ class LinearModel(LinearSystem):
     drift : array_like, shape (n,), optional
         Measured motion in one sample at the operating point, which the model leaves out. Zeros
         where it is within its uncertainty. Ignored and dropped as the notes are.
+    gain_errors : array_like, shape (n, m), optional
+        Standard errors of the steady gains, for the report. Ignored and dropped as the notes are.
     state_names, input_names : sequence of str, optional
         Names for reports, n and m of them. Equality ignores them.
     units : mapping from name to str, or sequence of n + m str, optional
@@ -82,6 +84,7 @@ class LinearModel(LinearSystem):
 
     notes: tuple[str, ...] = field(init=False, repr=False, compare=False)
     drift: Array = field(init=False, repr=False, compare=False)
+    gain_errors: Array | None = field(init=False, repr=False, compare=False)
     state_names: tuple[str, ...] = field(default=(), compare=False)
     input_names: tuple[str, ...] = field(default=(), compare=False)
     units: tuple[str, ...] = field(default=(), compare=False)
@@ -101,6 +104,7 @@ class LinearModel(LinearSystem):
         *,
         notes: Sequence[str] = (),
         drift: ArrayLike | None = None,
+        gain_errors: ArrayLike | None = None,
         state_names: Sequence[str] = (),
         input_names: Sequence[str] = (),
         units: Units = (),
@@ -122,6 +126,8 @@ class LinearModel(LinearSystem):
         u = check_vector("u_ss", u_ss, B.shape[1])
         d = check_vector("d_ss", d_ss, E.shape[1])
         moved = check_vector("drift", drift, n)
+        if gain_errors is not None:
+            gain_errors = check_array("gain_errors", gain_errors, B.shape)
         named = (
             as_names("state_names", state_names, n),
             as_names("input_names", input_names, u.size),
@@ -142,6 +148,7 @@ class LinearModel(LinearSystem):
             d,
             notes=tuple(notes),
             drift=moved,
+            gain_errors=gain_errors,
             state_names=named[0],
             input_names=named[1],
             units=kept,

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
+from sb3_yann.control.identification.least_squares import NORMAL
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
@@ -153,7 +154,9 @@ def _scaling(model: LinearSystem) -> list[str]:
         )
     if np.min(np.abs(np.linalg.eigvals(model.A) - 1)) > ON_CIRCLE:
         gain = np.linalg.solve(np.eye(model.n_states) - model.A, model.B)
-        gain[np.abs(gain) < 1e-9 * np.max(np.abs(gain))] = 0.0
+        width = NORMAL * (0 * gain if model.gain_errors is None else model.gain_errors)
+        rounding = 1e-9 * np.max(np.abs(gain))
+        gain, width = (np.where(np.abs(each) < rounding, 0.0, each) for each in (gain, width))
         # An unstable plant has this steady state but does not approach it.
         stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
         verb = "moves the state to" if stable else "would balance the state at"
@@ -162,10 +165,16 @@ def _scaling(model: LinearSystem) -> list[str]:
         if np.any(model.x_ss) or np.any(model.u_ss):  # what follows are deviations
             held = "Held at u_ss + 1"
             away = "x_ss + "
+        states, inputs = labels_of(model)
         lines += [
-            f"  {held}, {labels_of(model)[1][j]} {verb} {away}{_vector(g)}."
-            for j, g in enumerate(gain.T)
+            f"  {held}, {name} {verb} {away}{_vector(*of)}."
+            for name, *of in zip(inputs, gain.T, width.T, strict=True)
         ]
+        if np.any(width):
+            lost = np.argwhere((np.abs(gain) <= width) & (width > 0))
+            none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in lost)
+            unsure = f" Not distinguishable from zero: {none}." if none else ""
+            lines.append(f"  ± is a 95 % interval, under process noise.{unsure}")
     return lines
 
 
@@ -203,5 +212,7 @@ def _number(value: complex) -> str:
     return f"{value.real:.4f}" + (f" ± {abs(value.imag):.4f}i" if value.imag else "")
 
 
-def _vector(values: Array) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+def _vector(values: Array, width: Array | None = None) -> str:
+    """Return numbers, each with the half-width of its interval where that is known."""
+    known = zip(values, np.zeros(len(values)) if width is None else width, strict=True)
+    return f"({', '.join(f'{value:.4g}' + f' ± {w:.2g}' * bool(w) for value, w in known)})"

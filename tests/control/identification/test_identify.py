@@ -57,6 +57,18 @@ def test_data_without_noise_give_the_matrices_back() -> None:
 
 
 @pytest.mark.slow
+def test_steady_gains_have_errors_and_one_that_may_be_zero_is_named() -> None:
+    G = np.linalg.solve(np.eye(2) - A, B)
+    draws = [identify(*record(i, process=0.02)[:2], dt=1, held_out=0).model for i in range(200)]
+    off = [np.linalg.solve(np.eye(2) - each.A, each.B) - G for each in draws]
+    share = np.mean(np.abs(off) <= 1.96 * np.array([each.gain_errors for each in draws]), axis=0)
+    assert np.all(np.abs(share - 0.95) < 0.062), share
+    told = LinearModel(A, B, dt=1, gain_errors=[[5.0], [0.1]]).report()
+    assert f"({G[0, 0]:.4g} ± 9.8, {G[1, 0]:.4g} ± 0.2)." in told
+    assert "Not distinguishable from zero: u[0] on x[0]." in told
+
+
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say_under_process_noise() -> None:
     draws = [identify(*record(i, process=0.02)[:2], dt=1, held_out=0) for i in range(200)]
     share = np.mean([coverage(found) for found in draws], axis=0)
