@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import HealthCheck, settings
 
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")  # SB3 would put models on a GPU
 try:
     import torch as th
 except ImportError:  # models, MPC and law are tested without, see noxfile.py

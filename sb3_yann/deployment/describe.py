@@ -464,7 +464,7 @@ def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
     first = nodes.sum(1)
     rest = [each.detach().double().cpu().numpy() for each in network.weights()[1:]]
     layers = [first, *rest]
-    pinned = network.pinned_array > 0
+    pinned = network.pinned[:, 0].cpu().numpy() > 0
     if not all(np.all(np.isfinite(each)) for each in layers):
         raise ValueError(
             "The actor's weights hold NaN or infinite entries: there is nothing to export. Load an "

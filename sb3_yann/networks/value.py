@@ -414,7 +414,7 @@ def require_prediction(model: PredictionModel, n: int, m: int) -> None:
 
 def untrained(model: nn.Module) -> nn.Module:
     """Return a copy with buffers for parameters: no optimizer or target update moves those."""
-    model = copy.deepcopy(model).double()
+    model = copy.deepcopy(model).double().cpu()
     for module in model.modules():
         for name, parameter in [*module.named_parameters(recurse=False)]:
             delattr(module, name)
