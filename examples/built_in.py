@@ -56,7 +56,8 @@ def main() -> None:
     limits = {"x_min": [-2, -8], "x_max": [2, 8], "u_min": -2, "u_max": 2}
     mpc = LinearMPC(plant, **cost, horizon=2, **limits, infeasible="zero_input")
 
-    model = DDPG(YannPolicy, make_env(), seed=arguments.seed, policy_kwargs={"problem": mpc})
+    settings = {"seed": arguments.seed, "device": "cpu", "policy_kwargs": {"problem": mpc}}
+    model = DDPG(YannPolicy, make_env(), **settings)
     before = evaluate(model, make_env, TEST_SEEDS)
     guard = ImprovementGuard(make_env)
     callbacks = [NoActionNoise(), CostAudit(verbose=1), guard]

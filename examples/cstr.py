@@ -28,7 +28,8 @@ def main() -> None:
     torch.set_num_threads(1)  # the networks are too small to share among cores
     console = Console()
 
-    model = DDPG(YannPolicy, "CSTR-v0", tensorboard_log="out/tensorboard", seed=arguments.seed)
+    settings = {"seed": arguments.seed, "device": "cpu", "tensorboard_log": "out/tensorboard"}
+    model = DDPG(YannPolicy, "CSTR-v0", **settings)
     console.print(f"The policy starts as {model.policy.problem.explicit()}.")
     before = evaluate(model, "CSTR-v0", TEST_SEEDS)
 

@@ -58,7 +58,7 @@ def main() -> None:
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes.
     policy = {"problem": mpc, "max_correction": 0.05}
-    settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
+    settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed, "device": "cpu"}
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     before = evaluate(model, make, TEST_SEEDS)
     log_path = "out/own_plant.csv"

@@ -28,7 +28,7 @@ def make_env() -> StageCost:
 def main() -> None:
     """Train under the guard, and compare with the offset-free MPC."""
     options = {"policy_kwargs": {"problem": mpc}, "gamma": 0.95, "n_steps": 10, "gradient_steps": 4}
-    model = DDPG("YannPolicy", make_env(), **options)
+    model = DDPG("YannPolicy", make_env(), device="cpu", **options)
     guard = ImprovementGuard(make_env, n_eval_episodes=20, patience=10, keep_if_worse=True)
     before = evaluate(model, make_env, range(2000, 2030))
     explores = SimulatedEpisodes(make_env)

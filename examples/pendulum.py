@@ -29,7 +29,7 @@ def main() -> None:
     console = Console()
 
     # Few starts have to swing, so few episodes tell how: each is used twice, and the actor waits.
-    settings = {"gradient_steps": 2, "policy_kwargs": {"critic_warmup": 4000}}
+    settings = {"gradient_steps": 2, "policy_kwargs": {"critic_warmup": 4000}, "device": "cpu"}
     if arguments.algo == "td3":
         # Noise on the target policy, TD3's default, would spoil the critic's exact start.
         settings["target_policy_noise"] = 0.0

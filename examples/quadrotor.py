@@ -55,9 +55,9 @@ def main() -> None:
     torch.set_num_threads(1)  # the networks are too small to share among cores
     console, mpc = Console(highlight=False), hover()
     make = partial(make_env, mpc)
-
     policy = {"problem": mpc, "law": "online"}
-    model = DDPG(YannPolicy, make(), policy_kwargs=policy, gamma=mpc.gamma, seed=arguments.seed)
+    settings = {"gamma": mpc.gamma, "seed": arguments.seed, "device": "cpu"}
+    model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     console.print(f"The policy starts as {mpc.online()}.")
     before = evaluate(model, make, TEST_SEEDS)
     log_path = "out/quadrotor.csv"

@@ -46,16 +46,16 @@ PRINTED = {
         "The reward is the cost of the problem in all of",
         "50 unseen set-point sequences",
         "violations",
-        "episodes that cost more",
+        "worst start",
     ],
     "built_in": [
         "sampled every 0.05",
         "Unstable: 1 of 2 poles grow",
         "The reward is the cost of the problem in all of 100 steps",
         "50 unseen starts",
-        "episodes that cost more",
+        "worst start",
     ],
-    "quadrotor": ["OnlineLaw(constraints=241", "100 unseen starts", "episodes that cost more"],
+    "quadrotor": ["OnlineLaw(constraints=241", "100 unseen starts", "worst start"],
 }
 
 
