@@ -239,7 +239,7 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:
     known: Mask = np.asarray(np.all(np.isfinite([rewards, *costs]), axis=0), dtype=np.bool_)
     if np.count_nonzero(known) < FEWEST_REWARDS or not np.any(rewards[known]):
         return
-    share = max(_explained(-cost, rewards, known) for cost in costs)
+    share = max(explained(-cost, rewards, known) for cost in costs)
     if share < EXPLAINED_REWARD:
         warn(
             f"The env has a reward of its own, and it is ignored: the MPC's stage cost explains "
@@ -252,7 +252,7 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:
         )
 
 
-def _explained(gain: Array, rewards: Array, known: Mask) -> float:
+def explained(gain: Array, rewards: Array, known: Mask) -> float:
     """Return the share of the rewards' variance within episodes that a gain explains, 0 to 1.
 
     It is 1 where the gain does not vary, which says nothing, and 0 where rewards fall as it rises.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -15,7 +14,8 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._progress import bar, shown
-from sb3_yann._validation import Array, Feedback, check_bool, check_int, check_range
+from sb3_yann._validation import Array, Feedback, check_bool, check_int, check_range, check_type
+from sb3_yann.audit.meaning import explained
 from sb3_yann.commissioning.journal import (
     ACCEPTED_MPC,
     Accepted,
@@ -25,7 +25,7 @@ from sb3_yann.commissioning.journal import (
     Record,
     Verdict,
 )
-from sb3_yann.commissioning.plant import AcceptedPolicy, Plant, PlantEpisode
+from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import (
     RULE,
@@ -34,16 +34,15 @@ from sb3_yann.compare import (
     level_of_look,
 )
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.mpc.bound_excess import (
-    BoundExcess,
-    BoundNames,
-    bound_excess,
-    excess_of_episodes,
-)
+from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, excess_of_episodes
 from sb3_yann.env_pool import Source, one_env
 from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
-from sb3_yann.policy.checkpoint import ActorCheckpoint
+from sb3_yann.improvement.imitation import controller_of
+from sb3_yann.improvement.simulator import Scenarios
+from sb3_yann.policy.checkpoint import ActorCheckpoint, restore_whole, whole_policy
+from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -52,6 +51,8 @@ MOST_ABOVE_MPC = 0.05  # of the MPC's cost: what a policy may cost more in any c
 SAME_REWARD = 0.95  # share of the episodes' rewards that the same stage cost explains
 ALARMS = 0.25
 """Share of a policy's episodes with an alarm from which on it is taken back, two at least."""
+
+Whole = tuple[dict[str, Any], list[Any]]  # weights and optimizers: see `whole_policy`
 
 
 class Commissioning:
@@ -134,8 +135,8 @@ class Commissioning:
         verbose: int = 0,
         progress_bar: bool = True,
     ) -> None:
-        self.accepted = AcceptedPolicy(model)
-        self.policy = self.accepted.policy
+        check_type("model", model, OffPolicyAlgorithm, "a DDPG or TD3 model")
+        self.policy = require_yann_policy(model.policy, "Commissioning")
         if not (isinstance(plant_env, str | gym.Env) or callable(plant_env)):
             raise TypeError(
                 f"plant_env = {plant_env!r} must be the id of an environment, a gymnasium.Env or a "
@@ -155,6 +156,14 @@ class Commissioning:
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
         self.observer = observer_of(model.get_env()) or observer_of(plant_env)
+        # What the model has learnt before is nobody's yet: it waits to be tried.
+        has_learnt = not self.policy.actor.mu.network.is_zero()
+        self.candidate: Whole | None = whole_policy(self.policy) if has_learnt else None
+        with preserve_rng():  # building an actor draws weights
+            ActorCheckpoint.of_mpc(self.policy).restore(self.policy)
+        self._mpc = whole_policy(self.policy)
+        self._acting: Whole = self._mpc
+        self._kept: Whole = self._mpc
         record = Record(None if log_path is None else Path(log_path))
         bound = 1.0 if self.policy.max_correction is None else self.policy.max_correction
         # A model that was saved meanwhile has the bound of then.
@@ -209,7 +218,7 @@ class Commissioning:
                     played.close()
                     self._decide(plant)
             finally:
-                self.accepted.show()
+                self._show()
         return self.batches
 
     def report(self) -> str:
@@ -246,7 +255,7 @@ class Commissioning:
         turn = np.random.default_rng([self.seed, len(journal.batches), number // 2]).integers(2)
         acts = trial and not doubted and turn == number % 2
         excites = self.excite > 0 and not trial and not journal.doubted and number % 2
-        self.accepted.restore()
+        self._become(self._acting, journal.state.max_correction)
         # A simulator gives both of a pair the same start, but not after an alarm: an odd start
         # would look like a changed plant.
         again = number % 2 if trial and not journal.doubted else 0
@@ -281,103 +290,100 @@ class Commissioning:
         by_policy = any(each for _, each in journal.batch)
         who, within = (before.policy, before.max_correction) if by_policy else ("MPC", 0.0)
         alarms = sum(each.alarm is not None for each, _ in journal.batch)
-        self.accepted.restore()
-        with self._unless_cut_off():
-            if self._changed:
-                costs = compare(journal, plant, self.twin, None)
-                self.twin = self.watchdog = None
-                first = len(journal.episodes)
-                state = CommissioningState(
-                    self._first_bound, first=first, anew=number, tried=before.tried
-                )
-                self.accepted.give_back()
-                verdict: Verdict = "begins anew"
-                reason = "Two episodes in a row had an alarm."
-            else:
-                costs, state, verdict, reason = self._learn(plant, number)
-            if verdict == "accepted":
-                saved = journal.record.save(self.model, number)
-                digest = journal.record.digest_of(saved)
-                acting = Accepted(f"batch {number}", saved, digest, state.max_correction)
-                state = replace(state, acting=acting, since=number)
-            elif verdict != "stays":
-                self.accepted.keep(False)
-                state = replace(state, acting=ACCEPTED_MPC, kept=ACCEPTED_MPC, since=0)
-            self.accepted.limit(state.max_correction)
-            shown = costs.actual, costs.predicted, costs.mpc
-            sizes = number, len(journal.batch), alarms
-            journal.close(
-                Batch(*sizes, who, within, *shown, costs.difference.pairs, verdict, reason), state
+        self._become(self._acting, before.max_correction)
+        twin = None
+        if self._changed:
+            costs = compare(journal, plant, self.twin, None)
+            first = len(journal.episodes)
+            state = CommissioningState(
+                self._first_bound, first=first, anew=number, tried=before.tried
             )
+            verdict: Verdict = "begins anew"
+            reason = "Two episodes in a row had an alarm."
+        else:
+            numbers = journal.log
+            seed = self.seed + number
+            fitted = self._fit(numbers, seed) if len(numbers) > 1 else None
+            twin = fitted if fitted is not None and fitted.trusted else None
+            costs = compare(journal, plant, self.twin, twin or self.twin)
+            state = before if twin is None else replace(before, twin=numbers, twin_seed=seed)
+            state, verdict, reason = self._judge(state, costs, fitted, number)
+            twin = twin or self.twin
+        if verdict == "accepted":
+            saved = journal.record.save(self.model, number)
+            acting = Accepted(f"batch {number}", saved, state.max_correction)
+            state = replace(state, acting=acting, since=number)
+        elif verdict != "stays":
+            self._become(self._mpc, state.max_correction)
+            state = replace(state, acting=ACCEPTED_MPC, kept=ACCEPTED_MPC, since=0)
+        shown = costs.actual, costs.predicted, costs.mpc
+        sizes = number, len(journal.batch), alarms
+        acts = whole_policy(self.policy)
+        journal.close(
+            Batch(*sizes, who, within, *shown, costs.difference.pairs, verdict, reason), state
+        )
+        # All of it holds from here on: an error or Ctrl-C before has changed nothing.
+        known = {before.kept: self._kept, before.acting: self._acting}
+        self._kept = known.get(state.kept, self._mpc)
+        self._acting = acts
+        self.candidate = None if state.tried else self.candidate
+        self._watch(twin)
         if self.verbose:
             print(self.journal.report().splitlines()[-1])
 
-    def _learn(self, plant: Plant, number: int) -> tuple[Costs, CommissioningState, Verdict, str]:
-        """Decide by the pairs, fit the twin anew, and improve where no policy is on trial."""
-        before = self.twin
-        numbers = self.journal.log
-        seed = self.seed + number
-        twin = self._fit(numbers, seed) if len(numbers) > 1 else None
-        known = twin if twin is not None and twin.trusted else None
-        costs = compare(self.journal, plant, before, known or before)
-        state = self.journal.state
-        said = ""
-        if known is not None:
-            self.twin = known
-            self.watchdog = Watchdog.of(known)
-            state = replace(state, twin=numbers, twin_seed=seed)
-        if why := why_taken_back(self.journal, costs):
-            return costs, *self._take_back(state, number, why)
-        if self.journal.accepted and not state.is_kept:
-            if not is_kept(costs):
-                return costs, state, "stays", f"{costs.difference.pairs} pairs are not enough."
-            self.accepted.keep(True)
-            state = replace(state, kept=state.acting)
-            said = f"{costs.difference.pairs} pairs show that it costs less. "
-        if known is None:
-            why = f"There are {len(numbers)} episodes to learn from."
-            if twin is not None:
-                why = " ".join(["The twin is not trusted.", *twin.trust.problems])
-            verdict: Verdict = "stays" if state.is_kept else "the MPC acts"
-            return costs, state, verdict, f"{said}{why}"
-        state, verdict, found = self._improve(known, state, seed)
-        return costs, state, verdict, f"{said}{found}"
-
-    def _take_back(
-        self, state: CommissioningState, number: int, why: str
+    def _judge(
+        self, state: CommissioningState, costs: Costs, twin: PlantTwin | None, number: int
     ) -> tuple[CommissioningState, Verdict, str]:
-        """Go back to what the plant has confirmed before, else to the MPC."""
-        said = f"The policy was taken back: {why}."
-        kept = state.kept
-        if kept.policy not in ("MPC", state.policy):
-            self.accepted.return_to_kept()
+        """Decide by the pairs, and improve where no policy is on trial."""
+        if why := why_taken_back(self.journal, costs):
+            said = f"The policy was taken back: {why}."
+            kept = state.kept
+            if kept.policy in ("MPC", state.policy):
+                return replace(state, max_correction=self._first_bound), "the MPC acts", said
+            self._become(self._kept, kept.bound)
             state = replace(state, acting=kept, max_correction=kept.bound, since=number)
             return state, "stays", said
-        self.accepted.give_back()
-        return replace(state, max_correction=self._first_bound), "the MPC acts", said
-
-    def _improve(
-        self, twin: PlantTwin, state: CommissioningState, seed: int
-    ) -> tuple[CommissioningState, Verdict, str]:
-        """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
+        said = ""
+        if self.journal.accepted and not state.is_kept:
+            if not is_kept(costs):
+                return state, "stays", f"{costs.difference.pairs} pairs are not enough."
+            state = replace(state, kept=state.acting)
+            said = f"{costs.difference.pairs} pairs show that it costs less. "
+        verdict: Verdict = "stays" if state.is_kept else "the MPC acts"
+        if twin is None or not twin.trusted:
+            why = f"There are {len(self.journal.log)} episodes to learn from."
+            if twin is not None:
+                why = " ".join(["The twin is not trusted.", *twin.trust.problems])
+            return state, verdict, f"{said}{why}"
+        state = replace(state, tried=True)
         wider = state
         if state.is_kept:  # the plant has confirmed it: the next one may leave the MPC farther
             wider = replace(state, max_correction=min(2 * state.max_correction, self.largest))
-        self.accepted.take_candidate()
-        held = ActorCheckpoint.of(self.policy)
-        self.accepted.limit(wider.max_correction)
+        self._become(self.candidate or self._acting, wider.max_correction)
+        seed = self.seed + number
         found = improve(self.model, twin, rounds=self.rounds, updates=self.updates, seed=seed)
         before = found.before
-        known = before is not None and before.accepted and not state.is_kept
-        if found.accepted or known:
-            said = f"{100 * found.change:+.2f} % in the twin."
-            return replace(wider, tried=True), "accepted", said
-        if state.is_kept:
-            held.restore(self.policy)
-            self.accepted.limit(state.max_correction)
-            return replace(state, tried=True), "stays", found.reason
-        self.accepted.give_back()
-        return replace(state, tried=True), "the MPC acts", found.reason
+        if found.accepted or (before is not None and before.accepted and not state.is_kept):
+            return wider, "accepted", f"{said}{100 * found.change:+.2f} % in the twin."
+        self._become(self._acting, state.max_correction)
+        return state, verdict, f"{said}{found.reason}"
+
+    def _watch(self, twin: PlantTwin | None) -> None:
+        """Take a twin for the one in force, and watch the plant by it."""
+        if twin is not self.twin:
+            self.twin = twin
+            self.watchdog = None if twin is None else Watchdog.of(twin)
+
+    def _become(self, whole: Whole, bound: float) -> None:
+        """Give the model a policy, and bound it for good: a model that is saved keeps it."""
+        restore_whole(self.policy, whole)
+        self.policy.limit_correction(bound)
+
+    def _show(self) -> None:
+        """Give the model what the plant has confirmed, else the MPC, while nothing is played."""
+        state = self.journal.state
+        confirmed = state.kept.policy != "MPC"
+        self._become(self._kept, state.kept.bound if confirmed else state.max_correction)
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
@@ -390,16 +396,6 @@ class Commissioning:
     @property
     def _first_bound(self) -> float:
         return min(self.smallest, self.largest)
-
-    @contextmanager
-    def _unless_cut_off(self) -> Iterator[None]:
-        before = self.twin, self.watchdog
-        try:
-            with self.accepted.unless_cut_off():
-                yield
-        except BaseException:
-            self.twin, self.watchdog = before
-            raise
 
     @property
     def _settings(self) -> dict[str, Any]:
@@ -425,30 +421,22 @@ class Commissioning:
         }
 
     def _restore(self, state: CommissioningState) -> None:
-        """Restore the accepted policy, the twin and its watchdog as a record left them."""
+        """Restore the accepted policies, the twin and its watchdog as a record left them."""
         if not self.journal.batches:
             return
-        self.accepted.limit(state.max_correction)
-        load = self.journal.record.load
-        acting = state.acting
-        kept = state.kept
-        if acting.model is None:
-            self.accepted.give_back()
-        else:
-            load(acting.model, acting.digest, self.model)
+        self._kept, self._acting = (self._loaded(each) for each in (state.kept, state.acting))
         if state.tried:
-            self.accepted.candidate = None
-        self.accepted.hold()
-        if kept.model is not None and acting.model is not None:
-            load(kept.model, kept.digest, self.model)
-            self.accepted.limit(kept.bound)
-            self.accepted.keep(True)
-            self.accepted.limit(state.max_correction)
-            load(acting.model, acting.digest, self.model)
-        self.accepted.show()
+            self.candidate = None
+        self._show()
         if state.twin is not None:
-            self.twin = self._fit(state.twin, state.twin_seed)
-            self.watchdog = Watchdog.of(self.twin)
+            self._watch(self._fit(state.twin, state.twin_seed))
+
+    def _loaded(self, accepted: Accepted) -> Whole:
+        """Return a policy that a record names."""
+        if accepted.model is None:
+            return self._mpc
+        self.journal.record.load(accepted.model, self.model)
+        return whole_policy(self.policy)
 
 
 class Costs(NamedTuple):
@@ -513,17 +501,13 @@ def compare(
 def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
     """Return whether the episodes' rewards are something else than minus their stage costs.
 
-    They may differ by a constant and a factor. Rewards that are all zero are none.
+    They may differ by a constant and a factor. Rewards that are all the same are none.
     """
-    rewards = np.array([each.reward for each in episodes])
-    if not np.all(np.isfinite(rewards)) or not np.any(rewards):
+    rewards = np.array([[each.reward] for each in episodes])
+    if not np.ptp(rewards) > 1e-9 * np.abs(rewards).max():  # nor does NaN
         return False
-    costs = _costs(problem, episodes, False)
-    spread = float(np.std(rewards) * np.std(costs))
-    if not spread > 1e-9 * np.abs(rewards).max() * np.abs(costs).max():
-        return False
-    correlation = -float(np.mean((rewards - rewards.mean()) * (costs - costs.mean()))) / spread
-    return not (correlation > 0 and correlation**2 >= SAME_REWARD)
+    costs = _costs(problem, episodes, False)[:, None]
+    return explained(-costs, rewards, np.isfinite(costs)) < SAME_REWARD
 
 
 def why_taken_back(journal: Journal, costs: Costs) -> str:
@@ -615,19 +599,12 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Feed
 
     References and measured disturbances are those of the episodes.
     """
-    dynamics = twin.dynamics
     row = twin.dynamics.row
-    problem = twin.problem
-    lengths = np.array([len(each.actions) for each in episodes])
-    steps = np.arange(lengths.max())[:, None]
-    first = row.begin(np.array([each.thetas[0] for each in episodes]))
-    given = np.stack([e.thetas[np.minimum(steps[:, 0], len(e.actions))] for e in episodes], axis=1)
-    starts = np.repeat(first[None], len(dynamics.members), axis=0)
-    with np.errstate(all="ignore"):
-        rows, u = dynamics.roll_out(act, starts, len(steps), given[..., row.given])
-        costs = np.asarray(problem.deviations.stage_cost(row.shown(rows[:-1]), u))
-        found = np.sum(costs * (steps < lengths)[:, None], axis=0)
-        for i, length in enumerate(lengths):
-            played = row.shown(rows[: length + 1, :, i])
-            found[:, i] += bound_excess(problem, played, u[:length, :, i]).penalty
-    return np.asarray(found.mean(axis=0))
+    members = np.arange(len(twin.dynamics.members))
+    found = []
+    for each in episodes:
+        starts = row.begin(np.tile(each.thetas[0], (len(members), 1)))
+        given = np.repeat(each.thetas[:-1, None, row.given], len(members), axis=1)
+        played = Scenarios(twin, members, starts, given).play(controller_of(act))
+        found.append(played.costs.mean())
+    return np.array(found)

@@ -10,7 +10,6 @@ import math
 import os
 import zlib
 from dataclasses import asdict, dataclass, fields
-from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -93,20 +92,9 @@ class Record:
             model.save(part)
         return name
 
-    def digest_of(self, name: str | None) -> str | None:
-        """Return the digest of a model that was saved."""
-        if self.path is None or name is None:
-            return None
-        return sha256(self.path.with_name(name).read_bytes()).hexdigest()
-
-    def load(self, name: str, digest: str | None, model: OffPolicyAlgorithm) -> None:
-        """Give a model the parameters of one that was saved; ValueError if it has changed."""
+    def load(self, name: str, model: OffPolicyAlgorithm) -> None:
+        """Give a model the parameters of one that was saved."""
         assert self.path is not None  # names come from :meth:`save`
-        if self.digest_of(name) != digest:
-            raise ValueError(
-                f"{self.path.with_name(name)} has changed since it was accepted. Put back the file "
-                f"that was written, or begin anew with another record than {self.path}."
-            )
         model.set_parameters(str(self.path.with_name(name)), device=model.device)
 
 
@@ -197,7 +185,6 @@ class Accepted(NamedTuple):
 
     policy: str = "MPC"
     model: str | None = None
-    digest: str | None = None
     bound: float = 0.0
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
 from typing import Any, cast
@@ -13,23 +11,17 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array, Feedback, warn
+from sb3_yann._validation import Array, Feedback
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
 from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.improvement.imitation import policy_of
 from sb3_yann.improvement.simulator import Excited
-from sb3_yann.policy.checkpoint import (
-    ActorCheckpoint,
-    all_or_nothing,
-    restore_whole,
-    whole_policy,
-)
 from sb3_yann.policy.checks import LOST_STATISTICS
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
-from sb3_yann.rollout import limit_of, preserve_rng
+from sb3_yann.rollout import limit_of
 from sb3_yann.twin.dynamics import law_of
 
 ENDLESS = 1_000_000  # steps after which an episode is taken for one that never ends
@@ -84,7 +76,7 @@ class Plant:
                 raise ValueError(
                     f"plant_env has {name} = {its}, the model {own}: it is another plant."
                 )
-        self.law = law_of(self.problem)
+        self.mpc = law_of(self.problem)
         self.range = self.problem.deviations.u_max - self.problem.deviations.u_min
         units = self.yann.action_units
         self.as_is = units.kind == "plant" and not np.any(units.shift)
@@ -94,10 +86,6 @@ class Plant:
         u = policy_of(self.yann.actor.mu, self.problem)(theta)
         finite = np.isfinite(u)
         return u if finite.all() else np.where(finite, u, self.mpc(theta))
-
-    def mpc(self, theta: Array) -> Array:
-        """Return the MPC's inputs (rows, m)."""
-        return self.law(theta)
 
     def excited_mpc(self, seed: int, share: float) -> Feedback:
         """Return the MPC of one episode, moved at random by a share of the range at most."""
@@ -215,118 +203,3 @@ class Plant:
         """Return which entries are not finite, by name."""
         wrong = np.flatnonzero(~np.isfinite(theta))
         return ", ".join(f"{self.problem.labels()[i]} = {theta[i]}" for i in wrong)
-
-
-class AcceptedPolicy:
-    """A model's policy, its bound, and the MPC that it can always return to.
-
-    A policy that the model has learnt before is nobody's yet: it waits as ``candidate``, and the
-    model is the MPC.
-    """
-
-    def __init__(self, model: OffPolicyAlgorithm) -> None:
-        if not isinstance(model, OffPolicyAlgorithm):
-            raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
-        self.model = model
-        self.policy = require_yann_policy(model.policy, "Commissioning")
-        with preserve_rng():  # building an actor draws weights
-            mpc = self.policy.make_actor().state_dict()
-        self._first = {name: each.clone() for name, each in self.policy.state_dict().items()}
-        for actor in ("actor", "actor_target"):
-            self._first |= {f"{actor}.{name}": each for name, each in mpc.items()}
-        self.candidate: ActorCheckpoint | None = None
-        self._kept: tuple[ActorCheckpoint, float | None] | None = None
-        self._shown: tuple[ActorCheckpoint, Any] | None = None
-        if self.has_learnt:
-            self.candidate = ActorCheckpoint.of(self.policy)
-            self.give_back()
-        self.hold()
-
-    @property
-    def has_learnt(self) -> bool:
-        """Whether it differs from the MPC anywhere."""
-        return not self.policy.actor.mu.network.is_zero()
-
-    def limit(self, max_correction: float | None) -> None:
-        """Bound it, for good: a model that is saved keeps it."""
-        self.policy.limit_correction(max_correction)
-
-    def give_back(self) -> None:
-        """Make it the MPC, with the critic that the model began with."""
-        self.policy.load_state_dict(self._first)
-        for network in (self.policy.actor, self.policy.critic):
-            network.optimizer.state.clear()  # what other weights were moved by
-
-    def take_candidate(self) -> None:
-        """Make it what the model had learnt before, if that still waits, to be tried."""
-        if self.candidate is not None:
-            self.candidate.restore(self.policy)
-            self.candidate = None
-
-    def keep(self, kept: bool) -> None:
-        """Take it for the one that the plant has confirmed; or forget which one that was."""
-        self._kept = self._present() if kept else None
-
-    def return_to_kept(self) -> None:
-        """Make it the one that the plant has confirmed."""
-        assert self._kept is not None
-        self._become(*self._kept)
-
-    def _present(self) -> tuple[ActorCheckpoint, float | None]:
-        return ActorCheckpoint.of(self.policy), self.policy.max_correction
-
-    def _become(self, checkpoint: ActorCheckpoint, bound: float | None) -> None:
-        checkpoint.restore(self.policy)
-        self.limit(bound)
-
-    def show(self) -> None:
-        """Make it the one that the plant has confirmed, else the MPC, while no episode is played.
-
-        What is on trial goes on from :meth:`restore`.
-        """
-        if self._shown is not None:
-            return
-        whole = whole_policy(self.policy), self.policy.max_correction
-        if self._kept is None:
-            self.give_back()
-        else:
-            self.return_to_kept()
-        self._shown = ActorCheckpoint.of(self.policy), whole
-
-    def hold(self) -> None:
-        """Take it for the accepted one from here on."""
-        self._shown = None
-        self._held = self._present()
-
-    def restore(self) -> None:
-        """Make it the accepted one again, with a warning where something has changed it."""
-        held, bound = self._held
-        if self._shown is not None:
-            shown, (whole, its_bound) = self._shown
-            self._shown = None
-            if shown.is_actor_of(self.policy):
-                restore_whole(self.policy, whole)
-                self.limit(its_bound)
-        if held.is_actor_of(self.policy) and bound == self.policy.max_correction:
-            return
-        self._become(held, bound)
-        warn(
-            "The model's actor is not the one that was accepted: that one is restored. Train "
-            "another copy of the model, not the one that is being commissioned.",
-        )
-
-    @contextmanager
-    def unless_cut_off(self) -> Iterator[None]:
-        """Leave it as it was if an error or Ctrl-C cuts a decision off."""
-        bound = self.policy.max_correction
-        candidate = self.candidate
-        kept = self._kept
-        try:
-            with all_or_nothing(self.policy):
-                yield
-        except BaseException:
-            self.limit(bound)
-            self.candidate = candidate
-            self._kept = kept
-            raise
-        self.hold()

@@ -54,54 +54,21 @@ class Alarm:
 
 
 @dataclass(frozen=True)
-class PredictiveVariance:
-    """How far the twin may be wrong at a point that the log shows little of.
-
-    The standard deviation of ``dynamics``, fits without each fold of the episodes; beyond the box
-    of logged features ``[x, d, u]`` also the ``size`` (n,) of what the residual explains, times the
-    distance in widths of the log.
-    """
-
-    dynamics: Dynamics
-    low: Array
-    high: Array
-    size: Array
-
-    def doubt(self, rows: Array, u: Array) -> Array:
-        """Return standard deviations (..., n) at rows (..., size) and inputs (..., m)."""
-        z = self.dynamics.row.features(rows, u)
-        width = np.maximum(self.high - self.low, 1e-6 * self.dynamics.coordinates.scale)
-        beyond = np.maximum(np.maximum(z - self.high, self.low - z), 0.0)
-        far = (beyond / width).sum(axis=-1, keepdims=True)
-        far = far + far**2  # a twin of a narrow log underrates what is far away
-        flat = (each.reshape(1, -1, each.shape[-1]) for each in (rows, u))
-        apart = self.dynamics.residual(*flat).std(axis=0).reshape(*far.shape[:-1], -1)
-        return np.asarray(np.hypot(apart, far * self.size))
-
-
-class _Charts:
-    """Exponentially weighted averages of innovations, and of what is not known (Roberts 1959)."""
-
-    def __init__(self, n: int) -> None:
-        self.means, self.doubts = np.zeros((2, len(CHART_GAINS), n))
-
-    def take(self, innovation: Array, doubt: Array) -> None:
-        """Take in those of a sample, (n,) each."""
-        self.means += CHART_GAINS[:, None] * (innovation - self.means)
-        self.doubts += CHART_GAINS[:, None] * (doubt - self.doubts)
-
-
-@dataclass(frozen=True)
 class Bands:
     """How far charts may go while all is well, from episodes that a fit has not seen.
 
-    ``error`` (n,) are root mean squares of one-step errors, ``spread`` (gains, n) typical
-    deviations of the charts, ``most`` the largest ratios to their scale, which are exceeded by
-    ``factor`` only where something is wrong. A ``noisy`` (n,) sensor's errors change from step to
-    step; a reading ``repeats`` itself so often in a row in the log.
+    ``unseen`` are fits without each fold of the episodes, ``low`` and ``high`` (k,) the box of
+    logged features ``[x, d, u]``. Of each state (n,) ``size`` is what the residual explains,
+    ``error`` the root mean square of one-step errors. ``spread`` (gains, n) are typical deviations
+    of the charts, ``most`` the largest ratios to their scale, which are exceeded by ``factor`` only
+    where something is wrong. A ``noisy`` (n,) sensor's errors change from step to step; a reading
+    ``repeats`` itself so often in a row in the log.
     """
 
-    known: PredictiveVariance
+    unseen: Dynamics
+    low: Array
+    high: Array
+    size: Array
     error: Array
     spread: Array
     most: Array
@@ -133,27 +100,55 @@ class Bands:
         explained = [twin.dynamics.residual(e.thetas[None, :-1], e.actions[None])[0] for e in log]
         size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST_ERROR * error) ** 2)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log])
-        known = PredictiveVariance(unseen, seen.min(axis=0), seen.max(axis=0), size)
-        means = []
-        doubts = []
+        box = seen.min(axis=0), seen.max(axis=0)
+        charted = []
         for each, errors in zip(log, left, strict=True):
-            charts = _Charts(len(units))
-            for step in zip(errors, known.doubt(each.thetas[:-1], each.actions), strict=True):
-                charts.take(*step)
-                means.append(charts.means.copy())
-                doubts.append(charts.doubts.copy())
+            charts: Array = np.zeros((2, len(CHART_GAINS), len(units)))
+            doubts = _doubt(unseen, *box, size, each.thetas[:-1], each.actions)
+            for step in zip(errors, doubts, strict=True):
+                charts = charted_with(charts, *step)
+                charted.append(charts)
+        means, doubted = np.moveaxis(np.array(charted), 1, 0)
         # A median: where an episode leaves what the others show, the doubt explains its errors.
         spread = np.median(np.abs(means), axis=0) / NORMAL_MEDIAN + 1e-9 * error
-        most = np.max(np.abs(means) / np.hypot(spread, doubts), axis=0)
+        most = np.max(np.abs(means) / np.hypot(spread, doubted), axis=0)
         repeats = np.max([_repeats(e.thetas[:, row.state]) for e in twin.episodes], axis=0)
         factor = FACTOR + FACTOR_OF_FEW / len(twin.episodes)
         most = np.maximum(most, LEAST_RATIO)
-        return cls(known, error, spread, most, lag < NOISE_CORRELATION, repeats, factor)
+        noisy = lag < NOISE_CORRELATION
+        return cls(unseen, *box, size, error, spread, most, noisy, repeats, factor)
 
-    def ratios(self, charts: _Charts) -> Array:
-        """Return charts (gains, n) in units of their bands: beyond 1 something is wrong."""
-        band = self.factor * self.most * np.hypot(self.spread, charts.doubts)
-        return np.asarray(charts.means / band)
+    def doubt(self, rows: Array, u: Array) -> Array:
+        """Return how far the twin may be wrong, (..., n), at rows (..., size) and u (..., m)."""
+        return _doubt(self.unseen, self.low, self.high, self.size, rows, u)
+
+    def ratios(self, charts: Array) -> Array:
+        """Return charts (2, gains, n) in units of their bands: beyond 1 something is wrong."""
+        means, doubts = charts
+        return np.asarray(means / (self.factor * self.most * np.hypot(self.spread, doubts)))
+
+
+def _doubt(unseen: Dynamics, low: Array, high: Array, size: Array, rows: Array, u: Array) -> Array:
+    """Return the standard deviation of the fits, and beyond the box more: see :class:`Bands`.
+
+    There it is also the ``size`` of what the residual explains, times the distance in widths.
+    """
+    z = unseen.row.features(rows, u)
+    width = np.maximum(high - low, 1e-6 * unseen.coordinates.scale)
+    beyond = np.maximum(np.maximum(z - high, low - z), 0.0)
+    far = (beyond / width).sum(axis=-1, keepdims=True)
+    far = far + far**2  # a twin of a narrow log underrates what is far away
+    flat = (each.reshape(1, -1, each.shape[-1]) for each in (rows, u))
+    apart = unseen.residual(*flat).std(axis=0).reshape(*far.shape[:-1], -1)
+    return np.asarray(np.hypot(apart, far * size))
+
+
+def charted_with(charts: Array, innovation: Array, doubt: Array) -> Array:
+    """Return exponentially weighted averages (2, gains, n) with one sample more (Roberts 1959).
+
+    They are of innovations, and of what is not known, (n,) each.
+    """
+    return charts + CHART_GAINS[:, None] * (np.array([innovation, doubt])[:, None] - charts)
 
 
 def _repeats(x: Array) -> NDArray[np.int64]:
@@ -222,10 +217,6 @@ class Watchdog:
             raise TypeError(f"twin = {twin!r} must be a PlantTwin.")
         return cls(twin.dynamics, Bands.of(twin))
 
-    def __repr__(self) -> str:
-        """Say whether it is quiet."""
-        return f"Watchdog({'quiet' if self.alarm is None else self.alarm})"
-
     @property
     def quiet(self) -> bool:
         """Whether there has been no alarm in this episode."""
@@ -245,7 +236,7 @@ class Watchdog:
         self.alarm = None
         self._first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
         self._row = dynamics.row.begin(first)
-        self._charts = _Charts(n)
+        self._charts: Array = np.zeros((2, len(CHART_GAINS), n))
         self._steps = 0
         self._stands = np.zeros(n, np.int64)  # samples for which a reading has repeated itself
         self._moved = np.zeros(n)  # how far the twin would have moved it meanwhile
@@ -288,7 +279,7 @@ class Watchdog:
         self._row = layout.after(before, u, after)
         predicted = self._first.step(before[None, None], u[None, None])[0, 0]
         innovation = (self._row - predicted)[layout.state]
-        self._charts.take(innovation, self.bands.known.doubt(before, u))
+        self._charts = charted_with(self._charts, innovation, self.bands.doubt(before, u))
         self._steps += 1
         same = self._row[layout.state] == before[layout.state]
         self._stands = (self._stands + 1) * same
@@ -304,7 +295,7 @@ class Watchdog:
         stands = self._stands
         bands = self.bands
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
-        unsure = np.hypot(bands.error, self._charts.doubts[0])  # what is not familiar counts
+        unsure = np.hypot(bands.error, self._charts[1, 0])  # what is not familiar counts
         moving = np.abs(self._moved) > PREDICTED_MOVE * stands * unsure
         problem = self.dynamics.problem
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
@@ -323,7 +314,7 @@ class Watchdog:
         at_once = ratios[:1] if ratios[0].max() > 1.0 else ratios
         gain, i = np.unravel_index(int(np.argmax(at_once)), at_once.shape)
         name = labels_of(self.dynamics.problem.model)[0][int(i)]
-        said = f"{name} is off the twin's prediction by {self._charts.means[gain, i]:.3g}"
+        said = f"{name} is off the twin's prediction by {self._charts[0, gain, i]:.3g}"
         if CHART_GAINS[gain] < 1.0:
             said += f" on an average of {1 / CHART_GAINS[gain]:.0f} samples"
         kind = "outside the band" if CHART_GAINS[gain] == 1.0 else "drift"

@@ -25,6 +25,7 @@ from sb3_yann.commissioning.watchdog import Alarm
 from sb3_yann.compare import Difference
 from sb3_yann.env_pool import one_env
 from sb3_yann.improvement import Check
+from sb3_yann.policy.checkpoint import whole_policy
 from twin_samples import Cart, problem
 from weights import is_mpc
 
@@ -199,11 +200,11 @@ def test_a_violation_takes_the_policy_back() -> None:
 def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:
     run = commission(max_correction=1.0)
     run.run(1)
-    run.accepted.restore()
+    run._become(run._acting, 1.0)
     with th.no_grad():  # what was accepted turns out to be bad: the plant says so
         for each in run.policy.actor.parameters():
             each.add_(0.5 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
-    run.accepted.hold()
+    run._acting = whole_policy(run.policy)
     monkeypatch.setattr(commissioning, "improve", lambda *_, **__: found)
     found = Improvement((Check(1, False, "nothing", 0.0, 0.0, True),), 0.0, False)
     last = run.run(2)[-1]
@@ -215,8 +216,7 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     run = commission()
     run.run(1)
     assert is_mpc(run.model)  # until the plant has confirmed it
-    run.accepted.restore()
-    bound = run.policy.max_correction
+    run._become(run._acting, bound := run.policy.max_correction)
     before = [each.clone() for each in run.policy.actor.parameters()]
     refused = Check(0, False, "start 3 violates a limit", 0.0, 0.0, False)
     found = Improvement((refused,), 0.0, False, refused)
@@ -235,13 +235,13 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
 def test_weights_that_nobody_accepted_never_act() -> None:
     run = commission()
     run.run(1)
-    run.accepted.restore()
+    run._become(run._acting, 0.2)
     accepted = [each.clone() for each in run.policy.actor.parameters()]
     with th.no_grad():
         for each in run.policy.actor.parameters():
             each.add_(1.0)
     run.policy.limit_correction(None)
-    with pytest.warns(UserWarning, match="that one is restored"), one_env(Cart) as env:
+    with one_env(Cart) as env:
         run._play(Plant(env, run.model))
     assert all(th.equal(a, b) for a, b in zip(accepted, run.policy.actor.parameters(), strict=True))
     assert run.policy.max_correction == 0.2 and run.episodes[-1].apart <= 0.2 + 1e-6
