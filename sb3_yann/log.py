@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, check_int, check_positive, to_float, warn
+from sb3_yann._validation import LARGEST_BOUND, Array, check_int, check_positive, to_float, warn
 
 Arrays = ArrayLike | Sequence[ArrayLike]
 """One array for each episode, or that of a single one."""
@@ -403,7 +403,7 @@ def _records(given: dict[str, Arrays | None], *, gaps: bool = False) -> list[Epi
     }
     x, *driven = parts.values()
     for name in [*parts][1:]:
-        _require_one_state_more(name, parts[name], x)
+        require_one_state_more(name, parts[name], x)
     if len(driven) < 2:
         driven.append([np.zeros((len(each), 0)) for each in driven[0]])
     return [Episode(*each) for each in zip(x, *driven, strict=True)]
@@ -475,7 +475,8 @@ def _time(
         raise
 
 
-def _require_one_state_more(name: str, parts: list[Array], states: list[Array]) -> None:
+def require_one_state_more(name: str, parts: list[Array], states: list[Array]) -> None:
+    """Raise unless each episode has one row of states more than of something else."""
     if len(parts) != len(states):
         raise ValueError(f"{name} has {len(parts)} episodes, states has {len(states)}.")
     for i, (part, state) in enumerate(zip(parts, states, strict=True)):
@@ -536,7 +537,7 @@ def as_matrices(name: str, value: Arrays, *, gaps: bool = False) -> list[Array]:
                 f"{name} of episode {i} has shape {part.shape}, expected (rows, columns) with the "
                 "same columns in each episode. Of a single one write values.reshape(-1, 1)."
             )
-        bad = np.flatnonzero(~np.all(np.isfinite(part), axis=1))
+        bad = np.flatnonzero(~np.all(np.abs(part) <= LARGEST_BOUND, axis=1))
         if bad.size and not (gaps and not np.isinf(part).any()):
             raise ValueError(
                 f"{name} of episode {i} holds NaN or infinite entries in {bad.size} rows, first in "

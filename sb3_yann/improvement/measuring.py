@@ -32,6 +32,7 @@ from sb3_yann.rollout import Controller, Rows, Trajectories
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import as_episodes
 from sb3_yann.twin.plant_twin import PlantTwin
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import reidentified
 
 LITTLE = 0.005
@@ -405,7 +406,7 @@ class _Search:
                 other = self.twin.reidentified()
             else:
                 log = as_episodes(self.mpc.deviations, self.base.pairs)
-                other = reidentified(self.mpc, Coordinates.of(self.mpc, log), log)
+                other = reidentified(self.mpc, Coordinates.of(RowLayout(self.mpc), log), log)
         except ValueError:  # a model without a steady state or a Riccati solution
             return
         if other is not self.mpc:

@@ -322,7 +322,7 @@ def model_of(
     problem: LinearMPC, episodes: Sequence[Episode], observer: StateEstimator | None, seed: int
 ) -> LearntModel:
     """Return networks on top of the given model, fitted to episodes in the observer's rows."""
-    coordinates = Coordinates.of(problem, episodes, observer)
+    coordinates = Coordinates.of(RowLayout(problem, observer), episodes)
     members = fit_ensemble(coordinates, [episodes] * MEMBERS, seed)
     return LearntModel(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC, StateEstimator
+from sb3_yann.control import LinearMPC
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 
@@ -123,22 +123,15 @@ class Coordinates:
     turn: Array | None = None
 
     @classmethod
-    def of(
-        cls,
-        problem: LinearMPC,
-        episodes: Sequence[Episode],
-        observer: StateEstimator | None = None,
-        hidden: bool = False,
-    ) -> Coordinates:
+    def of(cls, row: RowLayout, episodes: Sequence[Episode]) -> Coordinates:
         """Return those of a log, whose episodes hold rows of this layout."""
-        row = RowLayout(problem, observer, hidden)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in episodes])
         half = row.half
         low = seen.min(0)
         high = seen.max(0)
         width = np.maximum(high - low, 1e-6 * half)
         scale = np.maximum(np.abs(seen).max(0), 1e-3 * half)
-        units = np.maximum(np.std(seen, axis=0), 1e-6 * half)[: problem.model.n_states]
+        units = np.maximum(np.std(seen, axis=0), 1e-6 * half)[: row.problem.model.n_states]
         turn = (
             None if row.observer is not None else _turns([e.thetas[:, row.state] for e in episodes])
         )

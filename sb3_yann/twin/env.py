@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array, Single, check_int
+from sb3_yann._validation import Array, Single
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import bound_excess
@@ -250,27 +250,17 @@ class TwinEnv(gym.Env[Single, Single]):
     one of its episodes, and lasts as long. ``info["violation"]`` reports a state beyond the
     problem's bounds, or outside what the log shows: there the twin knows nothing.
 
-    :meth:`PlantTwin.env` makes one.
-
-    Parameters
-    ----------
-    model : LearntModel
-        The members, and the log.
-    member : int, optional
-        The member that acts; by default the seed of an episode decides: seed modulo members.
+    The seed of an episode decides which member acts: seed modulo members. :meth:`PlantTwin.env`
+    makes one.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
     observation_space: ProblemBox
 
-    def __init__(self, model: LearntModel, member: int | None = None) -> None:
-        members = len(model.dynamics.members)
-        if member is not None and check_int("member", member, 0) >= members:
-            raise ValueError(f"member = {member} must be below {members}, how many there are.")
+    def __init__(self, model: LearntModel) -> None:
         self.model = model
         self.dynamics = model.dynamics
         problem = model.problem
-        self.member = member
         self.render_mode = None
         low, high = (each.astype(np.float32) for each in (problem.theta_min, problem.theta_max))
         self.observation_space = ProblemBox(low, high, problem=problem)
@@ -291,9 +281,7 @@ class TwinEnv(gym.Env[Single, Single]):
         problem = self.dynamics.problem
         members = self.dynamics.members
         acting = int(self.np_random.integers(len(members)))
-        if self.member is not None:
-            acting = self.member
-        elif seed is not None:
+        if seed is not None:
             acting = seed % len(members)
         self._acting = Dynamics(problem, self.dynamics.coordinates, (members[acting],))
         self._episode = self.model.episodes[int(self.np_random.integers(len(self.model.episodes)))]

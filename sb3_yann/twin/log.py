@@ -14,11 +14,10 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, to_float, warn
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.env_pool import is_vec_env
-from sb3_yann.log import SECONDS, Log
+from sb3_yann.log import SECONDS, Log, as_matrices, require_one_state_more
 from sb3_yann.twin.row_layout import ROUNDED
 
 SHORTEST = 5  # steps that an episode has at least
-OVERFLOW = 1e100  # beyond this, squares and their sums overflow
 EXPLAINED = 1e-3  # an estimate's moves follow the model's errors but for so much of their squares
 
 
@@ -48,46 +47,51 @@ def as_episodes(
     episodes: Iterable[tuple[ArrayLike, ArrayLike]],
     references: Sequence[ArrayLike] | None = None,
     disturbances: Sequence[ArrayLike] | None = None,
-    previous: Sequence[ArrayLike] | None = None,
     *,
     observed: bool = False,
 ) -> tuple[Episode, ...]:
     """Return episodes, given in plant units, as the law sees them: in deviations.
 
     States are (T + 1, n), or all of theta; references (T + 1, p) and disturbances (T + 1, d) what
-    theta holds besides, one for each episode, or one row for all of it; ``previous`` the input
-    before each episode, by default that of the operating point. Where an observer estimates the
-    disturbances they are NaN where none are given. Wrong shapes, entries that are not finite and
-    inputs beyond their bounds are a ValueError.
+    theta holds besides, one for each episode, or one row for all of it. The input before each
+    episode is that of the operating point. Where an observer estimates the disturbances they are
+    NaN where none are given. Wrong shapes, entries that are not finite and inputs beyond their
+    bounds are a ValueError.
     """
     layout = problem.layout
-    pairs = _pairs(episodes)
-    units = problem.units
-    given = {"references": references, "disturbances": disturbances, "previous": previous}
-    for name, values in given.items():
-        if values is not None and not hasattr(values, "__len__"):
+    pairs = [tuple(map(_as_columns, each)) for each in _pairs(episodes)]
+    states, actions = map(list, zip(*pairs, strict=True))
+    states = as_matrices("states", states)
+    actions = as_matrices("actions", actions)
+    require_one_state_more("actions", actions, states)
+    given = {"references": references, "disturbances": disturbances}
+    beside = {name: values for name, values in given.items() if values is not None}
+    for name, values in beside.items():
+        if not hasattr(values, "__len__"):
             raise TypeError(f"{name} must be a list with an entry for each episode.")
-        if values is not None and len(values) != len(pairs):
+        if len(values) != len(pairs):
             raise ValueError(f"{name} has {len(values)} entries for {len(pairs)} episodes.")
+    if states[0].shape[1] not in (layout.n_states, layout.size):
+        raise ValueError(
+            f"states have {states[0].shape[1]} columns, the problem {layout.n_states} states, and "
+            f"theta {layout.size} entries. Past inputs are states where the model has them: see "
+            "sb3_yann.wrappers.PastInputs."
+        )
+    if actions[0].shape[1] != problem.model.n_inputs:
+        raise ValueError(
+            f"actions have {actions[0].shape[1]} columns, the problem {problem.model.n_inputs} "
+            "inputs."
+        )
+    whole = states[0].shape[1] == layout.size > layout.n_states
+    if whole and beside:
+        raise ValueError(f"{[*beside]} is given, but states are all of theta: leave it out.")
     found = []
-    for i, (states, actions) in enumerate(pairs):
-        u = _actions(problem, i, actions)
-        sizes = layout.n_states, layout.size
-        hint = " Past inputs are states where the model has them: see sb3_yann.wrappers.PastInputs."
-        x = _table(f"episode {i}: states", states, "T + 1", sizes, hint)
-        own = {name: None if each is None else each[i] for name, each in given.items()}
-        if len(x) != len(u) + 1:
-            raise ValueError(
-                f"episode {i}: {len(x)} states and {len(u)} actions; there is one state more than "
-                "actions, the one after the last."
-            )
-        if len(u) < SHORTEST:
-            raise ValueError(f"episode {i} has {len(u)} steps; {SHORTEST} are the least.")
-        whole = x.shape[1] == layout.size and layout.size > layout.n_states
-        beside = [name for name, each in given.items() if each is not None]
-        if whole and beside:
-            raise ValueError(f"{beside} is given, but states are all of theta: leave it out.")
-        x = units.to_deviations(x)
+    for i, (x, action) in enumerate(zip(states, actions, strict=True)):
+        if len(action) < SHORTEST:
+            raise ValueError(f"episode {i} has {len(action)} steps; {SHORTEST} are the least.")
+        u = _within_bounds(problem, i, action)
+        x = problem.units.to_deviations(x)
+        own = {name: values[i] for name, values in beside.items()}
         found.append(Episode(x if whole else _theta(problem, i, x, u, own, observed), u))
     return tuple(found)
 
@@ -162,32 +166,13 @@ def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
     return [(states, actions) for states, actions in pairs]
 
 
-def _finite(name: str, values: ArrayLike) -> Array:
-    array = to_float(name, values)
-    finite = np.abs(array) < OVERFLOW  # nor is NaN
-    if not np.all(finite):
-        row = int(np.argwhere(~finite)[0][0])
-        raise ValueError(
-            f"{name} are not finite, or too large, in row {row}: {array[row].tolist()}. Cut the "
-            "episode there, into two of their own."
-        )
-    return array
+def _as_columns(values: ArrayLike) -> ArrayLike:
+    """Return a list of numbers as one column, and anything else as it is."""
+    return np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values
 
 
-def _table(
-    name: str, values: ArrayLike, rows: str, columns: Sequence[int], hint: str = ""
-) -> Array:
-    """Return finite rows (T, k) of so many columns; a list of numbers is one column."""
-    array = _finite(name, values)
-    array = array[:, None] if array.ndim == 1 else array
-    if array.ndim != 2 or array.shape[1] not in columns:
-        wanted = " or ".join(f"({rows}, {each})" for each in dict.fromkeys(columns))
-        raise ValueError(f"{name} have shape {array.shape}, expected {wanted}.{hint}")
-    return array
-
-
-def _actions(problem: LinearMPC, i: int, actions: ArrayLike) -> Array:
-    u = _table(f"episode {i}: actions", actions, "T", [problem.model.n_inputs])
+def _within_bounds(problem: LinearMPC, i: int, u: Array) -> Array:
+    """Return inputs (T, m) of episode i in deviations, with their rounding cut off."""
     room = 1e-3 * problem.u_half
     beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
     if beyond.any():
@@ -217,7 +202,7 @@ def _theta(
     p = layout.n_references
     for name, part in (("references", slice(0, p)), ("disturbances", slice(p, None))):
         size = len(layout.now[part])
-        if given[name] is None:
+        if name not in given:
             if size and observed and name == "disturbances":
                 theta[:, layout.disturbance] = np.nan
             elif size:
@@ -227,27 +212,21 @@ def _theta(
                     f"columns: Log.from_csv(..., {name}=[...])."
                 )
             continue
-        values = _finite(f"episode {i}: {name}", given[name])
+        values = to_float(f"{name} of episode {i}", given[name])
         if values.ndim == 1 and size == 1 and len(values) == len(x):
             values = values[:, None]
         values = np.atleast_2d(values)
-        if values.shape not in ((1, size), (len(x), size)):
+        if values.shape not in ((1, size), (len(x), size)) or not np.all(np.isfinite(values)):
             raise ValueError(
-                f"episode {i}: {name} have shape {values.shape}, expected ({len(x)}, {size})."
+                f"{name} of episode {i} have shape {values.shape}, expected ({len(x)}, {size}), or "
+                "entries that are no finite numbers."
             )
         values = np.broadcast_to(values - point[layout.now[part]], (len(x), size))
         for ahead in reversed(range(max(layout.previews) + 1)):  # what came is what was foreseen
             rows = np.minimum(np.arange(len(x)) + ahead, len(x) - 1)
             theta[:, layout.sample(ahead)[part]] = values[rows]
     if layout.n_previous:
-        first = point[layout.previous].copy()
-        if given["previous"] is not None:
-            first = np.atleast_1d(_finite(f"episode {i}: previous", [given["previous"]])[0])
-        if first.shape != (u.shape[1],):
-            raise ValueError(
-                f"episode {i}: previous has shape {first.shape}, expected ({u.shape[1]},)."
-            )
-        theta[:, layout.previous] = np.vstack([first - point[layout.previous], u])
+        theta[1:, layout.previous] = u
     return theta
 
 

@@ -124,7 +124,6 @@ class PlantTwin(LearntModel):
         *,
         references: Sequence[ArrayLike] | None = None,
         disturbances: Sequence[ArrayLike] | None = None,
-        previous: Sequence[ArrayLike] | None = None,
         observer: StateEstimator | None = None,
         residuals: Sequence[str] = KINDS,
         n_members: int = 5,
@@ -145,8 +144,6 @@ class PlantTwin(LearntModel):
             disturbances.
         references, disturbances : sequence of array_like, optional
             What theta holds besides the state, shapes (T + 1, p) and (T + 1, d) for each episode.
-        previous : sequence of array_like, shape (m,), optional
-            The input before each episode.
         observer : StateEstimator, optional
             The one whose estimates x and d of theta are: that of :class:`EstimateState`. States
             that are not all of theta are what it measured, (T + 1, q), and it is run over them:
@@ -187,7 +184,7 @@ class PlantTwin(LearntModel):
             if observer is None and not units_confirmed:
                 _require_same_units(episodes, problem)
             whole = episodes if observer is not None else episodes.with_all_states()
-            if references is disturbances is previous is None:  # else they are one for each
+            if references is disturbances is None:  # else they are one for each
                 whole, notes = without_short_pieces(whole)
                 held = [(each.references, each.disturbances) for each in whole.episodes]
                 counts = problem.layout.n_references, problem.layout.n_disturbances
@@ -199,21 +196,20 @@ class PlantTwin(LearntModel):
         row = RowLayout(problem, observer)
         if observer is not None and row.observer is None:
             episodes, disturbances = row.estimated(episodes, disturbances)
-        given = (references, disturbances, previous)
         observed = row.observer is not None
-        log = as_episodes(problem, episodes, *given, observed=observed)
+        log = as_episodes(problem, episodes, references, disturbances, observed=observed)
         log, copied = without_copies(log)
         notes += copied
         if observer is None:
             warn_of_estimates(problem, log)
         log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)
-        fit = _Fit(problem, observer, residuals, n_members, updates, seed, units_confirmed, notes)
+        settings = residuals, n_members, updates, seed, units_confirmed, notes
         with shown(progress_bar):
-            found = fit.twin(log, hidden=False)
+            found = _fitted(row, log, *settings)
             hidden = RowLayout(problem, observer, hidden=True)
             if found.trust.lacks_alone and row.observer is None and hidden.observer is not None:
                 again = [Episode(*hidden.recovered(each.thetas, each.actions)) for each in log]
-                other = fit.twin(tuple(again), hidden=True)
+                other = _fitted(hidden, tuple(again), *settings)
                 found = other if other.trusted else found
         return found
 
@@ -282,13 +278,10 @@ class PlantTwin(LearntModel):
         loosest = labels_of(self.problem.model)[1][int(np.argmin(share))]
         return forecast(self.judges, self.episodes, self.starts, act, loosest)
 
-    def env(self, member: int | None = None) -> TwinEnv:
+    def env(self) -> TwinEnv:
         """Return a Gymnasium env with the twin's dynamics and the plant's spaces.
 
-        Parameters
-        ----------
-        member : int, optional
-            The member that acts; by default the seed of an episode decides: seed modulo members.
+        The seed of an episode decides which member acts: seed modulo members.
 
         Raises
         ------
@@ -296,72 +289,67 @@ class PlantTwin(LearntModel):
             If the twin is not to be trusted.
         """
         self.require_trust()
-        return TwinEnv(self, member)
+        return TwinEnv(self)
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """What a twin is fitted with."""
-
-    problem: LinearMPC
-    observer: StateEstimator | None
-    residuals: Sequence[str]
-    n_members: int
-    updates: int
-    seed: int
-    units_confirmed: bool
-    notes: tuple[str, ...]
-
-    def twin(self, log: tuple[Episode, ...], hidden: bool) -> PlantTwin:
-        """Return the twin of a log in rows, whose own states are to be found where ``hidden``."""
-        problem = self.problem
-        residuals = self.residuals
-        coordinates = Coordinates.of(problem, log, self.observer, hidden)
-        if hidden:
-            log = tuple(shoot(coordinates, log, HIDDEN_SETTINGS[-1], GUESS)[1])
-            box = Coordinates.of(problem, log, self.observer, hidden)
-            coordinates = replace(coordinates, low=box.low, high=box.high, units=box.units)
-        parts = pieces(log, FOLDS)
-        blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
-        rng = np.random.default_rng(self.seed)
-        draws = rng.integers(len(blocks), size=(self.n_members - 1, len(blocks)))
-        drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
-        kept = without_each_fold(parts)
-        # The model as it is comes first, to compare with, whether it may be chosen or not.
-        choices = candidates(coordinates, parts, residuals if not hidden else ())
-        if hidden:
-            for each in (each for each in HIDDEN_SETTINGS if each.kind in residuals):
-                by_fold = [shoot(coordinates, fold, each)[0] for fold in kept]
-                choices.append(Candidate(str(each), tuple(by_fold), each))
-        first = int("none" not in residuals and len(residuals) > 0)
-        alone = first == len(choices)
+def _fitted(
+    row: RowLayout,
+    log: tuple[Episode, ...],
+    residuals: Sequence[str],
+    n_members: int,
+    updates: int,
+    seed: int,
+    units_confirmed: bool,
+    notes: tuple[str, ...],
+) -> PlantTwin:
+    """Return the twin of a log in rows, whose own states are to be found where they are hidden."""
+    problem = row.problem
+    coordinates = Coordinates.of(row, log)
+    if row.hidden:
+        log = tuple(shoot(coordinates, log, HIDDEN_SETTINGS[-1], GUESS)[1])
+        box = Coordinates.of(row, log)
+        coordinates = replace(coordinates, low=box.low, high=box.high, units=box.units)
+    parts = pieces(log, FOLDS)
+    blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
+    rng = np.random.default_rng(seed)
+    draws = rng.integers(len(blocks), size=(n_members - 1, len(blocks)))
+    drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
+    kept = without_each_fold(parts)
+    # The model as it is comes first, to compare with, whether it may be chosen or not.
+    choices = candidates(coordinates, parts, residuals if not row.hidden else ())
+    if row.hidden:
+        for each in (each for each in HIDDEN_SETTINGS if each.kind in residuals):
+            by_fold = [shoot(coordinates, fold, each)[0] for fold in kept]
+            choices.append(Candidate(str(each), tuple(by_fold), each))
+    first = int("none" not in residuals)
+    alone = first == len(choices)
+    runs = held_out(coordinates, parts, choices)
+    chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
+    known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
+    long = sum(map(len, parts)) >= LONG_LOG and len(parts) > 1 and not row.hidden
+    members: list[Residual] = []
+    if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
+        networks = fit_ensemble(
+            coordinates, [*kept, *drawn], seed, ahead=WINDOW_STEPS, updates=updates
+        )
+        choices.append(Candidate("network", tuple(networks[: len(kept)])))
         runs = held_out(coordinates, parts, choices)
-        chosen = runs.choose(first) if len(parts) > 1 and not alone else 0
+        chosen = runs.choose(first) if len(parts) > 1 else first
+        members = networks[len(kept) :]
         known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
-        long = sum(map(len, parts)) >= LONG_LOG and len(parts) > 1 and not hidden
-        members: list[Residual] = []
-        if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
-            networks = fit_ensemble(
-                coordinates, [*kept, *drawn], self.seed, ahead=WINDOW_STEPS, updates=self.updates
-            )
-            choices.append(Candidate("network", tuple(networks[: len(kept)])))
-            runs = held_out(coordinates, parts, choices)
-            chosen = runs.choose(first) if len(parts) > 1 else first
-            members = networks[len(kept) :]
-            known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
-        choice = choices[chosen]
-        if choice.setting is not None and hidden:
-            members = [shoot(coordinates, each, choice.setting)[0] for each in drawn]
-        elif choice.setting is not None:
-            members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
-        elif choice.name == "none":
-            zero = Residual.zero(len(coordinates.scale), problem.model.n_states)
-            members = [zero] * self.n_members
-        dynamics = Dynamics(problem, coordinates, tuple(members))
-        trust = evidence(dynamics, parts, (runs, chosen, known), self.units_confirmed)
-        found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
-        name = f"hidden states, {choice.name}" if hidden else choice.name
-        return PlantTwin(problem, log, dynamics, name, trust, self.notes, found)
+    choice = choices[chosen]
+    if choice.setting is not None and row.hidden:
+        members = [shoot(coordinates, each, choice.setting)[0] for each in drawn]
+    elif choice.setting is not None:
+        members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
+    elif choice.name == "none":
+        zero = Residual.zero(len(coordinates.scale), problem.model.n_states)
+        members = [zero] * n_members
+    dynamics = Dynamics(problem, coordinates, tuple(members))
+    trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
+    found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
+    name = f"hidden states, {choice.name}" if row.hidden else choice.name
+    return PlantTwin(problem, log, dynamics, name, trust, notes, found)
 
 
 def _require_same_sampling(log: Log, problem: LinearMPC) -> None:

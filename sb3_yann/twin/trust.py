@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import ROUND_CEILING, Context
 from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.optimize import nnls
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
@@ -25,7 +23,6 @@ COST_ERROR = 0.25
 """The largest error of a predicted episode cost, relative to the mean cost, that is trusted."""
 STILL = 1e-4  # an input that moves by less, in half-widths, does not move
 FOREIGN = 10.0  # A model that errs by so many times what moves describes another plant
-POOR = 2.0  # from so many times on, a report asks whether it is the same plant
 OUTSIDE = 0.05  # share of logged rows beyond the box of theta from which on units are doubted
 PREVIOUS = 0.01  # how far theta's previous input may be from the one before it, in half-widths
 
@@ -55,8 +52,6 @@ class Trust:
         Share of each input's variance that states and disturbances do not explain.
     moves : ndarray, shape (m,)
         Standard deviations of the inputs, in half-widths.
-    noise : ndarray, shape (n,)
-        Standard deviation of the measurement that the one-step errors amount to, at most.
     problems, advice : tuple of str
         Why it is not to be trusted, and what would help; empty where there is nothing to say.
     """
@@ -68,7 +63,6 @@ class Trust:
     actual: Array
     excitation: Array
     moves: Array
-    noise: Array
     problems: tuple[str, ...]
     advice: tuple[str, ...]
 
@@ -214,16 +208,11 @@ def judge(
             said = f"{name} follows the MPC ({100 * own:.2f} % of its variance is its own), so its "
             found.append(("", f"{said}gain rests on the given B. A small step test would tell."))
     worse = runs.errors[0][0] / max(standing[0], 1e-300) if several else 0.0
-    compared = (
-        f"predicts {runs.horizons[0]} steps {{}}worse than 'nothing moves' "
-        f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
-    )
     units = "Compare units, operating point and sampling time of the log and the model."
     if worse > FOREIGN:
-        found.append((f"The problem's model {compared.format('far ')}", units))
-    elif worse > POOR:
-        columns = "Look at the order of the columns, units, operating point and sampling time."
-        found.append(("", f"The problem's model {compared.format('')} {columns}"))
+        said = f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing "
+        said += f"moves' ({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
+        found.append((said, units))
     if beyond[0] > OUTSIDE:
         rows = f"{100 * beyond[0]:.3g} % of the logged {beyond[1]}"
         found.append((f"{rows} lie beyond the problem's box of theta.", units))
@@ -254,7 +243,6 @@ def evidence(
     runs, chosen, costs = found
     problem = dynamics.problem
     coordinates = dynamics.coordinates
-    row = dynamics.row
     standing = persistence_error(coordinates, log, runs.horizons)
     inputs = excitation(problem, log)
     shares = beyond_the_box(problem, log) * (not made_by_law(problem, log).all())
@@ -266,13 +254,7 @@ def evidence(
     problems += foreign_previous(problem, log)
     problems += objections(problem, coordinates, log, units_confirmed)
     problems += _frozen(dynamics, log)
-    first = Dynamics(problem, coordinates, dynamics.members[:1])
-    left = [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]
-    errors = np.concatenate(left)[:, row.state]
-    # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
-    mixing = np.eye(problem.model.n_states) + problem.model.A**2
-    noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(errors, axis=0)))[0])
-    return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))
+    return Trust(runs, chosen, standing, *costs, *inputs, tuple(problems), tuple(advice))
 
 
 def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:
@@ -309,21 +291,13 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
             said.append(f"  ... and {more} more")
         said.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
     said.append("Inputs: how much they move, and how much of that does not follow the MPC:")
-    states, inputs = labels_of(problem.model)
+    inputs = labels_of(problem.model)[1]
     for name, own, moves in zip(inputs, trust.excitation, trust.moves, strict=True):
         rests = "rests on the given B" if own < ALONE else "is known from the log"
         half = f"{100 * moves:.3g} % of half the range"
         said.append(f"  {name}: {half}, {100 * own:.2f} %: its gain {rests}")
-    noise = [f"{n} {_rounded_up(s)}" for n, s in zip(states, trust.noise, strict=True)]
-    said.append(f"Sensor noise, at most (standard deviations): {', '.join(noise)}.")
     said.append("Verdict: trusted." if trust.trusted else "Verdict: NOT trusted; the MPC stays.")
     said += [f"  {each}" for each in trust.problems]
     if trust.advice:
         said += ["What would help:", *(f"  {each}" for each in np.unique(trust.advice))]
     return "\n".join(said)
-
-
-def _rounded_up(value: float) -> str:
-    """Return a number in two digits that is no less: what holds at most stays true."""
-    digits = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(float(value)))
-    return f"{float(digits):.2g}"

@@ -8,6 +8,7 @@ import torch as th
 
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import log, observed, problem
 
@@ -25,7 +26,7 @@ def episodes(count: int, noise: float = 0.0, first: int = 0) -> list[Episode]:
 
 @cache
 def coordinates(noise: float = 0.0) -> Coordinates:
-    return Coordinates.of(problem(), episodes(8, noise))
+    return Coordinates.of(RowLayout(problem()), episodes(8, noise))
 
 
 @cache
@@ -95,7 +96,7 @@ def test_a_plant_that_its_linear_model_describes_leaves_nothing_to_learn() -> No
         for u in each.actions:
             thetas.append(problem().predict(thetas[-1], u))
         exact.append(Episode(np.array(thetas), each.actions))
-    box = Coordinates.of(problem(), exact)
+    box = Coordinates.of(RowLayout(problem()), exact)
     (found,) = fit_ensemble(box, [exact], seed=0, updates=50)
     z, y = map(np.concatenate, zip(*map(box.regression, exact), strict=True))
     assert np.abs(y).max() < 1e-12

@@ -25,6 +25,7 @@ from sb3_yann.plan import TwinPlant
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import POLYNOMIALS, Cart, log, observed, problem, rated
 
@@ -198,7 +199,7 @@ def test_what_a_model_lacks_is_told_from_noise(noise, bend, wanted) -> None:
             after = mpc.deviations.predict(rows[-1], each)
             rows.append(after + noise * rng.standard_normal(after.shape) + bend * np.sin(rows[-1]))
         episodes.append(Episode(np.array(rows), u))
-    box = Coordinates.of(mpc, episodes)
+    box = Coordinates.of(RowLayout(mpc), episodes)
     none = Residual.zero(len(box.scale), mpc.model.n_states)
     found = LearntModel(mpc, tuple(episodes), Dynamics(mpc, box, (none, none)))
     assert lacks(found) == wanted

@@ -7,6 +7,7 @@ from general_problems import solved
 from sb3_yann import DisturbanceBounds, LinearModel, LinearMPC, RateLimits, Tracking
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.log import Episode, as_episodes, without_copies
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import fit_ensemble
 from twin_samples import problem
 from twin_samples import random_episode as episode
@@ -63,7 +64,7 @@ def episodes(turn: float, low: float) -> list[Episode]:
 def test_a_wrapped_angle_is_found_and_its_jumps_are_not_learnt(turn, low) -> None:
     mpc = rotor()
     log = episodes(turn, low)
-    coordinates = Coordinates.of(mpc, log)
+    coordinates = Coordinates.of(RowLayout(mpc), log)
     np.testing.assert_allclose(coordinates.turn, [turn, 0.0])
     (network,) = fit_ensemble(coordinates, [log], 0, updates=500)
     model = Dynamics(mpc, coordinates, (network,))
@@ -78,7 +79,7 @@ def bent(mpc: LinearMPC, members: int = 2) -> tuple[Dynamics, Episode]:
     """Return dynamics with quadratic residuals, and the episode that scales them."""
     log = episode(mpc)
     found = []
-    coordinates = Coordinates.of(mpc, [log])
+    coordinates = Coordinates.of(RowLayout(mpc), [log])
     for seed in range(members):
         rng = np.random.default_rng(seed)
         k = len(coordinates.scale)
@@ -128,10 +129,10 @@ HOLED = np.where(np.arange(11)[:, None] == 4, np.nan, X)
     [
         ([], ValueError, "episodes is empty"),
         ([X], TypeError, r"episode 0 must be a pair \(states, actions\)"),
-        ([(X, U), (X, U[1:])], ValueError, "episode 1: 11 states and 9 actions"),
-        ([(X[:, :1], U)], ValueError, r"episode 0: states have shape \(11, 1\), expected \(T \+ 1"),
-        ([(X, np.hstack([U, U]))], ValueError, r"actions have shape \(10, 2\), expected \(T, 1\)"),
-        ([(HOLED, U)], ValueError, "not finite, or too large, in row 4.* Cut the episode there"),
+        ([(X, U), (X, U[1:])], ValueError, "actions of episode 1 has 9 rows, states has 11"),
+        ([(X[:, :1], U)], ValueError, "states have 1 columns, the problem 2 states, and theta 2"),
+        ([(X, np.hstack([U, U]))], ValueError, "actions have 2 columns, the problem 1 inputs"),
+        ([(HOLED, U)], ValueError, "NaN or infinite entries in 1 rows, first in row 4"),
         ([(X, 30 * U)], ValueError, "action 0 is 3 in row 0, beyond the bounds -1 and 1"),
         ([(X[:4], U[:3])], ValueError, "episode 0 has 3 steps; 5 are the least"),
     ],
@@ -141,8 +142,7 @@ def test_what_is_no_log_is_refused_by_name(episodes, error, message) -> None:
         as_episodes(problem(), episodes)
 
 
-@pytest.mark.parametrize("previous", [None, [[0.2]]])
-def test_a_log_is_in_plant_units(previous) -> None:
+def test_a_log_is_in_plant_units() -> None:
     model = LinearModel([[0.9]], [[1.0]], 1.0, E=[[0.5]], x_ss=[300.0], u_ss=[40.0])
     mpc = LinearMPC(
         model, Q=[[1]], R=[[1]], horizon=2, u_min=39, u_max=41, theta_min=295, theta_max=305,
@@ -152,17 +152,16 @@ def test_a_log_is_in_plant_units(previous) -> None:
     rng = np.random.default_rng(0)
     u = np.linspace(-0.3, 0.3, 7)[:, None]
     x, r, d = (rng.uniform(-1, 1, (8, 1)) for _ in range(3))
-    (expected,) = as_episodes(mpc.deviations, [(x, u)], [r], [d], previous)
-    shown = None if previous is None else [[40.2]]
-    (found,) = as_episodes(mpc, [(x + 300, u + 40)], [r + 300], [d], shown)
+    (expected,) = as_episodes(mpc.deviations, [(x, u)], [r], [d])
+    (found,) = as_episodes(mpc, [(x + 300, u + 40)], [r + 300], [d])
     (same,) = as_episodes(mpc, [(expected.thetas + mpc.theta_ss, u + 40)])
     for each in (found, same):
         np.testing.assert_allclose(each.thetas, expected.thetas, atol=1e-12)
         np.testing.assert_allclose(each.actions, expected.actions, atol=1e-12)
     with pytest.raises(ValueError, match=r"action 0 is -0.3 .* 39 and 41 .* is in plant units"):
         as_episodes(mpc, [(x, u)], [r], [d])
-    with pytest.raises(ValueError, match="episode 0: 7 states and 7 actions; there is one state m"):
-        as_episodes(mpc, [(x[1:] + 300, u + 40)], [r[1:] + 300], [d[1:]], shown)
+    with pytest.raises(ValueError, match="actions of episode 0 has 7 rows, states has 7"):
+        as_episodes(mpc, [(x[1:] + 300, u + 40)], [r[1:] + 300], [d[1:]])
 
 
 def test_an_input_a_thousandth_beyond_its_bound_is_rounding_and_more_is_not() -> None:
@@ -199,11 +198,9 @@ def test_an_observer_s_disturbances_are_not_known_where_they_are_not_given() -> 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"references": [np.zeros((7, 1))]}, r"references have shape \(7, 1\), expected \(8, 1\)"),
-        ({"disturbances": [np.zeros(8)]}, r"disturbances have shape \(1, 8\), expected \(8, 2\)"),
-        ({"disturbances": [np.full((8, 2), np.nan)]}, "episode 0: disturbances are not finite"),
-        ({"previous": [[0.1, 0.2]]}, r"previous has shape \(2,\), expected \(1,\)"),
-        ({"previous": [[np.inf]]}, "episode 0: previous are not finite"),
+        ({"references": [np.zeros((7, 1))]}, r"episode 0 have shape \(7, 1\), expected \(8, 1\)"),
+        ({"disturbances": [np.zeros(8)]}, r"episode 0 have shape \(1, 8\), expected \(8, 2\)"),
+        ({"disturbances": [np.full((8, 2), np.nan)]}, "entries that are no finite numbers"),
     ],
 )  # fmt: skip
 def test_what_stands_beside_the_states_is_refused_by_name(given, message) -> None:
@@ -217,7 +214,9 @@ def test_all_of_theta_and_something_beside_it_is_too_much() -> None:
     as_episodes(loaded(), whole)
     with pytest.raises(ValueError, match=r"\['references'\] is given, but states are all of theta"):
         as_episodes(loaded(), whole, [0.0])
-    with pytest.raises(ValueError, match=r"expected \(T \+ 1, 1\) or \(T \+ 1, 5\)"):
+    with pytest.raises(
+        ValueError, match="states have 3 columns, the problem 1 states, and theta 5"
+    ):
         as_episodes(loaded(), [(np.zeros((8, 3)), np.zeros((7, 1)))])
 
 

@@ -10,6 +10,7 @@ from general_problems import solved
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, UntrustedTwinError
 from sb3_yann.control import OutputBounds, Terminal
 from sb3_yann.twin.dynamics import Coordinates
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import FreeRuns, Setting, ridge
 from twin_samples import log, mean_cost, problem, twin
 from twin_samples import random_episode as episode
@@ -20,7 +21,7 @@ from twin_samples import random_episode as episode
 def test_weights_are_those_of_a_ridge_regression_on_what_the_model_leaves(name, degree) -> None:
     mpc = solved(name)
     log = [episode(mpc, seed=seed) for seed in range(4)]
-    box = Coordinates.of(mpc, log[1:])  # the first one lies outside of it in part
+    box = Coordinates.of(RowLayout(mpc), log[1:])  # the first one lies outside of it in part
     (found,) = ridge(box, log, [Setting(degree, 1e-3, 30.0)])
     z, y = (np.concatenate(each) for each in zip(*map(box.regression, log), strict=True))
     k = z.shape[1]

@@ -61,11 +61,10 @@ def test_the_twin_s_env_is_the_wrapped_plant_step_by_step() -> None:
     dynamics = found.dynamics
     member = Dynamics(found.problem, dynamics.coordinates, dynamics.members[2:3])
     plant = observed_env(Same(member))
-    env = found.env(member=2)
+    env = found.env()
     over = False
     shown, _ = plant.reset(seed=3)
-    env.reset(seed=3)
-    env.reset(options={"state": shown.astype(float)})
+    env.reset(seed=2, options={"state": shown.astype(float)})
     rng = np.random.default_rng(0)
     law = found.problem.explicit()
     while not over:
