@@ -11,9 +11,8 @@ acts. A plant whose gain is not the model's looks like an input in other units; 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +35,7 @@ SLOPE_TOLERANCE = 0.1
 """How far from one the slope of an input on the law may be: sensors' noise lowers it."""
 LEAST_GAIN = 0.6
 """A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
-RUN = 10
-MUCH_BETTER = 0.8
-"""Steps of a run of the model; share of its squared error that a unit's factor leaves at most."""
+MUCH_BETTER = 0.8  # share of the model's squared error that a unit's factor leaves at most
 ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
 MOVING = 1e-3  # of a standard deviation: a state that moves by more in a step moves
 PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
@@ -52,13 +49,47 @@ CONFIRM = (
 ROW_NAMES = {-1: "the row before", 0: "the same row", 1: "the row after"}
 
 
-class _Log(NamedTuple):
-    """What is checked: see :func:`objections`."""
+class _Log:
+    """What is checked: rows (N, size), inputs (N, m), and the states after them (N, n)."""
 
-    problem: LinearMPC
-    coordinates: Coordinates
-    episodes: tuple[Episode, ...]
-    units_confirmed: bool
+    def __init__(
+        self,
+        problem: LinearMPC,
+        coordinates: Coordinates,
+        episodes: tuple[Episode, ...],
+        units_confirmed: bool,
+    ) -> None:
+        self.problem = problem
+        self.row = coordinates.row
+        self.unit = coordinates.units
+        self.scale = coordinates.scale
+        self.episodes = episodes
+        self.units_confirmed = units_confirmed
+        self.rows = np.concatenate([each.thetas[:-1] for each in episodes])
+        self.inputs = np.concatenate([each.actions for each in episodes])
+        self.after = np.concatenate([each.thetas[1:, self.row.state] for each in episodes])
+        self.names = labels_of(problem.model)
+
+    def on_law(self, shift: int = 0) -> tuple[Array, Array]:
+        """Return rows of theta (N, n_theta), ``shift`` away from the inputs (N, m) beside them."""
+        layout = self.problem.layout
+        thetas = []
+        inputs = []
+        for each in self.episodes:
+            k = np.arange(1, len(each) - 1)
+            theta = self.row.shown(each.thetas)[k + shift].copy()
+            theta[:, layout.previous] = each.actions[k - 1][:, : layout.n_previous]
+            thetas.append(theta)
+            inputs.append(each.actions[k])
+        return np.concatenate(thetas), np.concatenate(inputs)
+
+    def errors(self, change: Array, shift: Any = 0.0, inputs: Array | None = None) -> Array:
+        """Return how far the given model errs (N, n) where states x are ``change x + shift``."""
+        u = self.inputs if inputs is None else inputs
+        rows = np.concatenate([self.rows, u], axis=1)
+        rows[:, self.row.state] = self.rows[:, self.row.state] @ change.T + shift
+        left = self.after @ change.T + shift - rows @ self.row.linear[self.row.state].T
+        return np.asarray(left / np.abs(change @ self.unit))
 
 
 def objections(
@@ -75,10 +106,10 @@ def objections(
     log = _Log(problem, coordinates, episodes, units_confirmed)
     readings = {s: _on_law(log, s) for s in ROW_NAMES}
     logged = np.diagonal(readings[0].left)
-    proven = np.diagonal(_is_one(readings[0])).copy()
+    proven = np.diagonal(readings[0].as_it_is).copy()
     for s in (-1, 1):
         clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
-        proven &= ~(clearly & np.diagonal(_is_one(readings[s]) & readings[s].alone))
+        proven &= ~(clearly & np.diagonal(readings[s].as_it_is & readings[s].alone))
     found = [] if units_confirmed else [*_other_pace(log)]
     exact = made_by_law(problem, episodes)
     if np.all(exact | (proven & (logged < EXACT_SHARE))):
@@ -111,23 +142,21 @@ def made_by_law(problem: LinearMPC, episodes: Sequence[Episode]) -> NDArray[np.b
     return found
 
 
-@dataclass(frozen=True)
-class _OnLaw:
+class _OnLaw(NamedTuple):
     """Each logged input j regressed on each column i of the law, some rows away, at [i, j].
 
-    ``slope`` has the standard ``error``; the regression leaves a share ``left`` of the input's
-    variance, and would leave ``left_of_rows`` with theta besides, were all that it adds chance.
-    ``offset_room`` is four standard errors of the offset. ``unique`` (m,): the law is more than a
-    multiple of one entry of theta.
+    ``slope`` and ``offset`` are known to an ``error`` and an ``offset_error`` of four standard
+    errors, and what sensors' noise adds to the latter. The regression leaves a share ``left`` of
+    the input's variance, and would leave ``left_of_rows`` with theta besides, were all that it adds
+    chance. ``unique`` (m,): the law is more than a multiple of one entry of theta.
     """
 
     slope: Array
     offset: Array
     error: Array
+    offset_error: Array
     left: Array
     left_of_rows: Array
-    deviation: Array
-    offset_room: Array
     unique: NDArray[np.bool_]
 
     @property
@@ -136,19 +165,14 @@ class _OnLaw:
         made = (self.left < self.left_of_rows + EXACT_SHARE) & (self.left < DITHERED_SHARE)
         return (made & self.unique[:, None]) | (self.left < EXACT_SHARE)
 
+    @property
+    def as_it_is(self) -> NDArray[np.bool_]:
+        """Where column i of the law gives input j as it is, (m, m).
 
-def _rows(log: _Log, shift: int = 0) -> tuple[Array, Array]:
-    """Return rows of theta (N, n_theta), ``shift`` away from the inputs (N, m) beside them."""
-    layout = log.problem.layout
-    thetas = []
-    inputs = []
-    for each in log.episodes:
-        k = np.arange(1, len(each) - 1)
-        theta = log.coordinates.row.shown(each.thetas)[k + shift].copy()
-        theta[:, layout.previous] = each.actions[k - 1][:, : layout.n_previous]
-        thetas.append(theta)
-        inputs.append(each.actions[k])
-    return np.concatenate(thetas), np.concatenate(inputs)
+        No plausible factor of units is as near to one as the slope may yet be.
+        """
+        near = (np.abs(self.slope - 1) < SLOPE_TOLERANCE) & (self.error < 1 - LEAST_GAIN)
+        return near & (np.abs(self.offset) < self.offset_error)
 
 
 def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) -> _OnLaw:
@@ -157,7 +181,7 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
     With ``change`` = (M, v) the law sees M x + v in place of the logged states x.
     """
     m = log.problem.model.n_inputs
-    theta, u = _rows(log, shift)
+    theta, u = log.on_law(shift)
     if change is not None:
         state = log.problem.layout.state
         theta[:, state] = theta[:, state] @ change[0].T + change[1]
@@ -166,8 +190,9 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
     theta = theta[known]
     u = u[known]
     answer = answer[known]
-    slope, offset, deviation, room = np.zeros((4, m, m))
+    slope, offset, offset_error = np.zeros((3, m, m))
     error, left, left_of_rows = np.ones((3, m, m))
+    error *= STANDARD_ERRORS
     unique = np.zeros(m, dtype=bool)
     own = log.problem.deviations
     for i in range(m):
@@ -190,21 +215,14 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
         # An F test: p columns that say nothing explain p of N rows.
         chance = 1 + 3 * x.shape[1] / len(a)
         left_of_rows[i] = chance * np.mean(rest**2, axis=0) / spread
-        error[i] = np.sqrt(left[i] * spread / np.sum(F[:, 0] ** 2))
+        sure = STANDARD_ERRORS * np.sqrt(left[i] * spread / len(a))
+        error[i] = sure / np.std(a)
         # Of one entry of theta every linear controller is the law times a factor.
         share = x - F @ np.linalg.lstsq(F, x, rcond=None)[0]
         unique[i] = np.any(np.var(share, axis=0) > 0.02 * np.var(x, axis=0))
-        deviation[i] = np.sqrt(spread)
-        room[i] = STANDARD_ERRORS * np.sqrt(left[i] * spread * np.mean(a**2) / np.var(a) / len(a))
-    return _OnLaw(slope, offset, error, left, left_of_rows, deviation, room, unique)
-
-
-def _is_one(on: _OnLaw) -> NDArray[np.bool_]:
-    """Return where column i of the law gives input j as it is, [i, j]."""
-    near = np.abs(on.slope - 1) < SLOPE_TOLERANCE
-    # No plausible factor of units is as near to one as the slope may yet be.
-    sure = STANDARD_ERRORS * on.error < 1 - LEAST_GAIN
-    return near & sure & (np.abs(on.offset) < SLOPE_TOLERANCE * on.deviation + on.offset_room)
+        moved = sure * np.sqrt(np.mean(a**2) / np.var(a))
+        offset_error[i] = SLOPE_TOLERANCE * np.sqrt(spread) + moved
+    return _OnLaw(slope, offset, error, offset_error, left, left_of_rows, unique)
 
 
 def _against_law(
@@ -212,7 +230,7 @@ def _against_law(
 ) -> Iterator[str]:
     """Yield where an input is the law's of other rows or columns, or in other units."""
     logged = readings[0]
-    names = labels_of(log.problem.model)[1]
+    names = log.names[1]
     for j in np.flatnonzero(~proven):
         own = logged.left[j, j]
         found = [
@@ -229,8 +247,7 @@ def _against_law(
         cures = ["move the inputs by a row"] if s else []
         cures += ["exchange the columns"] if i != j else []
         cures += ["change the sign"] if slope < 0 else []
-        error = STANDARD_ERRORS * readings[s].error[i, j]
-        if cures and abs(abs(slope) - 1) < SLOPE_TOLERANCE + error:
+        if cures and abs(abs(slope) - 1) < SLOPE_TOLERANCE + readings[s].error[i, j]:
             what = f"{'minus ' if slope < 0 else ''}what the MPC gives {names[i]}"
             late = " A controller that acts a sample late is dead time: PastInputs."
             yield (
@@ -246,18 +263,11 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
 
     Then the law gives the inputs from the states so changed, or the given model predicts them.
     """
-    row = log.coordinates.row
     n = log.problem.model.n_states
-    names = labels_of(log.problem.model)[0]
-    x = np.concatenate([each.thetas[:-1] for each in log.episodes])
-    u = np.concatenate([each.actions for each in log.episodes])
-    after = np.concatenate([each.thetas[1:, row.state] for each in log.episodes])
+    names = log.names[0]
 
     def error(change: Array) -> Array:
-        rows = np.concatenate([x, u], axis=1)
-        rows[:, row.state] = x[:, row.state] @ change.T
-        left = after @ change.T - rows @ row.linear[row.state].T
-        return np.asarray(np.var(left / np.abs(change @ log.coordinates.units), axis=0)) + 1e-12
+        return np.asarray(np.var(log.errors(change), axis=0)) + 1e-12
 
     before = error(np.eye(n))
     for i, j in combinations_with_replacement(range(n), 2):
@@ -268,7 +278,7 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
         if not fits and not np.all(proven):
             on = _on_law(log, 0, (change, np.zeros(n)))
             better = np.diagonal(on.left) < CLEARLY_BETTER * logged - 1e-9
-            fits = np.any(np.diagonal(_is_one(on) & on.alone) & better & ~proven)
+            fits = np.any(np.diagonal(on.as_it_is & on.alone) & better & ~proven)
         if fits:
             what = (
                 f"{names[i]} and {names[j]} are exchanged" if i != j else f"{names[i]} is negated"
@@ -285,39 +295,31 @@ def _other_units(log: _Log, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterat
     A law that is nearly linear takes the zero of one state for that of another, or of its input:
     the model tells them apart, or all are named.
     """
-    names = labels_of(log.problem.model)
-    row = log.coordinates.row
-    unit = log.coordinates.units
+    names = log.names
     n = log.problem.model.n_states
-    x = np.concatenate([each.thetas[:-1] for each in log.episodes])
-    actions = np.concatenate([each.actions for each in log.episodes])
-    after = np.concatenate([each.thetas[1:, row.state] for each in log.episodes])
 
     def left_by_model(change: Array, shift: Array, u: Array) -> float:
-        rows = np.concatenate([x, u], axis=1)
-        rows[:, row.state] = x[:, row.state] @ change.T + shift
-        error = after @ change.T + shift - rows @ row.linear[row.state].T
-        return float(np.mean((error / (change @ unit)) ** 2))
+        return float(np.mean(log.errors(change, shift, u) ** 2))
 
     found: list[tuple[float, str]] = []
     of_inputs = []
-    read = actions.copy()
+    read = log.inputs.copy()
     for j in np.flatnonzero(~proven & np.diagonal(logged.alone)):
         slope = logged.slope[j, j]
-        error = STANDARD_ERRORS * logged.error[j, j]
-        room = SLOPE_TOLERANCE * logged.deviation[j, j] + logged.offset_room[j, j]
-        away = logged.offset[j, j] if abs(logged.offset[j, j]) > room else 0.0
+        error = logged.error[j, j]
+        away = logged.offset[j, j]
+        away = away if abs(away) > logged.offset_error[j, j] else 0.0
         if abs(slope) > error and (abs(slope - 1) > SLOPE_TOLERANCE + error or away):
             zero = f", {away:+.4g}" if away else ""
             of_inputs.append(
                 f"The logged {names[1][j]} is {slope:.4g} times what the MPC gives{zero}"
             )
-            read[:, j] = (actions[:, j] - away) / slope
+            read[:, j] = (log.inputs[:, j] - away) / slope
     if of_inputs:
         found = [(left_by_model(np.eye(n), np.zeros(n), read), " and ".join(of_inputs))]
-    left_open = ~(proven | _held(log))
+    left_open = ~proven
     law = law_of(log.problem)
-    theta, u = _rows(log)
+    theta, u = log.on_law()
     some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
     theta = theta[some]
     u = u[some]
@@ -326,7 +328,7 @@ def _other_units(log: _Log, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterat
 
         def left(p: Array, i: int = i) -> Array:
             rows = theta.copy()
-            rows[:, i] = p[0] * rows[:, i] + p[1] * unit[i]
+            rows[:, i] = p[0] * rows[:, i] + p[1] * log.unit[i]
             return np.asarray(np.nan_to_num((u - law(rows)) / scale).ravel())
 
         before = np.mean(left(np.array([1.0, 0.0])) ** 2)
@@ -338,13 +340,13 @@ def _other_units(log: _Log, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterat
         change = np.eye(n)
         shift = np.zeros(n)
         change[i, i] = factor
-        shift[i] = zero * unit[i]
+        shift[i] = zero * log.unit[i]
         on = _on_law(log, 0, (change, shift))
-        if np.any(np.diagonal(_is_one(on) & on.alone) & left_open):
+        if np.any(np.diagonal(on.as_it_is & on.alone) & left_open):
             times = f"{factor:.4g} times " if abs(factor - 1) > 0.01 else ""
             words = f"The MPC gives the logged inputs where {names[0][i]} is {times}what is logged"
             words += f", {shift[i]:+.4g}"
-            found.append((left_by_model(change, shift, actions), words))
+            found.append((left_by_model(change, shift, log.inputs), words))
     least = min((error for error, _ in found), default=0.0)
     if said := [words for error, words in found if CLEARLY_BETTER * error <= least]:
         yield f"{'; or: '.join(said)}: is it in other units, or has it another zero? {CONFIRM}"
@@ -355,12 +357,8 @@ def _other_pace(log: _Log) -> Iterator[str]:
 
     The gains are left open, and the zeros: a plant may have others.
     """
-    row = log.coordinates.row
     model = log.problem.model
-    unit = log.coordinates.units
-    z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes])
-    after = np.concatenate([e.thetas[1:, row.state] for e in log.episodes])
-    x = z[:, : model.n_states]
+    x = log.rows[:, log.row.state]
     n = model.n_states
     m = model.n_inputs
     power: Array = np.eye(n)
@@ -369,9 +367,10 @@ def _other_pace(log: _Log) -> Iterator[str]:
     for _ in PACES:
         driven = driven + power @ model.B
         power = model.A @ power
-        rest = (after - x @ power.T) / unit
+        rest = (log.after - x @ power.T) / log.unit
         rest -= rest.mean(axis=0)
-        u = (z[:, -m:] - z[:, -m:].mean(axis=0))[:, None] * (driven / unit[:, None])
+        moves = log.inputs - log.inputs.mean(axis=0)
+        u = moves[:, None] * (driven / log.unit[:, None])
         gains = np.linalg.lstsq(u.reshape(-1, m), rest.ravel(), rcond=1e-9)[0]
         left.append(np.var(rest - u @ gains, axis=0) + ROUNDING)
     ratio = np.array(left) / left[0]
@@ -383,31 +382,11 @@ def _other_pace(log: _Log) -> Iterator[str]:
         )
 
 
-def _held(log: _Log) -> NDArray[np.bool_]:
-    """Return which inputs (m,) mostly stand still inside of their bounds while the states move.
-
-    No law of the states makes them.
-    """
-    problem = log.problem.deviations
-    units = log.coordinates.units
-    state = log.coordinates.row.state
-    held = []
-    moves = []
-    for each in log.episodes:
-        u = each.actions
-        x = each.thetas[:-1, state]
-        still = np.abs(np.diff(u, axis=0)) <= ROUNDING * problem.u_half
-        held.append(still & (u[1:] > problem.u_min) & (u[1:] < problem.u_max))
-        moves.append(np.any(np.abs(np.diff(x, axis=0)) > MOVING * units, axis=1))
-    moving = np.concatenate(moves)
-    return np.asarray(np.concatenate(held)[moving].mean(axis=0) > 0.5) & bool(moving.any())
-
-
 def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where inputs that the law does not prove act otherwise than the model says."""
     fit = _Effects.of(log, 0)
     B = log.problem.model.B
-    unit = log.coordinates.units
+    unit = log.unit
     if fit is None:
         return
     sizes = np.maximum(np.sum((B / unit[:, None]) ** 2, axis=0), 1e-300)
@@ -418,7 +397,7 @@ def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
             continue
         # Inputs that follow the state of their own row tell it, with the other sign: no cause.
         caused = other.follows.min() > 0.7 or np.min(np.sum(weights * other.B.T, axis=1)) > 1 / 3
-        ratio = other.left / fit.left
+        ratio = np.diag(other.covariance) / np.diag(fit.covariance)
         if (s == -1 or caused) and ratio.min() < 0.5 and ratio.max() < 1.5:
             yield (
                 f"The next states follow the inputs of {ROW_NAMES[s]} (they leave "
@@ -436,17 +415,20 @@ def _against_gains(
     log: _Log, fit: _Effects, weights: Array, proven: NDArray[np.bool_]
 ) -> Iterator[str]:
     """Yield where inputs act as others of B do, against its signs, or far otherwise."""
-    names = labels_of(log.problem.model)[1]
+    names = log.names[1]
     own = np.arange(len(weights))
     B = log.problem.model.B
-    unit = log.coordinates.units[:, None]
+    same = np.eye(len(B))
+    unit = log.unit[:, None]
     norms = np.outer(np.linalg.norm(fit.B / unit, axis=0), np.linalg.norm(B / unit, axis=0))
     apart = 1 - ((fit.B / unit).T @ (B / unit) / np.maximum(norms, 1e-300)) ** 2
     columns = linear_sum_assignment(apart)[1]
     sizes = np.linalg.norm(fit.B / np.sqrt(np.diag(fit.covariance))[:, None], axis=0)
     known = np.all(sizes > STANDARD_ERRORS * np.sqrt(len(B)) * fit.factors)
-    if known and apart[own, columns].sum() < CLEARLY_BETTER * apart[own, own].sum():
-        for j in np.flatnonzero((columns != own) & ~proven):
+    others = np.flatnonzero((columns != own) & ~proven)
+    better = apart[own, columns].sum() < CLEARLY_BETTER * apart[own, own].sum()
+    if known and better and len(others):
+        for j in others:
             yield (
                 f"The logged {names[j]} moves the plant as the model's {names[columns[j]]} does: "
                 "exchange the columns of the log."
@@ -457,9 +439,12 @@ def _against_gains(
         variance = float(weights[j] @ fit.covariance @ weights[j])
         error = STANDARD_ERRORS * float(np.sqrt(max(variance, 0.0)) * fit.factors[j])
         measured = f"{gain:.3g} ± {error:.2g} times"
+        # Units make the model better; where they do not, the gain is curvature.
+        read = np.where(np.arange(len(own)) == j, gain, 1.0) * log.inputs
+        both = (np.var(log.errors(same, inputs=u), axis=0).sum() for u in (read, log.inputs))
+        left, before = both
         far = not LEAST_GAIN < gain < 1 / LEAST_GAIN and abs(gain - 1) > error
-        # Units make runs of the model better; where they do not, the gain is curvature.
-        far = far and _error_of_runs(log, j, gain) < MUCH_BETTER * _error_of_runs(log, j, 1.0)
+        far = far and bool(left < MUCH_BETTER * before)
         if gain + error < 0 and gain < -0.1:
             yield (
                 f"The logged {names[j]} moves the plant against the sign of the model's B "
@@ -472,34 +457,16 @@ def _against_gains(
             )
 
 
-def _error_of_runs(log: _Log, j: int, gain: float) -> float:
-    """Return how far runs of the given model vary from the log, with input j times a gain."""
-    row = log.coordinates.row
-    errors = []
-    linear = row.linear.copy()
-    linear[:, row.size + j] *= gain
-    for each in log.episodes:
-        starts = np.arange(0, max(len(each) - RUN, 1), RUN)
-        steps = min(RUN, len(each))
-        rows = each.thetas[starts].copy()
-        for k in range(steps):
-            rows[:, row.given] = each.thetas[starts + k][:, row.given]
-            rows = np.hstack([rows, each.actions[starts + k]]) @ linear.T
-            row.clip(rows)
-        errors.append((rows - each.thetas[starts + steps])[:, row.state] / log.coordinates.units)
-    return float(np.var(np.concatenate(errors), axis=0).sum())
-
-
 def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
     """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
     if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
         return
     A = log.problem.model.A
-    names = labels_of(log.problem.model)[0]
+    names = log.names[0]
     rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
     x_ss = log.problem.model.x_ss
     shown = log.problem.units.to_plant(rest)
-    away = np.abs(rest / log.coordinates.units)
+    away = np.abs(rest / log.unit)
     if np.max(away) > 5:  # beyond the log: a state that hardly returns, or noise
         return
     for i in np.flatnonzero(away > 0.5):
@@ -510,20 +477,18 @@ def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
         )
 
 
-@dataclass(frozen=True)
-class _Effects:
+class _Effects(NamedTuple):
     """A regression of the next states on states and inputs.
 
-    It finds B (n, m), leaves the ``covariance`` (n, n) and the mean squares ``left`` (n,).
-    ``factors`` (m,) are standard errors of a column of B over the deviation of what is left.
-    ``drift`` (n,) is the next state of x = 0 and u = 0. ``follows`` (m,) is the deviation of the
-    inputs that the states leave, relative to their own.
+    It finds B (n, m), and leaves the ``covariance`` (n, n). ``factors`` (m,) are standard errors of
+    a column of B over the deviation of what is left. ``drift`` (n,) is the next state of x = 0 and
+    u = 0. ``follows`` (m,) is the deviation of the inputs that the states leave, relative to their
+    own.
     """
 
     B: Array
     covariance: Array
     factors: Array
-    left: Array
     drift: Array
     drift_error: Array
     follows: Array
@@ -534,14 +499,12 @@ class _Effects:
 
         Squares of the states count where rows are enough.
         """
-        row = log.coordinates.row
+        row = log.row
         m = log.problem.model.n_inputs
         steps = [(e, np.arange(1, len(e) - 1)) for e in log.episodes]
         z = np.concatenate([row.features(e.thetas[k], e.actions[k + shift]) for e, k in steps])
-        z = z / log.coordinates.scale
         y = np.concatenate([e.thetas[k + 1, row.state] for e, k in steps])
-        x = z[:, :-m]
-        u = z[:, -m:]
+        x, u = np.split(z / log.scale, [-m], axis=1)
         first, second = np.triu_indices(x.shape[1])
         curved = np.hstack([x, x[:, first] * x[:, second]])
         states = curved if len(z) > 5 * (curved.shape[1] + m + 1) else x
@@ -550,19 +513,16 @@ class _Effects:
             return None
         scale = np.std(F, axis=0)
         scale[scale < 1e-12] = 1.0
-        left, singular, right = np.linalg.svd(F / scale, full_matrices=False)
-        kept = singular > 1e-7 * singular[0]
-        inverse = np.where(kept, 1 / np.maximum(singular, 1e-300), 1e7 / singular[0])
-        slopes = (right.T * inverse * kept) @ (left.T @ y) / scale[:, None]
+        gram = (F / scale).T @ (F / scale)
+        # Inputs that are linear in the states have no effect of their own, and a large error.
+        inverse = np.linalg.inv(gram + 1e-12 * np.trace(gram) * np.eye(len(gram)))
+        slopes = inverse @ (F / scale).T @ y / scale[:, None]
         rest = y - F @ slopes
-        rounding = np.diag((1e-5 * log.coordinates.units) ** 2)
-        covariance = rest.T @ rest / (len(z) - F.shape[1]) + rounding
-        factors = np.linalg.norm(right.T * inverse, axis=1) / scale
+        covariance = rest.T @ rest / (len(z) - F.shape[1]) + np.diag((1e-5 * log.unit) ** 2)
+        factors = np.sqrt(np.diag(inverse)) / scale
         own = u - F[:, m:] @ np.linalg.lstsq(F[:, m:], u, rcond=None)[0]
         follows = np.std(own, axis=0) / np.maximum(np.std(u, axis=0), 1e-12)
-        squares = np.diag(covariance).copy()
-        size = log.coordinates.scale[-m:]
-        return cls(
-            slopes[:m].T / size, covariance, factors[:m] / size, squares, slopes[m],
-            np.sqrt(squares) * factors[m], follows,
-        )  # fmt: skip
+        size = log.scale[-m:]
+        drift_error = np.sqrt(np.diag(covariance)) * factors[m]
+        B = slopes[:m].T / size
+        return cls(B, covariance, factors[:m] / size, slopes[m], drift_error, follows)
