@@ -275,52 +275,27 @@ def _centered(values: Array, known: Mask) -> Array:
 Map = Callable[[Array], Array]  # from an observation to theta
 
 
-class InDeviations(gym.Wrapper[Any, Any, Any, Any]):
-    """An env in plant units as laws compute with it: it shows theta, and takes u, in deviations.
+def _in_deviations(
+    make: Callable[[], gym.Env[Any, Any]], units: Units, observation: Map | None
+) -> gym.Env[Any, Any]:
+    """Return an env in plant units as laws compute with it: see :func:`in_deviations`."""
+    env = make()
+    seen: Any = env.observation_space
+    taken: Any = env.action_space
+    far = np.full(len(units.theta_ss), np.inf)
+    low, high = (seen.low, seen.high) if observation is None else (-far, far)
 
-    ``observation`` makes theta in plant units of what the env shows; by default it shows that.
-    """
+    def theta(shown: Any) -> Array:
+        return units.to_deviations(shown if observation is None else observation(np.ravel(shown)))
 
-    def __init__(
-        self, env: gym.Env[Any, Any], units: Units, observation: Map | None = None
-    ) -> None:
-        super().__init__(env)
-        self.units = units
-        self.observation = observation
-        seen: Any = env.observation_space
-        taken: Any = env.action_space
-        self.taken: spaces.Box = taken
-        far = np.full(len(units.theta_ss), np.inf)
-        low, high = (seen.low, seen.high) if observation is None else (-far, far)
-        self.observation_space = spaces.Box(
-            low - units.theta_ss, high - units.theta_ss, dtype=np.float64
-        )
-        self.action_space = spaces.Box(
-            taken.low - units.u_ss, taken.high - units.u_ss, dtype=np.float64
-        )
-
-    @classmethod
-    def around(cls, make: Callable[[], gym.Env[Any, Any]], *args: Any) -> InDeviations:
-        """Return one around an env that is made."""
-        return cls(make(), *args)
-
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(**kwargs)
-        return self._theta(observation), info
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step with the operating point put on the action, and taken off the observation."""
+    def action(u: Any) -> Any:
         # Rounding must not leave the space of the env.
-        u = np.clip(self.units.input_to_plant(action), self.taken.low, self.taken.high)
-        observation, reward, *ends, info = self.env.step(u.astype(self.taken.dtype))
-        terminated, truncated = ends
-        return self._theta(observation), float(reward), terminated, truncated, info
+        return np.clip(units.input_to_plant(u), taken.low, taken.high).astype(taken.dtype)
 
-    def _theta(self, shown: Any) -> Array:
-        return self.units.to_deviations(
-            shown if self.observation is None else self.observation(np.ravel(shown))
-        )
+    seen = spaces.Box(low - units.theta_ss, high - units.theta_ss, dtype=np.float64)
+    inputs = spaces.Box(taken.low - units.u_ss, taken.high - units.u_ss, dtype=np.float64)
+    env = gym.wrappers.TransformObservation(env, theta, seen)
+    return gym.wrappers.TransformAction(env, action, inputs)
 
 
 def in_deviations(
@@ -352,7 +327,7 @@ def in_deviations(
         )
     if observation is None and not problem.units.shifted:
         return make
-    return partial(InDeviations.around, make, problem.units, observation)
+    return partial(_in_deviations, make, problem.units, observation)
 
 
 def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:

@@ -47,16 +47,13 @@ def as_episodes(
     episodes: Iterable[tuple[ArrayLike, ArrayLike]],
     references: Sequence[ArrayLike] | None = None,
     disturbances: Sequence[ArrayLike] | None = None,
-    *,
-    observed: bool = False,
 ) -> tuple[Episode, ...]:
     """Return episodes, given in plant units, as the law sees them: in deviations.
 
     States are (T + 1, n), or all of theta; references (T + 1, p) and disturbances (T + 1, d) what
     theta holds besides, one for each episode, or one row for all of it. The input before each
-    episode is that of the operating point. Where an observer estimates the disturbances they are
-    NaN where none are given. Wrong shapes, entries that are not finite and inputs beyond their
-    bounds are a ValueError.
+    episode is that of the operating point. Wrong shapes, entries that are not finite and inputs
+    beyond their bounds are a ValueError.
     """
     layout = problem.layout
     pairs = [tuple(map(_as_columns, each)) for each in _pairs(episodes)]
@@ -92,7 +89,7 @@ def as_episodes(
         u = _within_bounds(problem, i, action)
         x = problem.units.to_deviations(x)
         own = {name: values[i] for name, values in beside.items()}
-        found.append(Episode(x if whole else _theta(problem, i, x, u, own, observed), u))
+        found.append(Episode(x if whole else _theta(problem, i, x, u, own), u))
     return tuple(found)
 
 
@@ -187,14 +184,7 @@ def _within_bounds(problem: LinearMPC, i: int, u: Array) -> Array:
     return problem.units.input_to_deviations(np.clip(u, problem.u_min, problem.u_max))
 
 
-def _theta(
-    problem: LinearMPC,
-    i: int,
-    x: Array,
-    u: Array,
-    given: dict[str, Any],
-    observed: bool,
-) -> Array:
+def _theta(problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any]) -> Array:
     layout = problem.layout
     point = problem.theta_ss
     theta = np.zeros((len(x), layout.size))
@@ -203,9 +193,7 @@ def _theta(
     for name, part in (("references", slice(0, p)), ("disturbances", slice(p, None))):
         size = len(layout.now[part])
         if name not in given:
-            if size and observed and name == "disturbances":
-                theta[:, layout.disturbance] = np.nan
-            elif size:
+            if size:
                 raise ValueError(
                     f"The problem's theta holds {size} {name}: pass {name}=, shape (T + 1, "
                     f"{size}) for each episode, or states of all of theta. Of a CSV file, name the "

@@ -194,10 +194,9 @@ class PlantTwin(LearntModel):
                 )
             episodes = whole
         row = RowLayout(problem, observer)
-        if observer is not None and row.observer is None:
+        if observer is not None:
             episodes, disturbances = row.estimated(episodes, disturbances)
-        observed = row.observer is not None
-        log = as_episodes(problem, episodes, references, disturbances, observed=observed)
+        log = as_episodes(problem, episodes, references, disturbances)
         log, copied = without_copies(log)
         notes += copied
         if observer is None:

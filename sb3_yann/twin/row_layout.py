@@ -238,15 +238,12 @@ class RowLayout:
     def recovered(self, thetas: Array, actions: Array) -> tuple[Array, Array]:
         """Return the rows (T + 1, size) and inputs (T, m) of an episode of thetas.
 
-        Where d is NaN its states are the measured ones: the observer is run over them. Else what
-        it measured follows from what it showed. An episode that begins amid an estimate loses its
-        first row: what was measured there is not known.
+        What an observer measured follows from what it showed. An episode that begins amid an
+        estimate loses its first row: what was measured there is not known.
         """
         if self.observer is None:
             return thetas, actions
         parts = self.problem.layout
-        if not self.hidden and np.isnan(thetas[:, parts.disturbance]).all():
-            return self._run(thetas, actions), actions
         rows = [self.begin(thetas[0])]
         for theta, u in zip(thetas[1:], actions, strict=True):
             rows.append(self.after(rows[-1], u, theta))
@@ -292,31 +289,14 @@ class RowLayout:
         u = np.asarray(inputs, np.float64).reshape(len(y) - 1, -1) - model.u_ss
         k = estimator.n_known
         d = None if loads is None or not k else loads[:, :k] - model.d_ss[:k]
-        x_hat, d_hat = np.split(self._filtered(y, u, d), [model.n_states], axis=1)
+        estimator = copy.deepcopy(estimator)
+        estimator.reset(y[0])
+        found = [estimator.estimate]
+        for t in range(len(u)):
+            estimator.update(y[t + 1], u[t], None if d is None else d[t])
+            found.append(estimator.estimate)
+        x_hat, d_hat = np.split(np.array(found), [model.n_states], axis=1)
         bounds = self.problem.disturbances
         known = self._n_disturbances - estimator.n_estimated
         d_hat = np.clip(d_hat + model.d_ss[k:], bounds.d_min[known:], bounds.d_max[known:])
         return x_hat + model.x_ss, d_hat
-
-    def _filtered(self, y: Array, u: Array, d: Array | None = None) -> Array:
-        """Return the estimates (T + 1, n + d) of readings, inputs and measured d in deviations."""
-        estimator = copy.deepcopy(self.estimator)
-        assert estimator is not None
-        estimator.reset(y[0])
-        found = [estimator.estimate]
-        for k in range(len(u)):
-            estimator.update(y[k + 1], u[k], None if d is None else d[k])
-            found.append(estimator.estimate)
-        return np.array(found)
-
-    def _run(self, thetas: Array, actions: Array) -> Array:
-        """Return rows of thetas whose states were measured, and whose d is not known."""
-        assert self.observer is not None
-        parts = self.problem.layout
-        n = parts.n_states
-        x = thetas[:, parts.state]
-        estimates = self._filtered(x @ self.observer.C.T, actions)
-        rows = np.concatenate([thetas, x, estimates[:, n:]], axis=1)
-        rows[:, parts.state] = estimates[:, :n]
-        self.clip(rows)
-        return np.asarray(rows)
