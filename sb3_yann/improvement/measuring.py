@@ -171,30 +171,25 @@ class Headroom:
             return "what was found may be chance on so few starts. Take more: n_starts=."
         poor = ""
         if self.lost is not None:
+            more = (
+                f"{100 * self.lost:.3g} % more than" if self.lost >= LITTLE / 10 else "as much as"
+            )
             poor = (
                 "plans were made in a model of its episodes that is not the plant: when played, "
-                f"they cost {_more(self.lost)} the MPC. Take more starts: n_starts=."
+                f"they cost {more} the MPC. Take more starts: n_starts=."
             )
         if self.verdict == UNKNOWN:
             return f"nothing was found, but {poor}"
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
-        advice = self._with_d_max(ADVICE[self.verdict]).format(source=source)
+        advice = ADVICE[self.verdict].format(source=source)
+        if self.d_max is not None:  # the disturbances of this plant
+            largest = ", ".join(f"{each:.3g}" for each in self.d_max)
+            advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
         played = self.observer_played
         if self.verdict == "add ObserveDisturbance first" and played is not None:
             if np.any(played > self.mpc_costs + LITTLE * np.abs(self.mpc_costs)):
                 advice += " Not from every start: look at the worst one before you take it."
         return f"{advice} The rest is not known: {poor}" if poor else advice
-
-    def _with_d_max(self, advice: str) -> str:
-        """Return advice that gives `offset_free` the disturbances of this plant."""
-        if self.d_max is None:
-            return advice
-        largest = ", ".join(f"{each:.3g}" for each in self.d_max)
-        return advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
-
-
-def _more(lost: float) -> str:
-    return f"{100 * lost:.3g} % more than" if lost >= LITTLE / 10 else "as much as"
 
 
 def gain(before: Array, after: Array) -> float:
@@ -475,7 +470,9 @@ class _Search:
         if ended := int(self.base.terminated.sum()):
             which = f"{ended} of {len(base)} episodes of the MPC are ended by the env"
             note = f"{which}: their costs are those of fewer steps. {note}".strip()
-        observer, model = (_whole(self.fair.get(name), base) for name in ("observer", "model"))
+        # The MPC's own where another one is not better on average.
+        both = (self.fair.get(name, base) for name in ("observer", "model"))
+        observer, model = (each if each.mean() < base.mean() else base for each in both)
         best = self.best
         total, offset, known = (gain(base, each) for each in (best, observer, model))
         offset = min(offset, total)
@@ -497,11 +494,6 @@ class _Search:
             reidentified=self.reidentified,
             budget=EPISODES_OF_IMPROVE * int(self.base.lengths.max()) if self.twin is None else 0,
         )
-
-
-def _whole(costs: Array | None, ours: Array) -> Array:
-    """Return the costs of a controller, or the MPC's where those are not worse on average."""
-    return ours if costs is None or not costs.mean() < ours.mean() else costs
 
 
 def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:

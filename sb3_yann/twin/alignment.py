@@ -10,7 +10,8 @@ acts. A plant whose gain is not the model's looks like an input in other units; 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
@@ -19,7 +20,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.dynamics import Coordinates, law_of
 from sb3_yann.twin.log import Episode
@@ -49,18 +49,21 @@ CONFIRM = (
 ROW_NAMES = {-1: "the row before", 0: "the same row", 1: "the row after"}
 
 
-class _Log:
-    """What is checked: rows (N, size), inputs (N, m), and the states after them (N, n)."""
+class Logged:
+    """What is checked: rows (N, size), inputs (N, m), and the states after them (N, n).
+
+    Where its units are confirmed another gain, zero or pace than the model's is the plant's own,
+    and another law is another controller's.
+    """
 
     def __init__(
         self,
-        problem: LinearMPC,
         coordinates: Coordinates,
         episodes: tuple[Episode, ...],
-        units_confirmed: bool,
+        units_confirmed: bool = False,
     ) -> None:
-        self.problem = problem
         self.row = coordinates.row
+        self.problem = self.row.problem
         self.unit = coordinates.units
         self.scale = coordinates.scale
         self.episodes = episodes
@@ -68,7 +71,40 @@ class _Log:
         self.rows = np.concatenate([each.thetas[:-1] for each in episodes])
         self.inputs = np.concatenate([each.actions for each in episodes])
         self.after = np.concatenate([each.thetas[1:, self.row.state] for each in episodes])
-        self.names = labels_of(problem.model)
+        self.names = labels_of(self.problem.model)
+
+    @cached_property
+    def law(self) -> Array:
+        """What the MPC gives in each row, (N, m)."""
+        return law_of(self.problem)(self.row.shown(self.rows))
+
+    @cached_property
+    def made_by_law(self) -> NDArray[np.bool_]:
+        """Which inputs (m,) are the MPC's own in enough rows: then units are beyond doubt.
+
+        In these rows the law moves nearly as much as in all of them: in other units what is logged
+        would meet it only where it stands still, or on a bound.
+        """
+        room = LAW * self.problem.u_half
+        own = self.problem.deviations
+        inside = (self.law > own.u_min + room) & (self.law < own.u_max - room)
+        same = inside & (np.abs(self.inputs - self.law) <= room)
+        enough = same.sum(axis=0) >= np.maximum(LEAST_ROWS, PROVING * inside.sum(axis=0))
+        moves, every = (
+            np.ma.std(np.ma.array(self.law, mask=~part), axis=0).filled(0.0)
+            for part in (same, inside)
+        )
+        return np.asarray(enough & (moves > np.maximum(10 * room, 0.5 * every)))
+
+    @cached_property
+    def excitation(self) -> Array:
+        """How much of each input's variance (m,) is its own: not the MPC's, nor linear in theta."""
+        theta = self.row.shown(self.rows)
+        columns = np.column_stack([np.ones(len(theta)), theta, self.law])
+        left = self.inputs - columns @ np.linalg.lstsq(columns, self.inputs, rcond=None)[0]
+        variance = np.var(self.inputs, axis=0)
+        share = np.var(left, axis=0) / np.maximum(variance, 1e-300)
+        return np.where(variance > 0, share, 0.0)
 
     def on_law(self, shift: int = 0) -> tuple[Array, Array]:
         """Return rows of theta (N, n_theta), ``shift`` away from the inputs (N, m) beside them."""
@@ -92,54 +128,23 @@ class _Log:
         return np.asarray(left / np.abs(change @ self.unit))
 
 
-def objections(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    episodes: tuple[Episode, ...],
-    units_confirmed: bool = False,
-) -> list[str]:
-    """Return what speaks against the rows, columns, signs or units of a log.
-
-    Where its units are confirmed another gain, zero or pace than the model's is the plant's own,
-    and another law is another controller's.
-    """
-    log = _Log(problem, coordinates, episodes, units_confirmed)
+def objections(log: Logged) -> list[str]:
+    """Return what speaks against the rows, columns, signs or units of a log."""
     readings = {s: _on_law(log, s) for s in ROW_NAMES}
     logged = np.diagonal(readings[0].left)
     proven = np.diagonal(readings[0].as_it_is).copy()
     for s in (-1, 1):
         clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
         proven &= ~(clearly & np.diagonal(readings[s].as_it_is & readings[s].alone))
-    found = [] if units_confirmed else [*_other_pace(log)]
-    exact = made_by_law(problem, episodes)
+    found = [] if log.units_confirmed else [*_other_pace(log)]
+    exact = log.made_by_law
     if np.all(exact | (proven & (logged < EXACT_SHARE))):
         return found
     proven |= exact
     found += [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
-    if not found and not units_confirmed:
+    if not found and not log.units_confirmed:
         found += _other_units(log, readings[0], proven)
     return found or [*_against_plant(log, proven)]
-
-
-def made_by_law(problem: LinearMPC, episodes: Sequence[Episode]) -> NDArray[np.bool_]:
-    """Return which inputs (m,) are the MPC's own in enough rows: then all units are beyond doubt.
-
-    In these rows the law moves nearly as much as in all of them: in other units what is logged
-    would meet it only where it stands still, or on a bound.
-    """
-    theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
-    u = np.concatenate([each.actions for each in episodes])
-    law = law_of(problem)(theta)
-    found = np.zeros(u.shape[1], dtype=bool)
-    for j, half in enumerate(problem.u_half):
-        low = problem.deviations.u_min[j] + LAW * half
-        high = problem.deviations.u_max[j] - LAW * half
-        inside = (law[:, j] > low) & (law[:, j] < high)
-        same = inside & (np.abs(u[:, j] - law[:, j]) <= LAW * half)
-        if same.sum() >= max(LEAST_ROWS, PROVING * inside.sum()):
-            moves = np.std(law[same, j])
-            found[j] = moves > max(10 * LAW * half, 0.5 * np.std(law[inside, j]))
-    return found
 
 
 class _OnLaw(NamedTuple):
@@ -175,7 +180,7 @@ class _OnLaw(NamedTuple):
         return near & (np.abs(self.offset) < self.offset_error)
 
 
-def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) -> _OnLaw:
+def _on_law(log: Logged, shift: int, change: tuple[Array, Array] | None = None) -> _OnLaw:
     """Return the regressions on the law at the rows ``shift`` away.
 
     With ``change`` = (M, v) the law sees M x + v in place of the logged states x.
@@ -226,7 +231,7 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
 
 
 def _against_law(
-    log: _Log, readings: dict[int, _OnLaw], proven: NDArray[np.bool_]
+    log: Logged, readings: dict[int, _OnLaw], proven: NDArray[np.bool_]
 ) -> Iterator[str]:
     """Yield where an input is the law's of other rows or columns, or in other units."""
     logged = readings[0]
@@ -258,7 +263,7 @@ def _against_law(
             )
 
 
-def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iterator[str]:
+def _against_states(log: Logged, logged: Array, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where two columns of the states are exchanged, or one has the other sign.
 
     Then the law gives the inputs from the states so changed, or the given model predicts them.
@@ -289,7 +294,7 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
             )
 
 
-def _other_units(log: _Log, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterator[str]:
+def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield which inputs, or which state instead, in another unit or with another zero are the law.
 
     A law that is nearly linear takes the zero of one state for that of another, or of its input:
@@ -352,7 +357,7 @@ def _other_units(log: _Log, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterat
         yield f"{'; or: '.join(said)}: is it in other units, or has it another zero? {CONFIRM}"
 
 
-def _other_pace(log: _Log) -> Iterator[str]:
+def _other_pace(log: Logged) -> Iterator[str]:
     """Yield where the states move as the model's do in several samples: rows are missing.
 
     The gains are left open, and the zeros: a plant may have others.
@@ -382,7 +387,7 @@ def _other_pace(log: _Log) -> Iterator[str]:
         )
 
 
-def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
+def _against_plant(log: Logged, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where inputs that the law does not prove act otherwise than the model says."""
     fit = _Effects.of(log, 0)
     B = log.problem.model.B
@@ -412,7 +417,7 @@ def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _against_gains(
-    log: _Log, fit: _Effects, weights: Array, proven: NDArray[np.bool_]
+    log: Logged, fit: _Effects, weights: Array, proven: NDArray[np.bool_]
 ) -> Iterator[str]:
     """Yield where inputs act as others of B do, against its signs, or far otherwise."""
     names = log.names[1]
@@ -457,7 +462,7 @@ def _against_gains(
             )
 
 
-def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
+def _resting(log: Logged, fit: _Effects) -> Iterator[str]:
     """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
     if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
         return
@@ -494,7 +499,7 @@ class _Effects(NamedTuple):
     follows: Array
 
     @classmethod
-    def of(cls, log: _Log, shift: int) -> _Effects | None:
+    def of(cls, log: Logged, shift: int) -> _Effects | None:
         """Return the regression on the inputs some rows away; None where there are few rows.
 
         Squares of the states count where rows are enough.

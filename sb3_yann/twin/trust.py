@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -13,8 +12,8 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.identification.fit import frozen_rows, words_for
 from sb3_yann.control.linear_system import labels_of
-from sb3_yann.twin.alignment import made_by_law, objections
-from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual, law_of
+from sb3_yann.twin.alignment import Logged, objections
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.log import Episode, more_of, records
 from sb3_yann.twin.selection import FreeRuns
 from sb3_yann.units import FLOAT32_ROUNDING
@@ -112,43 +111,6 @@ def costs_of_each(
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 
 
-def persistence_error(
-    coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any
-) -> Array:
-    """Return the error (h,) of the prediction, so many steps ahead, that the state stays."""
-    states = [e.thetas[:, coordinates.row.state] for e in episodes]
-    found = []
-    for h in horizons:
-        moves = [(x[h:] - x[:-h]) / coordinates.units for x in states]
-        found.append(np.sqrt(np.mean(np.concatenate(moves) ** 2)))
-    return np.array(found)
-
-
-def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array]:
-    """Return how much of each input is its own (m,), and how much it moves (m,).
-
-    What is linear in theta or the MPC's own input is not its own.
-    """
-    theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
-    u = np.concatenate([each.actions for each in episodes])
-    law = law_of(problem)(theta)
-    columns = np.column_stack([np.ones(len(theta)), theta, law])
-    left = u - columns @ np.linalg.lstsq(columns, u, rcond=None)[0]
-    variance = np.var(u, axis=0)
-    share = np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
-    moves = np.sqrt(variance) / problem.u_half
-    return share, moves
-
-
-def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
-    """Return the share of logged rows (n_theta,) where an entry lies beyond the box of theta."""
-    theta = np.concatenate([each.thetas[:, : problem.n_theta] for each in episodes])
-    room = FLOAT32_ROUNDING * problem.theta_half
-    low = problem.deviations.theta_min - room
-    high = problem.deviations.theta_max + room
-    return np.asarray(np.mean((theta < low) | (theta > high), axis=0))
-
-
 def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[str]:
     """Return what speaks against a log whose theta does not hold the input before it."""
     if not problem.layout.n_previous:
@@ -159,16 +121,6 @@ def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[
     if share <= OUTSIDE:
         return []
     return [f"In {100 * share:.3g} % of the rows theta does not hold the input before it."]
-
-
-def _frozen(dynamics: Dynamics, episodes: tuple[Episode, ...]) -> list[str]:
-    """Return which sensor stands still though the plant moves."""
-    row = dynamics.row
-    model = dynamics.problem.model
-    driven = [row.features(e.thetas[:-1], e.actions)[:, model.n_states :] for e in episodes]
-    states = [each.thetas[:, row.state] for each in episodes]
-    found = frozen_rows(states, driven)
-    return words_for(found, labels_of(model)[0], [*map(dynamics.problem.units.to_plant, states)])
 
 
 def judge(
@@ -243,18 +195,32 @@ def evidence(
     runs, chosen, costs = found
     problem = dynamics.problem
     coordinates = dynamics.coordinates
-    standing = persistence_error(coordinates, log, runs.horizons)
-    inputs = excitation(problem, log)
-    shares = beyond_the_box(problem, log) * (not made_by_law(problem, log).all())
+    states = [each.thetas[:, coordinates.row.state] for each in log]
+    standing = []
+    for h in runs.horizons:
+        moves = [(x[h:] - x[:-h]) / coordinates.units for x in states]
+        standing.append(np.sqrt(np.mean(np.concatenate(moves) ** 2)))
+    logged = Logged(coordinates, log, units_confirmed)
+    inputs = logged.excitation, np.std(logged.inputs, axis=0) / problem.u_half
+    theta = np.concatenate([each.thetas[:, : problem.n_theta] for each in log])
+    room = FLOAT32_ROUNDING * problem.theta_half
+    low = problem.deviations.theta_min - room
+    high = problem.deviations.theta_max + room
+    shares = np.mean((theta < low) | (theta > high), axis=0)
+    shares = shares * (not logged.made_by_law.all())
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(problem, log))
     more = partial(more_of, problem, log)
-    problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names, more)
+    still = np.array(standing)
+    problems, advice = judge(runs, still, costs, inputs, independent, beyond, names, more)
     problems += foreign_previous(problem, log)
-    problems += objections(problem, coordinates, log, units_confirmed)
-    problems += _frozen(dynamics, log)
-    return Trust(runs, chosen, standing, *costs, *inputs, tuple(problems), tuple(advice))
+    problems += objections(logged)
+    n = problem.model.n_states
+    driven = [dynamics.row.features(e.thetas[:-1], e.actions)[:, n:] for e in log]
+    shown = [*map(problem.units.to_plant, states)]
+    problems += words_for(frozen_rows(states, driven), labels_of(problem.model)[0], shown)
+    return Trust(runs, chosen, still, *costs, *inputs, tuple(problems), tuple(advice))
 
 
 def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:

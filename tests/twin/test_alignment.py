@@ -7,7 +7,7 @@ import pytest
 
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
 from sb3_yann.evaluation import evaluate
-from sb3_yann.twin import alignment
+from sb3_yann.twin.alignment import Logged
 from sb3_yann_envs import cstr, problems
 
 GAINS = np.array([1.5, 0.7])
@@ -203,8 +203,9 @@ def test_episodes_of_the_mpc_prove_the_units_of_those_that_it_did_not_make() -> 
             ([1.0, 0.4], 1.0, False),
             ([1.0, 1.0], 0.55, False),
         ):
-            episodes = heated_twin([(x * of_x, of_u * u) for x, u in given]).episodes
-            assert alignment.made_by_law(room(), episodes).all() == made
+            found = heated_twin([(x * of_x, of_u * u) for x, u in given])
+            logged = Logged(found.dynamics.coordinates, found.episodes)
+            assert logged.made_by_law.all() == made
 
 
 def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed() -> None:
