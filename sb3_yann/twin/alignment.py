@@ -90,11 +90,11 @@ class Logged:
         inside = (self.law > own.u_min + room) & (self.law < own.u_max - room)
         same = inside & (np.abs(self.inputs - self.law) <= room)
         enough = same.sum(axis=0) >= np.maximum(LEAST_ROWS, PROVING * inside.sum(axis=0))
-        moves, every = (
-            np.ma.std(np.ma.array(self.law, mask=~part), axis=0).filled(0.0)
-            for part in (same, inside)
-        )
-        return np.asarray(enough & (moves > np.maximum(10 * room, 0.5 * every)))
+        found = np.zeros(len(room), dtype=bool)
+        for j in np.flatnonzero(enough):
+            moves = np.std(self.law[same[:, j], j])
+            found[j] = moves > max(10 * room[j], 0.5 * np.std(self.law[inside[:, j], j]))
+        return found
 
     @cached_property
     def excitation(self) -> Array:
