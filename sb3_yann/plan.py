@@ -94,24 +94,20 @@ class TwinPlant:
             found[:, parts.disturbance] = theta[:, parts.disturbance]
         return found
 
-    def slopes(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
-        """Return the derivatives of rows at theta (T, k, size) and u (T, k, m)."""
-        acting = self._acting(rows)
-        (steps, k) = theta.shape[:2]
-        if self.members is not None:
-            swapped = np.swapaxes(theta, 0, 1), np.swapaxes(u, 0, 1)
-            A, B = (np.swapaxes(each, 0, 1) for each in acting.jacobians(*swapped))
-            return A, B
-        flat = (each.reshape(1, steps * k, -1) for each in (theta, u))
-        means = (each.mean(axis=0) for each in acting.jacobians(*flat))
-        A, B = (each.reshape(steps, k, *each.shape[1:]) for each in means)
-        return A, B
-
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
         row = self.dynamics.row
         parts = self.dynamics.problem.layout
-        A, B = self.slopes(row.begin(theta), u, rows)
+        acting = self._acting(rows)
+        at = row.begin(theta)
+        steps = at.shape[:2]
+        if self.members is not None:
+            both = acting.jacobians(at.swapaxes(0, 1), u.swapaxes(0, 1))
+            A, B = (each.swapaxes(0, 1) for each in both)
+        else:
+            flat = (each.reshape(1, -1, each.shape[-1]) for each in (at, u))
+            means = (each.mean(axis=0) for each in acting.jacobians(*flat))
+            A, B = (each.reshape(*steps, *each.shape[1:]) for each in means)
         if row.observer is None:
             return A, B
         number = np.arange(parts.size)
