@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -34,9 +33,8 @@ class CostFinding:
     matches : bool
         Whether the reward is what the problem and the policy say.
     cause : str
-        "not finite", "constant", "sign flipped", "scaled", "scaled and shifted", "next state",
-        "normalized reward" or "observation" of a VecNormalize, or "unknown"; empty where there is
-        no mismatch.
+        "constant", "sign flipped", "scaled", "scaled and shifted", "next state", "normalized
+        reward" or "observation" of a VecNormalize, or "unknown"; empty where there is no mismatch.
     message : str
         All of it, in words.
     scale, offset, r2 : float
@@ -69,8 +67,6 @@ class Line(NamedTuple):
     @classmethod
     def through(cls, x: Array, y: Array) -> Line:
         """Return the line by least squares, through the origin where that does as well."""
-        if not len(y):
-            return cls(np.nan, np.nan, np.nan)
         if np.ptp(x) <= 1e-12 * np.abs(x).max() or np.ptp(y) <= 1e-12 * np.abs(y).max():
             return cls(0.0, float(y.mean()), 0.0)
         # Centered: with a large offset the normal equations would lose what varies.
@@ -241,7 +237,11 @@ class CostAudit(BaseCallback):
         finite = np.isfinite(records["reward"])
         for each in shown:
             finite &= np.isfinite(each.reshape(len(finite), -1)).all(axis=1)
-        theta, following = (self._theta(each[finite]) for each in shown)
+        if not finite.any():
+            return
+        theta, following = (
+            np.asarray(self.policy.theta(each[finite]).double().cpu().numpy()) for each in shown
+        )
         u = self.policy.inputs(records["action"][finite])
         counted = records["counted"][finite]
         compared = self._compared(
@@ -252,21 +252,17 @@ class CostAudit(BaseCallback):
             self._rounding(shown[0][finite][counted]),
         )
         count = len(compared.rewards)
-        if count < MIN_STEPS and finite.all():
+        if count < MIN_STEPS:  # what is not finite has had its own warning
             return
         if not self.order_checked:
             warn_of_order(self.policy.problem, theta, u, following)
         line = Line.through(-compared.cost, compared.rewards)
         cause, explanation = self._vec_normalize_switched_on()
-        if not cause and count >= MIN_STEPS and not compared.match(self.tolerance):
+        if not cause and not compared.match(self.tolerance):
             cause, explanation = compared.likely_cause(line, self.tolerance)
         message = f"The reward is the cost of the problem in all of {count} steps."
         if cause:
             message = self._in_words(compared, line, explanation)
-        if not finite.all():
-            rest = f" In the others, {cause}: {explanation}" if cause else ""
-            cause = "not finite"
-            message = f"{self._not_finite(finite, records['reward'])}{rest}"
         self._records = []
         self.finding = CostFinding(not cause, cause, message, *line, count)
         if not cause:
@@ -276,11 +272,6 @@ class CostAudit(BaseCallback):
             raise CostMismatchError(message)
         else:
             warn(message, CostMismatchWarning)
-
-    def _theta(self, observations: Array) -> Array:
-        if not len(observations):
-            return np.zeros((0, self.policy.problem.n_theta))
-        return np.asarray(self.policy.theta(observations).double().cpu().numpy())
 
     def _compared(
         self, theta: Array, following: Array, u: Array, rewards: Array, rounding: Array
@@ -317,17 +308,6 @@ class CostAudit(BaseCallback):
             numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
             said.append(f'Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.')
         return " ".join(said)
-
-    def _not_finite(self, finite: NDArray[np.bool_], rewards: Array) -> str:
-        """Return which steps (steps,), those of several envs in turns, are lost, in words."""
-        first = int(np.argmin(finite))
-        what = "an observation" if np.isfinite(rewards[first]) else f"the reward, {rewards[first]},"
-        return (
-            f"The rewards cannot all be compared: in {np.sum(~finite)} of {len(finite)} steps a "
-            f"reward or an observation is not a finite number, first {what} of step "
-            f"{first // self.training_env.num_envs + 1}: the env or a sensor fails. The steps are "
-            "left out."
-        )
 
     def _rounding(self, observations: Array) -> Array:
         """Return by how much theta may err, (steps, n_theta); see AffineObservation."""
