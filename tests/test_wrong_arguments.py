@@ -132,7 +132,7 @@ def with_two_outputs() -> ObserveDisturbance:
             lambda: PlantTwin.fit(
                 scalar_mpc(), [(np.ma.array(np.eye(5, 1), mask=1), np.eye(4, 1))]
             ),
-            "episode 0: states has masked entries",
+            "states of episode 0 has masked entries",
         ),
         (
             lambda: LinearModel.from_data(np.zeros((5, 1)), np.zeros((4, 1)), dt=1, delay=4),
