@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import threading
@@ -16,7 +17,7 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from sb3_yann._validation import check_bool
 
 DELAY = 3.0  # seconds that pass without a word
-FILE_INTERVAL = 30.0  # seconds between two states of bars in a file
+FILE_INTERVAL = 30.0  # seconds between two states of bars in a file; ten times that of parts
 
 _silent = ContextVar("silent", default="TQDM_DISABLE" in os.environ)
 _parts = ContextVar("parts", default=False)
@@ -34,7 +35,7 @@ def is_watched() -> bool:
 def shown(progress_bar: bool, parts: bool = False) -> Iterator[None]:
     """Show what takes long, unless it is False here or further out.
 
-    Bars of ``parts`` count and foretell nothing, and leave nothing in a file: `Progress` says how
+    Bars of ``parts`` count and foretell nothing, and leave little in a file: `Progress` says how
     long all of them take.
     """
     check_bool("progress_bar", progress_bar)
@@ -57,15 +58,16 @@ _Bar.set_lock(threading.RLock())
 
 
 class _Lines:
-    """A file in which bars and details leave a line where there was none for thirty seconds."""
+    """A file in which bars and details leave a line where there was none for so many seconds."""
 
-    def __init__(self) -> None:
-        self.latest = -FILE_INTERVAL
+    def __init__(self, interval: float, latest: float = -math.inf) -> None:
+        self.interval = interval
+        self.latest = latest
 
     def write(self, text: str, detail: bool = True) -> None:
         """Write a line, a detail only where there was none of late."""
         now = time.monotonic()
-        if text.strip() and (not detail or now >= self.latest + FILE_INTERVAL):
+        if text.strip() and (not detail or now >= self.latest + self.interval):
             self.latest = now
             print(text.strip(), file=sys.stderr)
 
@@ -74,12 +76,13 @@ class _Lines:
         sys.stderr.flush()
 
 
-_LINES = _Lines()
+_LINES = _Lines(FILE_INTERVAL)
+_PARTS = _Lines(10 * FILE_INTERVAL, time.monotonic())
 
 
 def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None) -> Any:
     """Return a bar over items, or one to ``update``; those inside each other share a line."""
-    watched = is_watched()
+    of_parts = _parts.get()
     return _Bar(
         items,
         desc=what,
@@ -88,9 +91,9 @@ def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None)
         leave=False,
         miniters=1,
         position=0,
-        file=sys.stderr if watched else _LINES,
-        disable=_silent.get() or (_parts.get() and not watched),
-        bar_format="  {desc}: {n_fmt} of {total_fmt}" if _parts.get() else None,
+        file=sys.stderr if is_watched() else _PARTS if of_parts else _LINES,
+        disable=_silent.get(),
+        bar_format="  {desc}: {n_fmt} of {total_fmt}" if of_parts else None,
     )
 
 

@@ -29,7 +29,8 @@ class Clock:
 def clock(monkeypatch) -> Clock:
     found = Clock()
     monkeypatch.setattr(_progress.time, "monotonic", found)
-    monkeypatch.setattr(_progress, "_LINES", _progress._Lines())
+    monkeypatch.setattr(_progress, "_LINES", _progress._Lines(30))
+    monkeypatch.setattr(_progress, "_PARTS", _progress._Lines(300, found()))
     return found
 
 
@@ -92,12 +93,14 @@ def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     )
 
 
-def test_bars_of_parts_count_foretell_nothing_and_leave_nothing_in_a_file(
+def test_bars_of_parts_count_foretell_nothing_and_leave_little_in_a_file(
     clock, capsys, monkeypatch
 ) -> None:
     with shown(True, parts=True):
         counted(clock, each=1.0)
         assert capsys.readouterr() == ("", "")
+        counted(clock, each=10.0)
+        assert capsys.readouterr().err.splitlines()[0] == "plans: 20 of 100"
         screen = Terminal()
         monkeypatch.setattr(sys, "stderr", screen)
         monkeypatch.setattr(sys, "__stderr__", screen)

@@ -22,7 +22,7 @@ from sb3_yann._validation import check_bool, check_int
 from sb3_yann.compare import RULE
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
-from sb3_yann.env_pool import Source, maker, name_of
+from sb3_yann.env_pool import Source, maker
 from sb3_yann.evaluation import change_in_percent, summary_lines
 from sb3_yann.improvement.confirmation import (
     ENOUGH,
@@ -324,7 +324,7 @@ def improve(
         else:
             # A simulator is not the env that VecNormalize normalizes.
             seen = None if model.get_vec_normalize_env() else policy.observation
-            found = replace(work.with_simulator(twin, max_steps, seen), source=name_of(twin))
+            found = work.with_simulator(twin, max_steps, seen)
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}
     prints = fingerprint(policy.actor.state_dict())
@@ -573,8 +573,8 @@ class _Work:
         finally:
             simulator.close()
         change = self.checks[-1].change if accepted else 0.0
-        found = Improvement(tuple(self.checks), change, accepted, before, "the simulator")
-        return replace(found, episodes=simulator.played, steps=simulator.steps, note=note)
+        where = "the simulator", simulator.name, simulator.played, simulator.steps
+        return Improvement(tuple(self.checks), change, accepted, before, *where, note=note)
 
     def _taught(
         self, simulator: Simulator, lost: list[Any], number: int

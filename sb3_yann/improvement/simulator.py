@@ -128,7 +128,7 @@ class Simulator:
             self.row = RowLayout(problem, observer_of(one))
             self.unaware = below_set_points(one)
             require_spaces(problem, one)
-            self.name = name_of(one)
+            self.name = name_of(one if callable(env) else env)
         self.new_seeds = NewSeeds(FIRST + APART * seed)
         self.longest = 0
         self.episodes: list[Episode] = []

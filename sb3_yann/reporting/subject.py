@@ -6,7 +6,7 @@ import base64
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from html import escape
 from io import BytesIO
 from string import Template
@@ -276,11 +276,13 @@ class Subject:
         now = fingerprint(self.policy.actor.state_dict())
         return accepted[-1] if accepted and accepted[-1].policy == now else None
 
-    @property
+    @cached_property
     def env_name(self) -> str:
         """A name of the simulator."""
-        function = self.env.func if isinstance(self.env, partial) else self.env  # without arguments
-        return "" if function is None else name_of(function)
+        if self.env is None:
+            return ""
+        with one_env(self.env) as env:
+            return name_of(env)
 
     @cached_property
     def loops(self) -> dict[str, Trajectories] | None:
