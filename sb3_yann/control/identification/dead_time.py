@@ -214,7 +214,8 @@ def input_notes(
 
 def _chance(found: Regression, n: int, column: int) -> float:
     """Return the p-value of Hotelling's T-squared test that a whole column is zero."""
-    floor = np.diag((1e-10 * np.maximum(found.spread[:n], np.finfo(float).tiny)) ** 2)
+    floor = (1e-10 * np.maximum(found.spread[:n], np.finfo(float).tiny)) ** 2
+    floor = np.diag(np.maximum(floor, 1e-13 * np.diag(found.covariance)))  # above its rounding
     effect = found.coefficients[:, column] / max(found.factors[column], np.finfo(float).tiny)
     square = float(effect @ np.linalg.solve(found.covariance + floor, effect))
     freedom = found.degrees_of_freedom - n + 1

@@ -447,6 +447,39 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
     return model
 
 
+def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, Array]:
+    """Return the poles (n,), largest first, their standard errors, and those of the gains (q, k).
+
+    To first order, by the inverse of the normal equations (Ljung, *System Identification*, section
+    9.4). What only changes the states' coordinates has no effect on either. Where errors of the
+    states do not decay, those of poles are inf, and those of gains 0.
+    """
+    with np.errstate(all="ignore"):
+        matrix, side = chunks.gauss_newton(model)
+    scale = np.sqrt(np.diag(matrix))
+    scale = np.where(scale > 0, scale, 1.0)
+    inverse = np.full(matrix.shape, np.nan)
+    if np.all(np.isfinite(matrix)):
+        inverse = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    values, left, right = linalg.eig(model.A, left=True, right=True)
+    overlap = np.sum(left.conj() * right, axis=0)
+
+    def told(step: Array) -> Array:
+        moved = moved_by(model, step / scale)
+        by_pole = np.sum(left.conj() * ((moved.A - model.A) @ right), axis=0)
+        settle = np.linalg.pinv(np.eye(model.order) - moved.A)
+        return np.concatenate([by_pole, (moved.C @ settle @ moved.B).ravel()])
+
+    with np.errstate(all="ignore"):
+        slopes = [(told(each) - told(-each)) / 2e-3 for each in 1e-3 * np.eye(len(side))]
+        found = np.sqrt(np.abs(np.einsum("pf,pq,qf->f", np.conj(slopes), inverse, slopes)))
+    of_poles, of_gains = np.split(found, [model.order])
+    of_poles = np.nan_to_num(of_poles / np.maximum(np.abs(overlap), 1e-300), nan=np.inf)
+    of_gains = np.nan_to_num(of_gains, posinf=0.0).reshape(len(model.C), -1)
+    order = np.argsort(-np.abs(values), kind="stable")
+    return values[order], of_poles[order], of_gains
+
+
 def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Array, Array]) -> Array:
     """Return the states (T + 1, n) that the outputs before each sample tell.
 

@@ -218,9 +218,8 @@ def gain_errors(found: Regression, n: int, m: int) -> Array | None:
     return np.asarray(np.sqrt(np.abs(np.outer(rows, np.sum(moved * (part @ moved), axis=0)))))
 
 
-def pole_note(found: Regression, n: int) -> str:
-    """Return the 95 % intervals of the poles in words, one of each complex pair."""
-    values, errors = pole_errors(found, n)
+def pole_note(values: Array, errors: Array, noise: str = "process noise") -> str:
+    """Return the 95 % intervals of poles in words, one of each complex pair."""
     words = []
     open_ends = 0
     for value, error in zip(values, errors, strict=True):
@@ -231,7 +230,7 @@ def pole_note(found: Regression, n: int) -> str:
         known = f"{value.real:.4g}{imaginary} within {width:.2g}"
         words.append(known if width < WIDE else f"{value.real:.4g}{imaginary}, hardly known")
         open_ends += bool(abs(value) < 1 <= abs(value) + width)
-    text = f"Poles with 95 % confidence, under process noise: {'; '.join(words)}."
+    text = f"Poles with 95 % confidence, under {noise}: {'; '.join(words)}."
     if open_ends:
         text += (
             f" {open_ends} that decay in the model may be unstable in the plant, as far as the log "

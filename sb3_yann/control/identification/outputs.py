@@ -18,6 +18,7 @@ from sb3_yann.control.identification.innovations import (
     Innovations,
     Past,
     dead_times,
+    errors_of,
     filtered,
     log_determinant,
     mean_square,
@@ -57,6 +58,7 @@ class Structure:
     idle: tuple[int, ...] = ()  # inputs and disturbances without effect beyond chance
     feedback: tuple[tuple[int, float], ...] = ()  # inputs that follow outputs; what does not
     curvature: Array = field(default_factory=lambda: np.zeros(0))  # (q,), share of the errors
+    poles: tuple[Array, Array, Array] = (np.zeros(0),) * 3  # with errors, also of gains (q, k)
 
     @property
     def error(self) -> float:
@@ -101,6 +103,7 @@ def fit_structure(
         idle=tuple(past.idle()),
         feedback=tuple(_feedback(episodes)),
         curvature=curvature_test(past.arx, past.rows)[0],
+        poles=errors_of(final.model, whole.chunks),
     )
 
 

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
-from sb3_yann.control.identification.least_squares import WEAK, Regression, neighbors, pole_note
+from sb3_yann.control.identification.least_squares import (
+    WEAK,
+    Regression,
+    neighbors,
+    pole_errors,
+    pole_note,
+)
 from sb3_yann.log import Episode
 
 STEPS_PER_FEATURE = 4  # steps for each feature, at least: with fewer the features fit anything
@@ -214,7 +220,7 @@ def quality_notes(
         )
     if ridge > 0:
         notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
-    return [*notes, *_residual_notes(found, fitted, n), pole_note(found, n)]
+    return [*notes, *_residual_notes(found, fitted, n), pole_note(*pole_errors(found, n))]
 
 
 def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[str]:

@@ -174,7 +174,8 @@ def _scaling(model: LinearSystem) -> list[str]:
             lost = np.argwhere((np.abs(gain) <= width) & (width > 0))
             none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in lost)
             unsure = f" Not distinguishable from zero: {none}." if none else ""
-            lines.append(f"  ± is a 95 % interval, under process noise.{unsure}")
+            noise = "process noise" if model.C is None else "process and sensor noise"
+            lines.append(f"  ± is a 95 % interval, under {noise}.{unsure}")
     return lines
 
 

@@ -250,3 +250,20 @@ def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
     for i in range(2):  # of a filter that reads each sample
         assert rms((guess - z[20:])[late, i]) < 1.2 * rms((best - z[20:])[late, i])
     assert found.estimator().every.tolist() == [1, 10]
+
+
+@pytest.mark.slow
+def test_intervals_of_poles_and_gains_hold_the_truth_nearly_as_often_as_they_say() -> None:
+    plant = {"A": np.array([[0.9, 0.05], [0.0, 0.8]]), "B": np.array([[0.5, 0.0], [0.0, 0.3]])}
+    C = np.array([[1.0, 0.0]])
+    gains = C @ np.linalg.solve(np.eye(2) - plant["A"], plant["B"])
+    inside = []
+    for seed in range(20):
+        u = steps(600, 2, seed)
+        found = identify_outputs(played(u, **plant, C=C, seed=seed), u, dt=1, order=2)
+        told = found.model.gain_errors
+        assert told is not None and not told[1:].any()  # only the first state is an output
+        off = np.linalg.solve(np.eye(2) - found.model.A, found.model.B)[:1] - gains
+        inside.append(np.abs(off) <= 1.96 * told[:1])
+    assert np.mean(inside) > 0.85
+    assert "± is a 95 % interval, under process and sensor noise." in found.report()
