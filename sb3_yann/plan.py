@@ -45,6 +45,7 @@ BURSTS = 25  # some searches begin with all inputs on a bound, for this part of 
 WEIGHTS = 0.1, 10.0  # factors of weights of the MPC, for laws that are tried instead of it
 CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
+DIFFERENCE = 1e-4  # half-widths of theta over which slopes of a feedback are taken
 PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new one
 
 
@@ -94,20 +95,24 @@ class TwinPlant:
             found[:, parts.disturbance] = theta[:, parts.disturbance]
         return found
 
+    def slopes(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the derivatives of rows at theta (T, k, size) and u (T, k, m)."""
+        acting = self._acting(rows)
+        steps = theta.shape[:2]
+        if self.members is not None:
+            both = acting.jacobians(theta.swapaxes(0, 1), u.swapaxes(0, 1))
+            A, B = (each.swapaxes(0, 1) for each in both)
+            return A, B
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (theta, u))
+        means = (each.mean(axis=0) for each in acting.jacobians(*flat))
+        A, B = (each.reshape(*steps, *each.shape[1:]) for each in means)
+        return A, B
+
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
         row = self.dynamics.row
         parts = self.dynamics.problem.layout
-        acting = self._acting(rows)
-        at = row.begin(theta)
-        steps = at.shape[:2]
-        if self.members is not None:
-            both = acting.jacobians(at.swapaxes(0, 1), u.swapaxes(0, 1))
-            A, B = (each.swapaxes(0, 1) for each in both)
-        else:
-            flat = (each.reshape(1, -1, each.shape[-1]) for each in (at, u))
-            means = (each.mean(axis=0) for each in acting.jacobians(*flat))
-            A, B = (each.reshape(*steps, *each.shape[1:]) for each in means)
+        A, B = self.slopes(row.begin(theta), u, rows)
         if row.observer is None:
             return A, B
         number = np.arange(parts.size)
@@ -166,6 +171,22 @@ class Task:
             if self.doubt is not None:
                 total = total + self.doubt.costs(thetas[:-1], inputs).sum(axis=0)
         return np.where(np.isfinite(total), total, np.inf)
+
+    def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
+        """Return gradients (T, k, n_theta + m) and curvatures of steps, but for bounds of states.
+
+        thetas (T, k, n_theta), inputs (T, k, m); curvatures (T, k, n_theta + m, n_theta + m).
+        """
+        W = 2 * self.problem.stage_matrix
+        slopes = np.concatenate([thetas, inputs], axis=-1) @ W + self.problem.stage_slope
+        curved = np.broadcast_to(W, (*inputs.shape[:2], *W.shape))
+        prices = [self.mixed_penalty] if len(self.problem.mixed.F) else []
+        prices += [self.doubt.slopes] if self.doubt is not None else []
+        for price in prices:
+            slope, more = price(thetas, inputs)
+            slopes = slopes + slope
+            curved = curved + more
+        return slopes, curved
 
     def limits(self, thetas: Array) -> tuple[Array, Array]:
         """Return the bounds (..., m) of the inputs at thetas (..., n_theta)."""
@@ -340,15 +361,7 @@ def _backward(
     states = problem.layout.state
     A, B = plant.jacobians(thetas[:-1], inputs, rows)
     F = np.concatenate([A, B], axis=-1)
-    W = 2 * problem.stage_matrix
-    slopes = np.concatenate([thetas[:-1], inputs], axis=-1) @ W + problem.stage_slope
-    curved = np.broadcast_to(W, (len(inputs), len(rows), *W.shape))
-    prices = [task.mixed_penalty] if len(problem.mixed.F) else []
-    prices += [task.doubt.slopes] if task.doubt is not None else []
-    for price in prices:
-        slope, more = price(thetas[:-1], inputs)
-        slopes = slopes + slope
-        curved = curved + more
+    slopes, curved = task.slopes(thetas[:-1], inputs)
     gradient, curvature = task.penalty(thetas[1:])
     limits = task.limits(thetas[:-1])
     low, high = (each - inputs for each in limits)
@@ -359,7 +372,7 @@ def _backward(
     V = np.tile(2 * task.end, (len(rows), 1, 1))
     corrections = np.empty_like(inputs)
     gains = np.empty_like(plans.gains)
-    damped = damping[:, None, None] * W[size:, size:]
+    damped = 2 * damping[:, None, None] * problem.stage_matrix[size:, size:]
     for t in reversed(range(len(inputs))):
         v[:, states] += gradient[t]
         V[:, states, states] += curvature[t]
@@ -381,6 +394,45 @@ def _backward(
         corrections[t] = move
         gains[t] = K
     return corrections, gains
+
+
+def slopes_of_inputs(
+    plant: TwinPlant, task: Task, act: Feedback, states: Array, inputs: Array
+) -> Array:
+    """Return the derivatives (T, k, m) of episodes' costs by inputs that a feedback answers.
+
+    ``states`` (T + 1, k, size) are the twin's rows of k episodes, ``inputs`` (T, k, m) what the
+    feedback put in. The costates run backward, as in Pontryagin's principle, and slopes of the
+    feedback are central differences.
+    """
+    problem = task.problem
+    shown = plant.dynamics.row.shown
+    thetas = shown(states)
+    n = problem.n_theta
+    A, B = plant.slopes(states[:-1], inputs, np.arange(states.shape[1]))
+    own, _ = task.slopes(thetas[:-1], inputs)
+    outside, _ = task.penalty(thetas[1:])
+    flat = thetas[:-1].reshape(-1, n)
+    limits = task.limits(flat)
+    near = np.where(np.isfinite(problem.theta_half), problem.theta_half, 1.0) * DIFFERENCE
+    gains = [
+        (np.clip(act(flat + each), *limits) - np.clip(act(flat - each), *limits)) / (2 * each.sum())
+        for each in np.diag(near)
+    ]
+    K = np.stack(gains, axis=-1).reshape(*inputs.shape, n)
+    found = np.empty_like(inputs)
+    costate: Array = np.zeros(states.shape[1:])
+    for t in reversed(range(len(inputs))):
+        shown(costate)[:, problem.layout.state] += outside[t]
+        found[t] = own[t][:, n:] + _pulled(B[t], costate)
+        costate = _pulled(A[t], costate)
+        shown(costate)[:] += own[t][:, :n] + _pulled(K[t], found[t])
+    return found
+
+
+def _pulled(J: Array, v: Array) -> Array:
+    """Return J' v (k, p) for J (k, q, p) and v (k, q)."""
+    return np.asarray((J.swapaxes(1, 2) @ v[..., None])[..., 0])
 
 
 def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:

@@ -218,10 +218,11 @@ def improve(
     """Improve a model's policy in a twin of its plant, or with a simulator; the plant sees nothing.
 
     Nearly optimal plans, those of :func:`headroom`, are made in a learnt model, from many starts at
-    once, and the actor's networks learn to do what they do, and what their feedback does nearby.
-    A simulator decides by new starts, in pairs with the MPC; a twin by every member, and by
-    :meth:`PlantTwin.forecast`. What is refused is taught, then parts of the correction are tried:
-    ``docs/improve.md`` has the steps and the tests.
+    once, and the actor's networks learn to do what they do, and what their feedback does nearby;
+    in a model of a simulator they then descend the costs of its episodes. A simulator decides by
+    new starts, in pairs with the MPC; a twin by every member, and by :meth:`PlantTwin.forecast`.
+    What is refused is taught, then parts of the correction are tried: ``docs/improve.md`` has the
+    steps and the tests.
 
     Where the actor keeps the problem's bounds, and no ``bounds_margin`` was given, it keeps as far
     from them as the MPC's model errs in 95 % of the steps. The model ends with the policy that was
@@ -254,7 +255,7 @@ def improve(
     updates : int, default 4000
         Steps of Adam of a fit of the actor to plans.
     confine : bool, default True
-        Whether, in a twin, the MPC acts alone beyond what the log shows: see
+        Whether the MPC acts alone beyond what the log, or the simulator's episodes, show: see
         :meth:`YannPolicy.confine_correction`.
     seed : int, default 0
         Of the starts, the models and the batches. No other random numbers are drawn.
@@ -316,9 +317,9 @@ def improve(
         if isinstance(twin, PlantTwin):
             require_problem_of_twin(policy, twin.problem)
             twin.require_trust()
-        work = _Work(policy, n_starts, rounds, updates, seed, _Progress(rounds))
+        work = _Work(policy, n_starts, rounds, updates, seed, _Progress(rounds), confine)
         if isinstance(twin, PlantTwin):
-            work.layer.confine(*twin.starts.shown) if confine else work.layer.confine(None, None)
+            work.confine_to(twin)
             found = work.in_twin(twin)
             found = replace(found, source=repr(twin), episodes=len(twin.episodes))
         else:
@@ -388,6 +389,7 @@ class _Work:
         updates: int,
         seed: int,
         say: _Progress,
+        confine: bool = True,
     ) -> None:
         self.policy = policy
         self.problem = policy.problem
@@ -396,6 +398,7 @@ class _Work:
         self.rounds = rounds
         self.updates = updates
         self.seed = seed
+        self.confine = confine
         self.layer: LawLayer = copy.deepcopy(policy.actor.mu).cpu()
         self.rng = np.random.default_rng([seed, 1])
         self.checks: list[Check] = []
@@ -433,6 +436,10 @@ class _Work:
         if len(self.layer.rows) and float(self.layer.margin) == 0:
             error = one_step_error(row, episodes)
             self.layer.keep(error if error > FLOAT32_ROUNDING else 0.0)
+
+    def confine_to(self, model: LearntModel) -> None:
+        """Let the layer's networks count only where a model's episodes were, if they are to."""
+        self.layer.confine(*(model.starts.shown if self.confine else (None, None)))
 
     def in_twin(self, twin: PlantTwin) -> Improvement:
         """Plan in the members of a twin, imitate, and check on every member."""
@@ -584,6 +591,7 @@ class _Work:
         model = model_of(
             self.problem, simulator.episodes, simulator.row.estimator, self.seed + number
         )
+        self.confine_to(model)
         order = self.rng.permutation(len(simulator.episodes))
         # Twice each: as it began, and elsewhere with the same references.
         chosen = [each for one in lost[: self.n_starts // 4] for each in (one, one)]

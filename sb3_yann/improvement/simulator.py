@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._progress import bar, shown
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, Mask
 from sb3_yann.audit.meaning import (
     below_set_points,
     in_deviations,
@@ -142,9 +142,9 @@ class Simulator:
             self.learn(some)
         if not self.episodes:
             raise ValueError(
-                f"None of {2 * each} episodes of the MPC in the simulator is finite in all of its "
-                f"rows, {SHORTEST} steps or more: there is nothing to learn from. An episode with "
-                "a reading that is no finite number is left out."
+                f"None of {2 * each} episodes of the MPC in the simulator begins with {SHORTEST} "
+                "steps whose readings are finite, and at most its width beyond theta's box: there "
+                "is nothing to learn from."
             )
 
     @property
@@ -239,17 +239,29 @@ class Simulator:
         return played
 
     def learn(self, played: Trajectories) -> list[Episode | None]:
-        """Take episodes into the model's data, and return them; None where one is of no use."""
+        """Take the first parts of episodes that are of use, and return them; None for none."""
         found: list[Episode | None] = []
         for thetas, inputs in played.pairs:
-            if not np.isfinite(thetas[-1]).all():  # where an env has failed
-                thetas = thetas[:-1]
-                inputs = inputs[:-1]
-            finite = np.isfinite(thetas).all() and np.isfinite(inputs).all()
-            usable = len(inputs) >= SHORTEST and bool(finite)
+            kept = int(np.argmin(np.append(self._near(thetas), False)))
+            thetas = thetas[:kept]
+            inputs = inputs[: max(kept - 1, 0)]
+            usable = len(inputs) >= SHORTEST and bool(np.isfinite(inputs).all())
             found.append(Episode(*self.row.recovered(thetas, inputs)) if usable else None)
         self.episodes += [each for each in found if each is not None]
         return found
+
+    def _near(self, thetas: Array) -> Mask:
+        """Return which thetas (T, n_theta) are finite, with states at most a width beyond the box.
+
+        An env that has failed shows others, and so do equations beyond where they hold.
+        """
+        bounds = self.problem.deviations
+        part = self.problem.layout.state
+        low = bounds.theta_min[part]
+        high = bounds.theta_max[part]
+        x = thetas[:, part]
+        near = (x >= low - (high - low)) & (x <= high + (high - low))
+        return np.asarray(near.all(axis=1) & np.isfinite(thetas).all(axis=1))
 
     def close(self) -> None:
         """Close all envs."""

@@ -336,7 +336,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         """Let the actor's networks count in a box of theta only; None is everywhere.
 
         They count in full within. Beyond they fade, and from a quarter of a half-width on the law
-        acts alone. :func:`improve` sets it to what the log shows. It is saved with the weights.
+        acts alone. :func:`improve` sets it to what its episodes show. It is saved with the weights.
 
         Parameters
         ----------

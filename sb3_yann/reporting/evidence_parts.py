@@ -396,7 +396,7 @@ IMPROVE_SETTINGS = {
     "n_starts": "episodes for which the best inputs are planned in a model of the plant",
     "rounds": "how often, at most, a model is fitted, planned in, and the policy taught the plans",
     "updates": "steps of the optimizer each time that the policy is taught",
-    "confine": "whether, after a log, the MPC acts alone where the log shows nothing",
+    "confine": "whether the MPC acts alone where the log, or the simulator's episodes, end",
     "seed": "repeats the same run",
 }
 
@@ -433,11 +433,7 @@ def improve_part(subject: Subject) -> Part:
         for k, each in enumerate(found, start=1)
         for j, of in enumerate(each.checks, start=1)
     ]
-    settings = [
-        [name, str(v), IMPROVE_SETTINGS.get(name, "")]
-        for name, v in found[-1].settings.items()
-        if name != "confine" or found[-1].where == "the twin"
-    ]
+    settings = [[k, str(v), IMPROVE_SETTINGS.get(k, "")] for k, v in found[-1].settings.items()]
     how = (
         "Episodes are those of the log that the twin was fitted to, or those that were played in "
         "the simulator to compare. What was confirmed there holds for the plant as far as the "

@@ -88,6 +88,17 @@ def test_a_policy_gains_on_starts_that_it_has_not_seen(kind, tmp_path) -> None:
     again.learn(15, callback=None if kind in SIMULATED else NoActionNoise())
 
 
+@pytest.mark.parametrize("confine", [True, False])
+def test_beyond_what_its_episodes_show_the_mpc_acts_alone(confine) -> None:
+    model = model_of()
+    assert improve(model, Spring, confine=confine, **FEW).accepted
+    layer = model.policy.actor.mu
+    begins = np.array([each[0] for each in evaluate(model, Spring, UNSEEN).observations])
+    far = th.as_tensor(1.5 * np.abs(begins).max(0) * [[1, 1], [-1, 1]])
+    assert layer.confined(th.as_tensor(0.9 * begins)).min() == 1
+    assert layer.confined(far).tolist() == [[1.0 - confine]] * 2
+
+
 def test_its_steps_are_counted_and_its_envs_closed() -> None:
     Counted.forget()
     model = model_of(Counted)
@@ -125,7 +136,7 @@ def test_where_there_is_nothing_to_gain_the_model_stays_bit_for_bit() -> None:
     before = bits(model)
     found = improve(model, Plain, **FEW)
     assert not found.accepted and found.change == 0.0 and is_mpc(model)
-    assert found.reason.startswith("Nothing better was found: plans gain ")
+    assert found.reason.startswith("Nothing better was found: plans ")
     assert bits(model) == before
 
 
@@ -321,7 +332,7 @@ class Unseeded(Spring):
         (Unseeded, r"the env does not repeat it.*wrap it in sb3_yann.wrappers.SeededGlobals"),
         (
             Short,
-            r"None of \d+ episodes of the MPC in the simulator is finite in all of its",
+            r"None of \d+ episodes of the MPC in the simulator begins with \d+ steps",
         ),
         (Strange, r"The env shows \(3,\) and takes \(1,\); theta of the MPC has"),
     ],

@@ -11,17 +11,20 @@ from stable_baselines3 import DDPG
 from sb3_yann import PlantTwin, YannPolicy
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.improvement import simulator as module
-from sb3_yann.improvement.imitation import Teacher, controller_of, policy_of
+from sb3_yann.improvement.imitation import Teacher, controller_of, policy_of, refine
 from sb3_yann.improvement.improving import _Progress, _Work
 from sb3_yann.improvement.simulator import (
     Disagreement,
     Scenarios,
+    Simulator,
     lacks,
     model_of,
     of_law,
     one_step_error,
+    task_of,
 )
-from sb3_yann.plan import TwinPlant
+from sb3_yann.plan import TwinPlant, slopes_of_inputs
+from sb3_yann.rollout import Trajectories
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
@@ -128,6 +131,61 @@ def test_a_scenario_that_is_planned_again_is_shown_anew() -> None:
     assert teacher.weights[3] == 2 and teacher.weights.max() == 2
     for key in ((2, 0), (3, 0)):
         assert not np.array_equal(first[key], teacher.taught[key][0])
+
+
+@pytest.mark.parametrize("members", [None, [0, 1, 0]])
+@pytest.mark.parametrize("make", [learnt, rated, observed])
+def test_slopes_of_inputs_are_those_of_the_cost_with_the_feedback_at_work(make, members) -> None:
+    found = make()
+    rng = np.random.default_rng(0)
+    some = Scenarios.like(found, found.episodes[:3], rng)
+    some = replace(some, members=None if members is None else np.array(members))
+    mpc = found.problem
+    task = task_of(found, 1.0, priced=members is None)
+    task = replace(task, end=0 * task.end, end_slope=0.0)
+    K = -0.05 * mpc.u_half[:, None] * rng.random((mpc.model.n_inputs, mpc.n_theta))
+    moved = np.zeros((*some.given.shape[:2], mpc.model.n_inputs))
+
+    def act(theta):
+        return theta @ K.T
+
+    def cost() -> np.ndarray:
+        played = some.play(lambda t, theta, rows: act(theta) + moved[t])
+        return task.costs(played.thetas, played.inputs)
+
+    played = some.play(controller_of(act))
+    slopes = slopes_of_inputs(some.plant, task, act, played.rows, played.inputs)
+    for t, i in ((0, 0), (3, 1), (len(moved) - 1, 2)):
+        both = []
+        for side in (1e-5, -1e-5):
+            moved[t, i, 0] = side * mpc.u_half[0]
+            both.append(cost()[i])
+        moved[:] = 0.0
+        expected = (both[0] - both[1]) / (2e-5 * mpc.u_half[0])
+        assert slopes[t, i, 0] == pytest.approx(expected, rel=1e-3, abs=1e-6)
+
+
+def test_an_episode_counts_until_it_is_a_width_beyond_the_box_or_not_finite() -> None:
+    simulator = Simulator(problem(), Cart, 0)
+    width = np.ptp([problem().theta_min, problem().theta_max], axis=0)
+    thetas, inputs = log(1)[0]
+    for far, kept in ((0.9, len(inputs)), (1.1, 29), (np.nan, 29)):
+        moved = thetas.copy()
+        moved[30, 0] = problem().theta_max[0] + far * width[0]
+        (episode,) = simulator.learn(Trajectories(None, None, (moved,), (inputs,), None))
+        assert len(episode) == kept
+    simulator.close()
+
+
+def test_a_policy_descends_to_what_costs_less_and_breaks_no_rule() -> None:
+    teacher = Teacher(scenarios(learnt()), 0)
+    layer = DDPG(
+        YannPolicy, Cart(), policy_kwargs={"problem": problem(), "networks": "shared"}
+    ).actor.mu
+    saved = refine(layer, teacher)
+    played = teacher.play(layer)
+    assert saved > 0 and saved == teacher.saved(played.costs)
+    assert not teacher.objection(played)
 
 
 def test_what_is_not_finite_is_lost_and_has_no_cost() -> None:
