@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_states
-from sb3_yann.compare import INPUT_STEP, RULE, Scores, less_safe, mean_change, no_worse
+from sb3_yann.compare import INPUT_STEP, RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.evaluation import change_in_percent
 from sb3_yann.evaluation.plots import (
@@ -207,12 +207,13 @@ def _beyond(subject: Subject) -> Finding:
     if not count:
         taken = 'The env takes no reset(options={"state": x})'
         return Finding("note", f"{text} {taken}: other starts are not tried.")
-    worst = (policy.costs - mpc.costs).max() / (abs(mpc.costs.mean()) or 1.0)
+    change = relative_costs(policy.costs - mpc.costs, mpc.costs)
+    more = int(np.sum(change > FLOAT32_ROUNDING))
     reason = no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
     text += (
-        f" From {count} states beyond, anywhere in the box of parameters, the mean cost "
-        f"changes by {change_in_percent(mean_change(policy.costs - mpc.costs, mpc.costs))}, at "
-        f"worst by {change_in_percent(worst)} of it{'; ' * bool(reason)}{reason}."
+        f" From {count} states beyond, anywhere in the box of parameters, the cost changes by "
+        f"{change_in_percent(float(np.median(change)))} in the median; from {more} it is more, by "
+        f"{change_in_percent(change.max())} at most{'; ' * bool(reason)}{reason}."
     )
     return Finding("look" if reason else "note", text)
 
