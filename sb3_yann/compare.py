@@ -290,6 +290,18 @@ class Difference(NamedTuple):
         widened = np.sqrt((1 + lag) / (1 - lag))  # an autoregression's variance of the mean
         return cls(mean, float(widened * error), n, chance)
 
+    @classmethod
+    def relative(cls, more: Array, mpc_costs: Array, in_turns: bool = False) -> Difference:
+        """Return that of what starts cost more, in mean costs of the MPC: a ratio of two means.
+
+        To first order its error counts that the MPC's mean is of these starts, too.
+        """
+        size = np.abs(mpc_costs)
+        with np.errstate(invalid="ignore"):  # a cost may be infinite
+            mean = max(float(size.mean()), 1e-300)
+            change = mean_change(more, mpc_costs)
+            return cls.of((more - change * (size - mean)) / mean, in_turns)
+
     def room(self, level: float) -> float:
         """Return how far from 0 the mean may be by chance, one-sided; inf for a single pair."""
         if self.pairs < 2:

@@ -302,3 +302,14 @@ def test_what_a_rule_may_be_ends_where_it_says(name: str, good: Any, bad: Any) -
 def test_looks_double_and_share_the_level() -> None:
     assert looks(5, 100) == [5, 10, 20, 40, 80, 100] and looks(5, 3) == [3]
     assert sum(level_of_look(0.05, j) for j in range(1, 1000)) == pytest.approx(0.05, rel=0.01)
+
+
+def test_the_interval_of_a_relative_change_holds_it_where_the_mpc_s_costs_vary() -> None:
+    rng = np.random.default_rng(0)
+    held = 0
+    for _ in range(1000):
+        mpc = rng.gamma(8.0, 0.6, 40)
+        more = -1.96 + 0.07 * rng.standard_normal(40)  # saves as much from each start
+        found = Difference.relative(more, mpc)
+        held += abs(found.mean + 1.96 / 4.8) <= found.room(0.05)
+    assert 860 <= held <= 930

@@ -67,11 +67,10 @@ def paired_rows(
     size = float(np.abs(mpc).mean())
     if not (size and np.isfinite(size)):
         return {"change": change}
-    more = (costs - mpc) / size
-    found = Difference.of(more, in_turns=in_turns)
+    found = Difference.relative(costs - mpc, mpc, in_turns=in_turns)
     room = found.room(level)
     shown = change_in_percent(found.mean, (found.mean - room, found.mean + room))
     return {
         "change": f"{shown}; {change}",
-        "worst_start": f"{change_in_percent(more.max())} of the MPC's mean cost",
+        "worst_start": f"{change_in_percent((costs - mpc).max() / size)} of the MPC's mean cost",
     }

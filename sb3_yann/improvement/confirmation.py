@@ -30,7 +30,7 @@ from sb3_yann.compare import (
     unsafe_columns,
 )
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
-from sb3_yann.improvement.imitation import HARDEST, controller_of
+from sb3_yann.improvement.imitation import HARDEST, NEARLY, controller_of
 from sb3_yann.improvement.simulator import Scenarios, Simulator, of_law
 from sb3_yann.rollout import Rows, Trajectories
 from sb3_yann.twin.dynamics import law_of
@@ -45,7 +45,6 @@ RAREST = 10.0
 many times as much at most where it is rare."""
 FURTHER = 0.01  # how much farther than the MPC a run may leave what the log shows, in its widths
 WINDOW = 200  # steps that are planned of a run of more than twice as many
-NEARLY = 0.5  # A start that loses so much of what it may lose is a hard one
 
 CostsAndUnsafe = tuple[Array, Array]  # costs, and what is unsafe (`unsafe_columns`), of all starts
 
@@ -75,6 +74,8 @@ class Check:
     interval : tuple of float, optional
         Where the change lies, with 90 %. In a simulator over all looks; in a twin on the plant, see
         :meth:`PlantTwin.forecast`: then ``logged`` and ``error`` are its forecast and half-width.
+    starts : int
+        Of a simulator, from which policy and MPC played.
     """
 
     iteration: int
@@ -87,6 +88,7 @@ class Check:
     error: float = 0.0
     final: bool = False
     interval: tuple[float, float] | None = None
+    starts: int = 0
 
     @property
     def verdict(self) -> str:
@@ -338,7 +340,7 @@ class SimulatorTrial(PairedTrial):
         more = self.scores.costs - mpc
         gain = Difference.of(self.relative)
         mean = max(float(np.abs(mpc).mean()), 1e-300)
-        of_mean = Difference.of(more / mean)
+        of_mean = Difference.relative(more, mpc)
         room = of_mean.room(level)
         check = Check(
             number,
@@ -351,6 +353,7 @@ class SimulatorTrial(PairedTrial):
             error=gain.error,
             final=final,
             interval=(of_mean.mean - room, of_mean.mean + room),
+            starts=len(mpc),
         )
         return check, found
 
