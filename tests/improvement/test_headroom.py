@@ -234,7 +234,7 @@ def test_another_way_to_swing_is_found() -> None:
 def test_a_twin_s_members_share_the_starts() -> None:
     twin = reactor_s_twin()
     found = headroom(problems.cstr(), twin, n_starts=3)
-    alone = evaluate(problems.cstr().explicit(), partial(twin.env, 2), [2])
+    alone = evaluate(problems.cstr().explicit(), twin.env, [2])
     np.testing.assert_allclose(found.mpc_costs[2], alone.costs[0], rtol=1e-5)
 
 
