@@ -14,6 +14,7 @@ from sb3_yann.control.linear_system import LinearSystem
 
 NEAR_CIRCLE = 1e-3
 """Distance from the unit circle at which rounding may put the poles of a chain of integrators."""
+NUDGE = 1e-12  # of the largest weight: it is given to all inputs where there is no solution without
 
 
 def riccati(
@@ -27,14 +28,19 @@ def riccati(
     """
     A = np.sqrt(gamma) * model.A
     B = np.sqrt(gamma) * model.B
-    try:
-        with np.errstate(all="ignore"):
-            P = linalg.solve_discrete_are(A, B, Q, R, s=cross)
-        radius = spectral_radius(A - B @ gain(model, R, P, gamma, cross))
-    except (np.linalg.LinAlgError, ValueError):
-        radius = np.inf
-    # SciPy also returns matrices that do not stabilize a mode on the unit circle.
-    if not radius < 1 - 1e-9:
+    # Inputs that cost their moves alone may rest anywhere: no more than rounding holds them.
+    for nudge in (0.0, NUDGE):
+        weight = R + nudge * np.max(np.abs(R)) * np.eye(len(R))
+        try:
+            with np.errstate(all="ignore"):
+                P = linalg.solve_discrete_are(A, B, Q, weight, s=cross)
+            radius = spectral_radius(A - B @ gain(model, weight, P, gamma, cross))
+        except (np.linalg.LinAlgError, ValueError):
+            radius = np.inf
+        # SciPy also returns matrices that do not stabilize a mode on the unit circle.
+        if radius < 1 - 1e-9:
+            break
+    else:
         raise ValueError(_why_no_solution(A, B))
     return np.asarray((P + P.T) / 2)
 

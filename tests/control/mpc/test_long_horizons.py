@@ -21,7 +21,7 @@ def test_the_online_law_is_that_of_a_program_that_keeps_all_states(pole, horizon
     assert compared and error < 1e-8
 
 
-@pytest.mark.parametrize(("pole", "horizon"), [(2.4, 8), (1.9, 20), (1.6, 24)])
+@pytest.mark.parametrize(("pole", "horizon"), [(2.4, 8), (1.9, 18), (1.6, 24)])
 def test_so_is_the_explicit_law(pole, horizon) -> None:
     mpc = problem(pole, horizon, seed=5)
     online, explicit, compared = errors(mpc, 12, explicit=True)
