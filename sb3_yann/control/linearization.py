@@ -192,6 +192,9 @@ def _slopes(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
     return np.array([(f(point + h) - f(point - h)) / (2 * h.max()) for h in np.diag(steps)]).T
 
 
+XTOL = 1e-12  # in scales, of what is solved for; what is smaller is zero
+
+
 def _least_moved(
     motion: Callable[[Array], Array],
     start: Array,
@@ -219,11 +222,12 @@ def _least_moved(
         start[free] / scale[free],
         jac=lambda z: _slopes(finite, z, np.full(z.size, step)),
         bounds=[np.broadcast_to(side, start.shape)[free] / scale[free] for side in bounds],
-        xtol=1e-12,
+        xtol=XTOL,
         ftol=1e-15,
         gtol=1e-15,
     )
-    return at(found.x), float(np.max(np.abs(found.fun)))
+    z = np.where(np.abs(found.x) <= XTOL, 0.0, found.x)
+    return at(z), float(np.max(np.abs(found.fun)))
 
 
 MOVED = 1e-3  # largest residual of a given steady state in one step, relative to the scale

@@ -626,7 +626,8 @@ class _Work:
             changes = found.logged, -promised, -teacher.gain
             own, modelled, planned = map(change_in_percent, changes)
             how = f"round {number + 1} of at most {self.rounds}, {len(trial.scores.costs)} starts"
-            verdict = f"start by start {own}, in the model {modelled}, plans {planned}"
+            verdict = f"a start's own change {own} on average, in the model {modelled}, "
+            verdict += f"plans {planned}"
             self.note(found, how, verdict)
             lost = trial.lost
             useful = found.safe and found.change < least

@@ -249,7 +249,8 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
             "nothing moves": trust.standing,
         }
         for name, errors in rows.items():
-            said.append(f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in errors))
+            real = np.where(errors <= FLOAT32_ROUNDING, 0.0, errors)
+            said.append(f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in real))
         said.append("Cost of held-out episodes (or pieces of them), predicted and actual:")
         for predicted, actual in zip(trust.predicted[:10], trust.actual[:10], strict=True):
             said.append(f"  {predicted:>10.4g} {actual:>10.4g}")

@@ -12,6 +12,7 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import combination, names
 from sb3_yann.log import Episode, split_episodes
+from sb3_yann.units import FLOAT32_ROUNDING
 
 WEAKEST = 1e-6  # least excitation, below which float32 rounding alone may be what moves
 
@@ -225,7 +226,7 @@ def pole_note(values: Array, errors: Array, noise: str = "process noise") -> str
     for value, error in zip(values, errors, strict=True):
         if value.imag < 0:
             continue
-        width = NORMAL * error
+        width = NORMAL * error if error > FLOAT32_ROUNDING else 0.0
         imaginary = f" ± {value.imag:.4g}i" if value.imag else ""
         known = f"{value.real:.4g}{imaginary} within {width:.2g}"
         words.append(known if width < WIDE else f"{value.real:.4g}{imaginary}, hardly known")
@@ -285,7 +286,7 @@ def operating_point(
         moves = moves[states]
         doubt = doubt[states]
     start[states] += scale[states] * _way(moves[:, states], drift, doubt[:, states])
-    return start
+    return np.where(np.abs(start) <= 1e-12 * scale, 0.0, start)  # no rounding
 
 
 def _directions(moves: Array, doubt: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:

@@ -18,6 +18,7 @@ from sb3_yann.control.identification.least_squares import (
     pole_note,
 )
 from sb3_yann.log import Episode
+from sb3_yann.units import FLOAT32_ROUNDING
 
 STEPS_PER_FEATURE = 4  # steps for each feature, at least: with fewer the features fit anything
 MAX_COMPONENTS = 12  # main components, at most: a long log with many states must not take minutes
@@ -209,7 +210,8 @@ def quality_notes(
     fits = fits[0][:n], fits[1][:n]
     notes = [
         f"Fitted to {found.steps} steps; one step differs from the prediction by "
-        f"{listed(np.sqrt(np.diag(found.covariance))[:n])} (standard deviation of each state)."
+        f"{listed_errors(found.covariance[:n, :n], found.spread)} (standard deviation of each "
+        "state)."
     ]
     if tested:
         notes.append(_words_for(fits, sum(map(len, tested))))
@@ -285,6 +287,12 @@ def _words_for(fits: tuple[Array, Array], steps: int) -> str:
     if np.any(fits[1] < POOR_FIT):
         text += f" Poor: {LONG_PREDICTION} steps ahead the model says little of the plant."
     return text
+
+
+def listed_errors(covariance: Array, spread: Array) -> str:
+    """Return standard deviations (n,); those that are rounding beside the spread (n, ...) are 0."""
+    sizes = np.sqrt(np.diag(covariance))
+    return listed(np.where(sizes > FLOAT32_ROUNDING * spread[: sizes.size], sizes, 0.0))
 
 
 def listed(values: Array) -> str:

@@ -30,7 +30,7 @@ from sb3_yann.control.identification.outputs import (
     predicted,
     stand_ins,
 )
-from sb3_yann.control.identification.residuals import listed
+from sb3_yann.control.identification.residuals import listed, listed_errors
 from sb3_yann.control.linear_system import names
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
@@ -398,7 +398,7 @@ def _notes(
     driven = [*(log.input_names or names((0, m))), *names((0, 0, log.sizes[2]))]
     notes = [
         f"From outputs: order {n}, fitted to {sum(map(len, log.episodes))} steps; one step differs "
-        f"from the prediction by {listed(np.sqrt(np.diag(noise)))} (standard deviation of each "
+        f"from the prediction by {listed_errors(noise, plain.spread)} (standard deviation of each "
         "output). A policy sees estimates: sb3_yann.wrappers.EstimateState(env, "
         "found.estimator())."
     ]

@@ -54,6 +54,7 @@ def test_data_without_noise_give_the_matrices_back() -> None:
     np.testing.assert_allclose(model.B, B, atol=1e-8)
     np.testing.assert_allclose(model.E, E, atol=1e-8)
     assert model.dt == 0.5
+    assert "e-1" not in model.report() and "prediction by 0, 0 (" in model.report()
 
 
 @pytest.mark.slow
