@@ -33,7 +33,7 @@ from sb3_yann.deployment.code import (
     sample_observations,
     table,
 )
-from sb3_yann.deployment.controller import MODES, Controller, steps_of
+from sb3_yann.deployment.controller import KEPT_ROUNDING, MODES, Controller, steps_of
 
 
 def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
@@ -287,6 +287,7 @@ def _definitions(data: ControllerArrays, precision: str) -> str:
             "REACH": f"((real){literal(data['reach'], precision)})",
             "FADES_FROM": literal(fade_start, precision),
             "FADES_TO": literal(fade_end, precision),
+            "KEPT_ROUNDING": literal(KEPT_ROUNDING, precision),
             "N_KEPT": len(data["kept"]),
         }
     index = f"int{8 * code.index_bytes(indices)}_t"

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 FORMAT = 5  # of the arrays: a reader takes no other
 POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
+KEPT_ROUNDING = 2.5e-7  # that of `units`, which this file does without
 MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
 
 
@@ -414,8 +415,8 @@ class Controller:
         moved = np.clip(action - most * b[worst], law - reach, law + reach)
         moved = np.clip(moved, low, high)
         push = (moved - law) @ b.T
-        share = np.where(push > room, room / np.where(push > room, push, 1.0), 1.0).min(1)
-        moved = np.clip(law + share[:, None] * (moved - law), low, high)
+        share = ((room + KEPT_ROUNDING) / np.maximum(push, KEPT_ROUNDING)).min(1)[:, None]
+        moved = np.clip(law + np.minimum(share, 1) * (moved - law), low, high)
         return np.where(most > 0, moved, action)
 
     def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

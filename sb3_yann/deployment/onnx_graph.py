@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann.deployment.code import ControllerArrays, action_scale, search_tolerances
-from sb3_yann.deployment.controller import ACTIVATIONS
+from sb3_yann.deployment.controller import ACTIVATIONS, KEPT_ROUNDING
 
 
 def onnx_model(data: ControllerArrays, precision: str, digest: str) -> bytes:
@@ -256,10 +256,9 @@ def _kept(
     moved = graph.between(moved, low, high)
     way = op("Sub", moved, law)
     push = op("MatMul", way, b)
-    breaks = op("Greater", push, room)
-    one = constant(1.0)
-    share = op("Where", breaks, op("Div", room, op("Where", breaks, push, one)), one)
-    share = op("ReduceMin", share, axes=[1], keepdims=1)
+    rounding = constant(KEPT_ROUNDING)
+    share = op("Div", op("Add", room, rounding), op("Max", push, rounding))
+    share = op("Min", op("ReduceMin", share, axes=[1], keepdims=1), constant(1.0))
     moved = graph.between(op("Add", law, op("Mul", share, way)), low, high)
     return op("Where", op("Greater", most, zero), moved, action)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_yann.deployment import code
 from sb3_yann.deployment.code import ControllerArrays, decimal
+from sb3_yann.deployment.controller import KEPT_ROUNDING
 
 ACTIVATE = {
     "tanh": """k := 0;
@@ -176,6 +177,7 @@ def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:
         "REACH": min(float(data["reach"]), MAX_REAL),
         "FADES_FROM": fade_start,
         "FADES_TO": fade_end,
+        "KEPT_ROUNDING": KEPT_ROUNDING,
         "LATE_AFTER": min(float(data["late_after"]), MAX_REAL),
     }
     lines = [f"{name} : {kind} := {decimal(value, precision)};" for name, value in reals.items()]

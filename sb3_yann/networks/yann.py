@@ -20,7 +20,7 @@ from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.mpc.invariant_sets import KeptSet
 from sb3_yann.control.online import Law
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
-from sb3_yann.units import FLOAT32_ROUNDING
+from sb3_yann.units import FLOAT32_ROUNDING, KEPT_ROUNDING
 
 ChangeBounds = tuple[Array, Array]
 FADE_START = 1.0
@@ -574,8 +574,8 @@ class _Kept(th.autograd.Function):
         moved = (actions - most * ctx.along).clamp(law - limit, law + limit)
         moved = moved.to(actions).clamp(*bounds)
         push = pushed(moved)
-        share = th.where(push > room, room / push, 1.0).amin(1, keepdim=True)
-        moved = (law + share * (moved - law)).to(actions).clamp(*bounds)
+        share = ((room + KEPT_ROUNDING) / push.clamp(min=KEPT_ROUNDING)).amin(1, keepdim=True)
+        moved = (law + share.clamp(max=1) * (moved - law)).to(actions).clamp(*bounds)
         kept: th.Tensor = th.where(held, moved, actions)
         return kept
 

@@ -11,7 +11,7 @@ from stable_baselines3 import DDPG
 
 import general_problems
 import sample_problems
-from general_problems import solved
+from general_problems import PUMPS, solved
 from sample_laws import by_loops_and_by_torch, scrambled
 from sb3_yann import LinearModel, LinearMPC, OutputBounds, Tracking
 from sb3_yann.control.mpc.bound_excess import Bounds
@@ -118,6 +118,19 @@ def test_any_weights_keep_the_bounds_of_a_plant_that_is_its_model(name):
         pushing(layer, towards)
         assert largest_excess(mpc, inputs_of(mpc, layer)) < 2e-6
     assert broken > 0.1
+
+
+@pytest.mark.parametrize("kind", [YannLayer, SharedYannLayer])
+def test_what_pushes_over_a_bound_that_the_law_rides_goes_along_it(kind):
+    """Which rounding does not decide: that is how far a few actions are beyond the bound."""
+    layer = layer_of(general_problems.solved("level"), kind)
+    pushing(layer, [0.4, 0.0])
+    theta = np.column_stack([np.linspace(0.8, 1, 50), np.full(50, 2.0)])
+    law = layer.law(th.as_tensor(theta)).numpy()
+    np.testing.assert_allclose(theta[:, 0] + law @ PUMPS, 1, atol=1e-6)
+    along = np.array([PUMPS[1], -PUMPS[0]]) / np.hypot(*PUMPS)
+    moved = by_loops_and_by_torch(layer, th.as_tensor(theta)).detach().numpy() - law
+    np.testing.assert_allclose(moved, 0.4 * along[0] * along + np.zeros((50, 2)), atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", [YannLayer, SharedYannLayer])

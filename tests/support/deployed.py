@@ -78,7 +78,7 @@ CASES: dict[str, Callable[[], YannPolicy]] = {
     "two tanks, by a walk": lambda: disturbed(general_problems.solved("two tanks, all parts")),
     "mixed observations": lambda: _seen(sample_laws.solved("two inputs"), max_correction=0.1),
     "confined": lambda: confined(disturbed(sample_laws.solved("reactor"), networks="shared")),
-    "keeps its bounds": lambda: disturbed(general_problems.solved("servo with a disturbance"), 3.0),
+    "keeps its bounds": lambda: disturbed(general_problems.solved("level"), 3.0),
     "bounds in theta": lambda: disturbed(
         replaced(
             sample_laws.solved("two inputs"),

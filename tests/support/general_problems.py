@@ -43,6 +43,16 @@ def two_tanks(**changes: Any) -> LinearMPC:
     return LinearMPC(TWO_TANKS, **{**values, **changes})
 
 
+PUMPS = np.array([1.0, 0.7])
+
+
+def level() -> LinearMPC:
+    """A level with two pumps, which rides its limit where it is to be higher."""
+    values: dict[str, Any] = {"Q": [[1.0]], "R": 0.01 * np.eye(2), "horizon": 3}
+    values |= {"u_min": -1, "u_max": 1, "x_min": -1, "x_max": 1, "tracking": Tracking([0], -2, 2)}
+    return LinearMPC(LinearModel([[1.0]], [PUMPS], 1.0), **values)
+
+
 RATES = {"du_min": -0.5, "du_max": 0.7}
 RATED = {"rate": RateLimits(**RATES)}
 INVARIANT_SET = {"terminal": Terminal(set="invariant")}
@@ -76,6 +86,7 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "more inputs than outputs": lambda: two_tanks(
         tracking=Tracking([[1, 1]], -0.5, 0.5), R=np.diag([0.1, 1])
     ),
+    "level": level,
 }
 
 

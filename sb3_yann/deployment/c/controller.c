@@ -212,8 +212,8 @@ static int worst_row(const real theta[N_THETA], const real law[N_INPUTS],
         }
         const real room = slack > end[1] ? slack - end[1] : ZERO;
         const real beyond = push - (slack < room ? slack : room);
-        if (push > room && room / push < *share) {
-            *share = room / push;
+        if (push * *share > room + KEPT_ROUNDING) {
+            *share = (room + KEPT_ROUNDING) / push;
         }
         if (beyond > *most) {
             *most = beyond;

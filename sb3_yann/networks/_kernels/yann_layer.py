@@ -18,6 +18,7 @@ from sb3_yann.networks._kernels.stack import (
     prepared,
     to_numpy,
 )
+from sb3_yann.units import KEPT_ROUNDING
 
 KEPT_TYPES = (
     "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1], float32[:, :, ::1]"
@@ -95,8 +96,7 @@ def _worst(theta: Array, row: int, law: Any, actions: Any, kept: Array) -> tuple
             push += kept[i, n + k] * (actions[row, k] - law[k])
             slack -= kept[i, n + k] * law[k]
         room = max(slack - kept[i, n + m + 1], 0.0)
-        if push > room:
-            share = min(share, room / push)
+        share = min(share, (room + KEPT_ROUNDING) / max(push, KEPT_ROUNDING))
         beyond = push - min(slack, room)
         if beyond > most:
             worst = i
