@@ -23,7 +23,7 @@ from sb3_yann.control import LinearMPC, lqr
 from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond, mixed_half
 from sb3_yann.control.mpc.problem import Value
 from sb3_yann.rollout import Rows
-from sb3_yann.twin.dynamics import Dynamics, law_of
+from sb3_yann.twin.dynamics import Dynamics, law_of, play
 
 Policy = Callable[[int, Array], Array]  # step and thetas (k, n_theta) -> inputs (k, m)
 
@@ -227,13 +227,12 @@ def roll_out(
 
     It begins at ``starts`` (k, n_theta); ``rows`` (k,) are their numbers, as the plant knows them.
     """
-    thetas = np.empty((steps + 1, *starts.shape))
-    inputs = np.empty((steps, len(starts), task.problem.model.n_inputs))
-    thetas[0] = starts
-    for t in range(steps):
-        inputs[t] = np.clip(np.nan_to_num(policy(t, thetas[t])), *task.limits(thetas[t]))
-        thetas[t + 1] = plant.step(thetas[t], inputs[t], rows)
-    return thetas, inputs
+    m = task.problem.model.n_inputs
+
+    def act(t: int, theta: Array) -> Array:
+        return np.clip(np.nan_to_num(policy(t, theta)), *task.limits(theta))
+
+    return play(act, lambda t, theta, u: plant.step(theta[t], u[t], rows), starts, steps, m)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from sb3_yann._progress import bar
 from sb3_yann._validation import Array, check_int, check_type, half_widths, warn
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
-from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
+from sb3_yann.control.mpc.bound_excess import BoundExcess, costs_of
 from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.env_pool import EnvPool, Source, vector_env_of
 from sb3_yann.units import same_bounds
@@ -416,9 +416,7 @@ def _with_stage_costs(played: Trajectories, problem: LinearMPC) -> Trajectories:
     """Return the same with the stage costs of a problem, and the excess over its bounds."""
     thetas, inputs, _ = played.padded()
     taken = np.arange(len(inputs))[:, None] < played.lengths
-    excess = bound_excess(problem, thetas, inputs, taken)
-    costs = problem.deviations.stage_cost(thetas[:-1], inputs)
-    costs = np.sum(costs, axis=0, where=taken) + excess.penalty
+    costs, excess = costs_of(problem, thetas, inputs, taken)
     return replace(played, costs=costs, excess=excess)
 
 

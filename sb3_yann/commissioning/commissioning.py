@@ -34,7 +34,7 @@ from sb3_yann.compare import (
     level_of_look,
 )
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, excess_of_episodes
+from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, costs_of, excess_of_episodes
 from sb3_yann.env_pool import Source, one_env
 from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
@@ -588,10 +588,7 @@ def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]
 def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode], own_reward: bool) -> Array:
     if own_reward:
         return np.array([-each.reward for each in episodes])
-    cost = problem.stage_cost
-    stage = np.array([np.sum(cost(each.thetas[:-1], each.actions)) for each in episodes])
-    soft = excess_of_episodes(problem, ((each.thetas, each.actions) for each in episodes))
-    return np.asarray(stage + soft.penalty)
+    return np.array([costs_of(problem, each.thetas, each.actions)[0] for each in episodes])
 
 
 def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Feedback) -> Array:

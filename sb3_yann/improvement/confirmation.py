@@ -29,7 +29,7 @@ from sb3_yann.compare import (
     relative_costs,
     unsafe_columns,
 )
-from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
+from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, costs_of
 from sb3_yann.improvement.imitation import HARDEST, NEARLY, controller_of
 from sb3_yann.improvement.simulator import Scenarios, Simulator, of_law
 from sb3_yann.rollout import Rows, Trajectories
@@ -165,14 +165,10 @@ class Trial:
 
     def _outcome(self, thetas: Array, inputs: Array) -> CostsAndUnsafe:
         twin = self.twin
-        shown = twin.dynamics.row.shown(thetas[:-1])
-        excess = bound_excess(twin.problem, twin.dynamics.row.shown(thetas), inputs)
-        excess = BoundExcess(*(each.ravel() for each in excess))
         with np.errstate(all="ignore"):
-            costs = (
-                twin.problem.deviations.stage_cost(shown, inputs).sum(axis=0).ravel()
-                + excess.penalty
-            )
+            costs, excess = costs_of(twin.problem, twin.dynamics.row.shown(thetas), inputs)
+        costs = costs.ravel()
+        excess = BoundExcess(*(each.ravel() for each in excess))
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
         return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_yann._progress import bar, shown
+from sb3_yann._progress import shown
 from sb3_yann._validation import Array, Mask
 from sb3_yann.audit.meaning import (
     below_set_points,
@@ -28,11 +28,11 @@ from sb3_yann.audit.meaning import (
 )
 from sb3_yann.compare import NewSeeds, unsafe_columns
 from sb3_yann.control import LinearMPC, StateEstimator
-from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.control.mpc.bound_excess import costs_of
 from sb3_yann.env_pool import EnvPool, Source, maker, name_of, pool_of
 from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import Controller, Rows, Trajectories, joined, of_episode, rollout
-from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of, play
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import SHORTEST, Episode, observer_of
 from sb3_yann.twin.row_layout import RowLayout
@@ -505,22 +505,20 @@ class Scenarios:
         """Return the episodes of a controller."""
         problem = self.model.problem
         row = self.model.dynamics.row
-        steps, k = self.given.shape[:2]
-        rows = np.empty((steps + 1, *self.starts.shape))
-        numbers = np.arange(k)
-        inputs = np.empty((steps, k, problem.model.n_inputs))
-        rows[0] = self.starts
-        low = problem.deviations.u_min
-        high = problem.deviations.u_max
+        numbers = np.arange(len(self))
+        limits = problem.deviations.u_min, problem.deviations.u_max
+
+        def act(t: int, rows: Array) -> Array:
+            return np.clip(np.nan_to_num(controller(t, row.shown(rows), numbers)), *limits)
+
+        def step(t: int, rows: Array, inputs: Array) -> Array:
+            return self.plant.advance(rows[t], inputs[t], numbers)
+
         with np.errstate(all="ignore"):
-            for t in bar(f"{k} episodes in the model: steps", range(steps)):
-                rows[t][:, row.given] = self.given[t]
-                u = np.asarray(controller(t, row.shown(rows[t]), numbers))
-                inputs[t] = np.clip(np.nan_to_num(u), low, high)
-                rows[t + 1] = self.plant.advance(rows[t], inputs[t], numbers)
+            size = len(self.given), problem.model.n_inputs
+            rows, inputs = play(act, step, self.starts, *size, (row.given, self.given))
             thetas = row.shown(rows)
-            excess = bound_excess(problem, thetas, inputs)
-            costs = problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
+            costs, excess = costs_of(problem, thetas, inputs)
         lost = ~(np.isfinite(costs) & np.isfinite(thetas).all(axis=(0, 2)))
         costs = np.where(lost, np.inf, costs)
         return Imagined(rows, thetas, inputs, costs, unsafe_columns(0, 0, lost, excess))

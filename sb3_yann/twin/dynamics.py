@@ -190,6 +190,30 @@ def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
     return act
 
 
+def play(
+    act: Callable[[int, Array], Array],
+    step: Callable[[int, Array, Array], Array],
+    starts: Array,
+    steps: int,
+    m: int,
+    given: tuple[slice, Array] | None = None,
+) -> tuple[Array, Array]:
+    """Return rows (steps + 1, ..., size) and inputs (steps, ..., m): the one loop in models.
+
+    ``act`` is asked for the inputs at a step and its rows, ``step`` for the rows after a step of
+    all rows and inputs so far. ``given`` is a part of the rows, and what it is at each step.
+    """
+    rows = np.empty((steps + 1, *starts.shape))
+    inputs = np.empty((steps, *starts.shape[:-1], m))
+    rows[0] = starts
+    for t in bar("episodes in a model: steps", range(steps)):
+        if given is not None:
+            rows[t][..., given[0]] = given[1][t]
+        inputs[t] = act(t, rows[t])
+        rows[t + 1] = step(t, rows, inputs)
+    return rows, inputs
+
+
 @dataclass(frozen=True)
 class Dynamics:
     """``theta+ = A_bar theta + B_bar u + residual``, with one residual for each member.
@@ -251,7 +275,7 @@ class Dynamics:
         times = starts + np.arange(steps)[:, None]
         begin = np.repeat(episode.thetas[starts][None], len(self.members), axis=0)
         given = episode.thetas[times][..., self.row.given]
-        rows, _ = self._run(lambda t, _: episode.actions[times[t]], begin, steps, given)
+        rows, _ = self._play(lambda t, _: episode.actions[times[t]], begin, steps, given)
         return np.asarray(np.moveaxis(rows[..., self.row.state], 0, 2))
 
     def roll_out(
@@ -271,7 +295,7 @@ class Dynamics:
             u = np.asarray(act(self.row.shown(rows.reshape(-1, rows.shape[-1]))), np.float64)
             return u.reshape(*rows.shape[:2], self.m)
 
-        return self._run(inputs, starts, steps, given)
+        return self._play(inputs, starts, steps, given)
 
     def replay_in_closed_loop(self, episode: Episode) -> Array:
         """Return the predicted costs (members,) of a whole episode.
@@ -291,23 +315,15 @@ class Dynamics:
 
         begin = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
         given = episode.thetas[:-1, None, row.given]
-        rows, u = self._run(inputs, begin, len(episode), given)
+        rows, u = self._play(inputs, begin, len(episode), given)
         costs = own.stage_cost(row.shown(rows[:-1]), u)
         return np.asarray(costs[..., 0].sum(axis=0))
 
-    def _run(
-        self, inputs: Callable[[int, Array], Array], starts: Array, steps: int, given: Array | None
+    def _play(
+        self, act: Callable[[int, Array], Array], starts: Array, steps: int, given: Array | None
     ) -> tuple[Array, Array]:
-        """Return rows and inputs as :meth:`roll_out` does, of inputs at a step and its rows."""
-        rows = np.empty((steps + 1, *starts.shape))
-        taken = np.empty((steps, *starts.shape[:2], self.m))
-        rows[0] = starts
-        for t in bar("episodes in a model: steps", range(steps)):
-            if given is not None:
-                rows[t][..., self.row.given] = given[t]
-            taken[t] = inputs(t, rows[t])
-            rows[t + 1] = self.step(rows[t], taken[t])
-        return rows, taken
+        fixed = None if given is None else (self.row.given, given)
+        return play(act, lambda t, rows, u: self.step(rows[t], u[t]), starts, steps, self.m, fixed)
 
     @property
     def m(self) -> int:

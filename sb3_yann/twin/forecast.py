@@ -17,8 +17,8 @@ from scipy import stats
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback
-from sb3_yann.control.mpc.bound_excess import bound_excess
-from sb3_yann.twin.dynamics import Dynamics, law_of
+from sb3_yann.control.mpc.bound_excess import costs_of
+from sb3_yann.twin.dynamics import Dynamics, law_of, play
 from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
@@ -108,33 +108,30 @@ class _Replays:
         """
         problem = self.dynamics.problem
         row = self.dynamics.row
-        low = problem.deviations.u_min
-        high = problem.deviations.u_max
+        limits = problem.deviations.u_min, problem.deviations.u_max
         count, some, size = starts.shape
+        steps, _, m = self.inputs.shape
         like = np.repeat(np.arange(count), some)
-        steps = len(self.inputs)
-        shape = (self.members, len(like))
-        rows = np.empty((steps + 1, *shape, size))
-        inputs = np.empty((steps, *shape, self.inputs.shape[2]))
-        missed = np.zeros((steps, *shape, self.errors.shape[3]))
-        rows[0] = starts.reshape(-1, size)
         alive = self.alive[:, like]
+        missed = self.errors[:, :, like]
+
+        def inputs_at(t: int, rows: Array) -> Array:
+            u = act(np.nan_to_num(row.shown(rows).reshape(-1, problem.n_theta)))
+            return np.clip(u, *limits).reshape(*rows.shape[:2], m)
+
+        def step(t: int, rows: Array, inputs: Array) -> Array:
+            if self.weights is not None:
+                missed[t] += self._regressors(t, rows[t], inputs, missed) @ self.weights
+            after: Array = self._step(rows[t], inputs[t]) + missed[t] @ row.spread.T
+            row.clip(after)
+            after[:, ~alive[t]] = rows[t][:, ~alive[t]]
+            return after
+
         with np.errstate(all="ignore"):
-            for t in range(steps):
-                rows[t][..., row.given] = self.rows[t][like, row.given]
-                flat = row.shown(rows[t]).reshape(-1, problem.n_theta)
-                u = np.asarray(act(np.nan_to_num(flat)), np.float64).reshape(inputs[t].shape)
-                inputs[t] = np.clip(u, low, high)
-                missed[t] = self.errors[t][:, like]
-                if self.weights is not None:
-                    missed[t] += self._regressors(t, rows[t], inputs, missed) @ self.weights
-                rows[t + 1] = self._step(rows[t], inputs[t]) + missed[t] @ row.spread.T
-                row.clip(rows[t + 1])
-                rows[t + 1][:, ~alive[t]] = rows[t][:, ~alive[t]]
-            shown = row.shown(rows)
-            costs = problem.deviations.stage_cost(shown[:-1], inputs)
-            penalty = bound_excess(problem, shown, inputs).penalty
-            found = np.sum(costs * alive[:, None], axis=0) + penalty
+            begins = np.repeat(starts.reshape(1, -1, size), self.members, axis=0)
+            given = row.given, self.rows[:-1, like, row.given]
+            rows, inputs = play(inputs_at, step, begins, steps, m, given)
+            found, _ = costs_of(problem, row.shown(rows), inputs, alive[:, None])
         found = np.where(np.isfinite(found), found, np.inf)
         return np.asarray(found.reshape(self.members, count, some).mean(axis=2))
 

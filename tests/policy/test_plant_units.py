@@ -25,6 +25,7 @@ from sb3_yann import (
     Tracking,
     YannPolicy,
 )
+from sb3_yann.commissioning.commissioning import _costs
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.wrappers import SetPoint, StageCost
 from sb3_yann_envs import problems
@@ -91,9 +92,10 @@ def test_a_model_that_is_loaded_reads_the_same(shows: str, takes: str, tmp_path:
 
 @pytest.mark.parametrize(("shows", "takes"), [("plant", "plant"), ("normalized",) * 2])
 def test_commissioning_plays_the_plant_in_its_units(shows: str, takes: str) -> None:
-    env = units.plant(shows, takes)
+    env = StageCost(units.plant(shows, takes), MPC, observation=units.SAYS[shows])
     played = Plant(env, build(env, units.SAYS[shows]))
     episode = played.play(played.begin(3), played.mpc, None)
+    np.testing.assert_allclose(_costs(MPC, [episode], False), -episode.reward, rtol=1e-3)
     law = MPC.explicit()(episode.thetas[:-1])
     np.testing.assert_allclose(episode.actions, law, atol=1e-5)
     moved = MPC.deviations.predict(episode.thetas[:-1], episode.actions)
@@ -141,6 +143,16 @@ def test_a_reading_that_is_lost_is_called_by_its_name(shows: str) -> None:
     with pytest.warns(NonFiniteWarning, match=r"not finite in entries \[0\] \(temperature\)"):
         action = model.predict(seen)[0]
     assert env.unwrapped.input(action) == pytest.approx(MPC.explicit()(x), abs=1e-5)
+
+
+def test_the_state_that_lies_at_zero_is_found() -> None:
+    mpc = LinearMPC(
+        LinearModel(np.eye(2) / 2, np.eye(2), 1.0, x_ss=[1, -30]), Q=np.eye(2), R=np.eye(2),
+        horizon=1, x_min=[-1, -32], x_max=[3, -28],
+    )  # fmt: skip
+    assert mpc.shown_as_deviation(np.array([[0.2, -0.5], [-0.2, 1]])).startswith("x[1] = -0.5 is")
+    for shown in (np.array([[1.2, -30.5]]), np.array([[2.5, 9]]), np.zeros((0, 2))):
+        assert mpc.shown_as_deviation(shown) == ""
 
 
 def test_set_points_in_deviations_are_named() -> None:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, Mask
 from sb3_yann.control.linear_system import labels_of
-from sb3_yann.control.mpc.problem import MPCProblem
+from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.units import FLOAT32_ROUNDING
 
 
@@ -36,7 +36,7 @@ class Bounds:
     moving: tuple[Array, ...]
 
     @classmethod
-    def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
+    def of(cls, problem: LinearMPC, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
         """Return those of a problem, and of its states (n,) besides, in deviations."""
         problem = problem.deviations
         outputs = problem.outputs
@@ -80,14 +80,14 @@ class Bounds:
         return _beyond(y, low, high, self.half, room)
 
 
-def mixed_half(problem: MPCProblem) -> Array:
+def mixed_half(problem: LinearMPC) -> Array:
     """Return what the rows (k,) of MixedBounds come to in half-widths of states and inputs."""
     mixed = problem.mixed
     size = problem.theta_half[problem.layout.state]
     return np.asarray(np.abs(mixed.F) @ size + np.abs(mixed.G) @ problem.u_half)
 
 
-def mixed_beyond(problem: MPCProblem, thetas: Array, inputs: Array, room: float = 0.0) -> Array:
+def mixed_beyond(problem: LinearMPC, thetas: Array, inputs: Array, room: float = 0.0) -> Array:
     """Return by how much MixedBounds that are moved out by some room are exceeded (..., k).
 
     As `Bounds.beyond`, at thetas (..., n_theta) and inputs (..., m) of the same samples.
@@ -113,7 +113,7 @@ class BoundNames(NamedTuple):
     soft: tuple[bool, ...] = ()
 
     @classmethod
-    def of(cls, problem: MPCProblem) -> BoundNames:
+    def of(cls, problem: LinearMPC) -> BoundNames:
         """Return those of a problem."""
         model = problem.model
         bounds = Bounds.of(problem)
@@ -164,7 +164,7 @@ class BoundExcess(NamedTuple):
 
 
 def bound_excess(
-    problem: MPCProblem,
+    problem: LinearMPC,
     thetas: Array,
     inputs: Array,
     taken: ArrayLike = True,
@@ -228,7 +228,16 @@ def bound_excess(
     )
 
 
-def excess_of_episodes(problem: MPCProblem, episodes: Iterable[tuple[Array, Array]]) -> BoundExcess:
+def costs_of(
+    problem: LinearMPC, thetas: Array, inputs: Array, taken: Mask | bool = True
+) -> tuple[Array, BoundExcess]:
+    """Return what trajectories cost (...), with the penalty of soft bounds, and their excess."""
+    excess = bound_excess(problem, thetas, inputs, taken)
+    stage = problem.deviations.stage_cost(thetas[:-1], inputs)
+    return np.sum(stage, axis=0, where=taken) + excess.penalty, excess
+
+
+def excess_of_episodes(problem: LinearMPC, episodes: Iterable[tuple[Array, Array]]) -> BoundExcess:
     """Return the same of thetas (T + 1, n_theta) and inputs (T, m) of episodes, one for each."""
     found = [bound_excess(problem, thetas, inputs) for thetas, inputs in episodes]
     return BoundExcess(*np.array(found, dtype=np.float64).reshape(-1, 5).T)
