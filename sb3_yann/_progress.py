@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -17,7 +17,7 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from sb3_yann._validation import check_bool
 
 DELAY = 3.0  # seconds that pass without a word
-FILE_INTERVAL = 30.0  # seconds between two states of bars in a file; ten times that of parts
+FILE_INTERVAL = 30.0  # seconds without a line after which a bar leaves one in a file; of parts 300
 
 _silent = ContextVar("silent", default="TQDM_DISABLE" in os.environ)
 _parts = ContextVar("parts", default=False)
@@ -35,10 +35,12 @@ def is_watched() -> bool:
 def shown(progress_bar: bool, parts: bool = False) -> Iterator[None]:
     """Show what takes long, unless it is False here or further out.
 
-    Bars of ``parts`` count and foretell nothing, and leave little in a file: `Progress` says how
-    long all of them take.
+    Bars of ``parts`` count and foretell nothing, and leave little in a file but for the first line:
+    `Progress` says how long all of them take.
     """
     check_bool("progress_bar", progress_bar)
+    if not _parts.get():
+        _Lines.latest = -math.inf
     token = _silent.set(_silent.get() or not progress_bar)
     of_parts = _parts.set(_parts.get() or parts)
     try:
@@ -58,17 +60,18 @@ _Bar.set_lock(threading.RLock())
 
 
 class _Lines:
-    """A file in which bars and details leave a line where there was none for so many seconds."""
+    """A file in which a line is left where there was none for so many seconds."""
 
-    def __init__(self, interval: float, latest: float = -math.inf) -> None:
+    latest = -math.inf  # of all of them
+
+    def __init__(self, interval: float) -> None:
         self.interval = interval
-        self.latest = latest
 
-    def write(self, text: str, detail: bool = True) -> None:
-        """Write a line, a detail only where there was none of late."""
+    def write(self, text: str) -> None:
+        """Write a line, without what moves the cursor."""
         now = time.monotonic()
-        if text.strip() and (not detail or now >= self.latest + self.interval):
-            self.latest = now
+        if text.strip() and now >= _Lines.latest + self.interval:
+            _Lines.latest = now
             print(text.strip(), file=sys.stderr)
 
     def flush(self) -> None:
@@ -76,13 +79,13 @@ class _Lines:
         sys.stderr.flush()
 
 
-_LINES = _Lines(FILE_INTERVAL)
-_PARTS = _Lines(10 * FILE_INTERVAL, time.monotonic())
-
-
 def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None) -> Any:
     """Return a bar over items, or one to ``update``; those inside each other share a line."""
+    watched = is_watched()
     of_parts = _parts.get()
+    words = "  {desc}: {n_fmt}" + " of {total_fmt}" * (total is not None or isinstance(items, Sized))
+    if not of_parts:
+        words += ", {elapsed} so far, {remaining} left"
     return _Bar(
         items,
         desc=what,
@@ -91,9 +94,9 @@ def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None)
         leave=False,
         miniters=1,
         position=0,
-        file=sys.stderr if is_watched() else _PARTS if of_parts else _LINES,
+        file=sys.stderr if watched else _Lines(FILE_INTERVAL * (10 if of_parts else 1)),
         disable=_silent.get(),
-        bar_format="  {desc}: {n_fmt} of {total_fmt}" if of_parts else None,
+        bar_format=words if of_parts or not watched else None,
     )
 
 
@@ -118,4 +121,4 @@ class Progress:
         if is_watched():
             _Bar.write(line, file=sys.stderr)
         else:
-            _LINES.write(line, detail)
+            _Lines(FILE_INTERVAL if detail else 0.0).write(line)

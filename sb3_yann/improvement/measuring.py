@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import sys
 import time
 import warnings
 from dataclasses import dataclass
@@ -260,7 +261,8 @@ def headroom(
     seed : int, default 0
         Of the first start.
     max_steps : int, optional
-        Of the env, for everything. Where they do not suffice, the rest is left out.
+        Of the env, for everything. Where they do not suffice, the rest is left out. Ctrl-C prints
+        what has been played so far.
     progress_bar : bool, default True
         Whether to show, on stderr, what takes more than three seconds and how long.
 
@@ -340,6 +342,10 @@ class _Search:
                     f"{len(self.seeds)} episodes of the MPC."
                 ) from None
             note = f"max_steps = {self.simulator.max_steps:,} were too few to go on."
+        except KeyboardInterrupt:
+            if hasattr(self, "base"):
+                print(self.figures("Interrupted: this was played so far."), file=sys.stderr)
+            raise
         finally:
             self.simulator.close()
         return self.figures(note)

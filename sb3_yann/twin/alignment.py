@@ -466,20 +466,54 @@ def _resting(log: Logged, fit: _Effects) -> Iterator[str]:
     """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
     if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
         return
-    A = log.problem.model.A
-    names = log.names[0]
-    rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
-    x_ss = log.problem.model.x_ss
-    shown = log.problem.units.to_plant(rest)
+    model = log.problem.model
+    rest = _rest_of(log)
     away = np.abs(rest / log.unit)
-    if np.max(away) > 5:  # beyond the log: a state that hardly returns, or noise
+    if not np.max(away) <= 5:  # beyond the log: a state that hardly returns, or noise
         return
-    for i in np.flatnonzero(away > 0.5):
+    shown = log.problem.units.to_plant(rest)
+    elsewhere = [
+        f"{log.names[0][i]} = {shown[i]:.4g}, the problem's at {model.x_ss[i]:.4g}"
+        for i in np.flatnonzero(away > 0.5)
+    ]
+    if elsewhere:
+        there = ", ".join(f"{each:.5g}" for each in shown)
         yield (
-            f"With inputs at u_ss the logged plant rests at {names[i]} = {shown[i]:.4g}, the "
-            f"problem's at {x_ss[i]:.4g}: compare units and operating point of states and inputs. "
-            f"{CONFIRM}"
+            f"With inputs at u_ss the logged plant rests at {'; '.join(elsewhere)}: compare units "
+            "and operating point of states and inputs. If the plant is not linear, fit the twin of "
+            f"mpc = replace(mpc, model=replace(mpc.model, x_ss=[{there}])), with "
+            f"dataclasses.replace. {CONFIRM}"
         )
+
+
+def _rest_of(log: Logged) -> Array:
+    """Return the state (n,) at which the plant rests, or hardly moves, with u = 0.
+
+    A regression on states and inputs, and on their products where rows are enough, tells; rows
+    nearby count more.
+    """
+    row = log.row
+    unit = log.unit
+    n = unit.size
+    z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes]) / log.scale
+    y = np.concatenate([e.thetas[1:, row.state] for e in log.episodes]) / unit
+    curved = products(z)
+    F = np.column_stack([np.ones(len(z)), curved if len(z) > 5 * (curved.shape[1] + 1) else z])
+    here = np.zeros(z.shape[1])
+    spread = z.std(axis=0)
+    spread[spread == 0] = 1.0
+
+    def motion(x: Array) -> Array:
+        now = np.concatenate([x * unit / log.scale[:n], here[n:]])
+        return np.asarray(weights[0] + products(now)[: F.shape[1] - 1] @ weights[1:] - x)
+
+    x = here[:n]
+    for _ in range(5):
+        near = np.exp(-np.mean(((z - here) / spread) ** 2, axis=1) / 2)[:, None]
+        weights = np.linalg.lstsq(near * F, near * y, rcond=1e-9)[0]
+        x = least_squares(motion, x).x
+        here = np.concatenate([x * unit / log.scale[:n], here[n:]])
+    return np.asarray(unit * x)
 
 
 class _Effects(NamedTuple):
@@ -510,8 +544,7 @@ class _Effects(NamedTuple):
         z = np.concatenate([row.features(e.thetas[k], e.actions[k + shift]) for e, k in steps])
         y = np.concatenate([e.thetas[k + 1, row.state] for e, k in steps])
         x, u = np.split(z / log.scale, [-m], axis=1)
-        first, second = np.triu_indices(x.shape[1])
-        curved = np.hstack([x, x[:, first] * x[:, second]])
+        curved = products(x)
         states = curved if len(z) > 5 * (curved.shape[1] + m + 1) else x
         F = np.column_stack([u, np.ones(len(z)), states])
         if len(z) <= 5 * F.shape[1]:
@@ -531,3 +564,9 @@ class _Effects(NamedTuple):
         drift_error = np.sqrt(np.diag(covariance)) * factors[m]
         B = slopes[:m].T / size
         return cls(B, covariance, factors[:m] / size, slopes[m], drift_error, follows)
+
+
+def products(x: Array) -> Array:
+    """Return states (..., k), followed by their products of two."""
+    first, second = np.triu_indices(x.shape[-1])
+    return np.concatenate([x, x[..., first] * x[..., second]], axis=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from functools import cache, partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -124,6 +125,17 @@ def test_it_takes_no_step_more_than_it_may() -> None:
     assert found.observer_played is not None and "were too few to go on" in found.report()
     with pytest.raises(ValueError, match="max_steps = 100 are too few for 5 episodes of the MPC"):
         headroom(heater(), Counted, n_starts=5, max_steps=100)
+
+
+def test_ctrl_c_prints_what_has_been_played_so_far(capsys, monkeypatch) -> None:
+    def interrupted(search: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_yann.improvement.measuring._Search.plan", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        headroom(heater(), Heater, n_starts=3)
+    said = capsys.readouterr().err
+    assert "Verdict:" in said and "Interrupted: this was played so far." in said
 
 
 class Ending(Heater):

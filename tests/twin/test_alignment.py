@@ -1,5 +1,7 @@
 """Logs whose inputs are not those that acted: rows, columns, signs, units; and frozen sensors."""
 
+import re
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -302,3 +304,22 @@ def test_the_input_of_an_mpc_in_a_closed_loop_is_not_its_own() -> None:
     rng = np.random.default_rng(0)
     dithered = [(x, np.clip(u + rng.normal(0, 10, u.shape), -55, 55)) for x, u in reactor()]
     assert PlantTwin.fit(problems.cstr(), dithered).trust.excitation > 0.02
+
+
+def test_a_plant_that_is_not_linear_is_led_on_to_where_it_rests() -> None:
+    # A tank whose outflow goes with the root of its level, fitted far from its operating point.
+    records = []
+    for seed in range(8):
+        u = np.repeat(np.random.default_rng(seed).uniform(0.1, 1, 10), 20)[:, None]
+        x = np.ones((201, 1))
+        for k in range(200):
+            x[k + 1] = x[k] + 0.25 * u[k] - 0.15 * np.sqrt(x[k])
+        records.append((x, u))
+    states, inputs = zip(*records, strict=True)
+    bounds = {"u_min": 0.1, "u_max": 1, "x_min": 0, "x_max": 12, "horizon": 5}
+    mpc = LinearMPC(identify(states, inputs, dt=0.5, u_ss=[0.9]), Q=[[1]], R=[[1]], **bounds)
+    (said,) = PlantTwin.fit(mpc, records, residuals=["none", "quadratic"]).trust.problems
+    told = re.search(r"mpc = replace\(mpc, model=replace\(mpc\.model, x_ss=\[(.*)\]\)\)", said)
+    assert told and abs(float(told[1]) - 2.25) < 0.1  # where 0.5 u is 0.3 times the root
+    mpc = replace(mpc, model=replace(mpc.model, x_ss=[float(told[1])]))
+    assert PlantTwin.fit(mpc, records, residuals=["none", "quadratic"]).trusted
