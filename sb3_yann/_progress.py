@@ -83,7 +83,8 @@ def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None)
     """Return a bar over items, or one to ``update``; those inside each other share a line."""
     watched = is_watched()
     of_parts = _parts.get()
-    words = "  {desc}: {n_fmt}" + " of {total_fmt}" * (total is not None or isinstance(items, Sized))
+    counted = total is not None or isinstance(items, Sized)
+    words = "  {desc}: {n_fmt}" + " of {total_fmt}" * counted
     if not of_parts:
         words += ", {elapsed} so far, {remaining} left"
     return _Bar(
