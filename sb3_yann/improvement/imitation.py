@@ -32,7 +32,6 @@ HUBER = 0.1
 """Errors of an action, in half-ranges, from which they count by their size rather than its square:
 where plans go one way or the other, their mean goes nowhere. Labels on a bound lie as far beyond
 it, so that the slope does not vanish on the way."""
-VAIN_FITS = 3  # fits in a row that may bring no policy that is better by half of `NEAR`
 FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
 HARDEST = 40  # scenarios that are planned anew after a fit or a check, at most
 HEAVIEST = 8  # times that a start counts which a policy loses: twice as often after each fit
@@ -41,11 +40,14 @@ DESCENT_RATE = 5e-4  # of Adam at first; it falls to zero
 DESCENT_ROWS = 12_000  # steps of episodes whose slopes each of these follows, about
 STEEPEST = 10.0  # slopes of an episode, in times the median's, at most
 LOOK = 10  # steps of Adam after which all scenarios are played
+VAIN_LOOKS = 3  # looks in a row that may bring no better policy
 NEARLY = 0.5
 PRICE = 40.0
 """How often a start counts, at first, that costs so much of what it may cost more than with the
 MPC; twice as often after each look with an objection."""
-NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
+NEAR = 0.02
+"""Share of what plans gain that a policy may lack when its fits end; a fit that brings less than
+half of it is the last."""
 RETURNS = 1000  # states whose returns the critic is fitted to
 RETURN_STEPS = 100  # steps of a return; the MPC's value counts after them
 CRITIC_BATCH = 256  # rows in a step of Adam on the critic
@@ -225,33 +227,18 @@ def imitate(
     Then the policy plays these episodes in the model, and learns more where it does worse than
     plans or the MPC: from their starts, and from where it had got to (S. Ross, G. Gordon and D.
     Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
-    learning*, AISTATS 2011). Starts that it loses count more in the next fit. Of a fit and the
-    mean of its weights before and after, which often errs less on what both have not seen (P.
-    Izmailov and others, *Averaging weights leads to wider optima and better generalization*, UAI
-    2018), the one that costs less is played; where several members act, a policy has seen several
-    plants, and the mean was no better. The layer ends with what cost the least. Return what it
-    saves in the model: see :meth:`Teacher.saved`.
+    learning*, AISTATS 2011). Starts that it loses count more in the next fit. Then it descends the
+    costs of a simulator's model, see :func:`refine`. The layer ends with what cost the least.
+    Return what it saves in the model: see :meth:`Teacher.saved`.
     """
     most = -np.inf
     promised = 0.0
     since = 0
     best = copy.deepcopy(layer.state_dict())
     for fit in range(FITS):
-        before = copy.deepcopy(layer.network)
         teacher.teach(layer, updates)
         played = teacher.play(layer)
         score = teacher.score(played.costs)
-        fitted = copy.deepcopy(layer.state_dict())
-        if teacher.scenarios.members is None and not before.is_zero():
-            with th.no_grad():
-                for now, old in zip(layer.network.parameters(), before.parameters(), strict=True):
-                    now.lerp_(old, 0.5)
-            halfway = teacher.play(layer)
-            if teacher.score(halfway.costs) > score:
-                score = teacher.score(halfway.costs)
-                played = halfway
-            else:
-                layer.load_state_dict(fitted)
         saved = teacher.saved(played.costs, teacher.usual)
         objection = teacher.objection(played)
         say(
@@ -265,10 +252,9 @@ def imitate(
             promised = saved
             best = copy.deepcopy(layer.state_dict())
         done = teacher.saved(played.costs) >= (1 - NEAR) * teacher.saved(teacher.attainable)
-        if (done and not objection) or fit == FITS - 1 or fit - since == VAIN_FITS:
+        if (done and not objection) or fit == FITS - 1 or since < fit:
             break
         teacher.show(policy_of(layer, teacher.problem), played)
-        layer.load_state_dict(fitted)
     layer.load_state_dict(best)
     if teacher.scenarios.members is None:
         promised = refine(layer, teacher)
@@ -299,6 +285,7 @@ def refine(layer: LawLayer, teacher: Teacher) -> float:
     room = NEARLY * allowed.allowed(mpc)
     price = PRICE
     most = (False, -np.inf)
+    since = 0
     best = copy.deepcopy(layer.state_dict())
     for k in bar("the policy descends in the model: steps of Adam", range(DESCENTS + 1)):
         if k % LOOK == 0:
@@ -309,6 +296,9 @@ def refine(layer: LawLayer, teacher: Teacher) -> float:
                 most = rank
                 saved = teacher.saved(played.costs, teacher.usual)
                 best = copy.deepcopy(layer.state_dict())
+                since = k
+            if k == DESCENTS or k - since == VAIN_LOOKS * LOOK:
+                break
             if not passes:
                 price *= 2
         chosen = teacher.rng.permutation(np.flatnonzero(known))
@@ -317,6 +307,8 @@ def refine(layer: LawLayer, teacher: Teacher) -> float:
         act = policy_of(layer, problem)
         played = some.play(controller_of(act))
         finite = np.flatnonzero(np.isfinite(played.costs))
+        if not len(finite):
+            break
         played = played.of(finite)
         slopes = slopes_of_inputs(
             some.of(finite).plant, teacher.task, act, played.rows, played.inputs
@@ -329,7 +321,7 @@ def refine(layer: LawLayer, teacher: Teacher) -> float:
             th.as_tensor(each.reshape(-1, each.shape[-1]))
             for each in (played.thetas[:-1], slopes / len(chosen))
         )
-        optimizer.param_groups[0]["lr"] = DESCENT_RATE * (1 - k / (DESCENTS + 1))
+        optimizer.param_groups[0]["lr"] = DESCENT_RATE * (1 - k / DESCENTS)
         optimizer.zero_grad()
         loss = th.sum(layer(at) * down.float())
         loss.backward()  # type: ignore[no-untyped-call]
