@@ -86,7 +86,7 @@ def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None)
     counted = total is not None or isinstance(items, Sized)
     words = "  {desc}: {n_fmt}" + " of {total_fmt}" * counted
     if not of_parts:
-        words += ", {elapsed} so far, {remaining} left"
+        words += ", {elapsed} so far" + ", {remaining} left" * counted
     return _Bar(
         items,
         desc=what,

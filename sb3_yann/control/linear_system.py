@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_yann._validation import Array, ReadOnlyArrays, is_text
+from sb3_yann.control.gains import Gains
 
 LARGEST_EXPONENT = 709.0
 """Beyond it the exponential function exceeds what numbers hold."""
@@ -30,7 +31,7 @@ class LinearSystem(ReadOnlyArrays):
     d_ss: Array
     notes: tuple[str, ...] = ()
     drift: Array | None = None
-    gain_errors: Array | None = None
+    gains: Gains | None = None
     state_names: tuple[str, ...] = ()
     input_names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()

@@ -22,7 +22,7 @@ from sb3_yann.control.identification.dead_time import (
 from sb3_yann.control.identification.least_squares import (
     EXTRAPOLATED,
     Regression,
-    gain_errors,
+    gains_of,
     operating_point,
     regress,
     regularized,
@@ -122,7 +122,7 @@ def system_of(
     if away.size:
         notes.append(f"x_ss[{away[0]}] lies far outside the data: the model is extrapolated.")
     return LinearSystem(
-        A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None, gain_errors(found, n, m)
+        A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None, gains_of(found, n, m)
     )
 
 

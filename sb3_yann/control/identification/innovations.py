@@ -19,6 +19,7 @@ from scipy import linalg
 from scipy.special import chdtrc
 
 from sb3_yann._validation import Array
+from sb3_yann.control.gains import count_integrators, responses
 from sb3_yann.control.identification.least_squares import Regression, regress
 from sb3_yann.control.lqr import spectral_radius
 from sb3_yann.log import Episode
@@ -447,12 +448,12 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
     return model
 
 
-def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, Array]:
-    """Return the poles (n,), largest first, their standard errors, and those of the gains (q, k).
+def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, int, Array]:
+    """Return poles (n,), largest first, their errors, integrators, errors of responses (3, q, k).
 
     To first order, by the inverse of the normal equations (Ljung, *System Identification*, section
     9.4). What only changes the states' coordinates has no effect on either. Where errors of the
-    states do not decay, those of poles are inf, and those of gains 0.
+    states do not decay, those of poles are inf, and those of `responses` 0.
     """
     with np.errstate(all="ignore"):
         matrix, side = chunks.gauss_newton(model)
@@ -461,23 +462,28 @@ def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, Array]:
     inverse = np.full(matrix.shape, np.nan)
     if np.all(np.isfinite(matrix)):
         inverse = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    steps = 1e-3 * np.eye(len(side))
+    sides = [[moved_by(model, each / scale) for each in (step, -step)] for step in steps]
+    dA = np.array([up.A - down.A for up, down in sides]) / 2e-3
+
+    def deviation(slopes: Array) -> Array:
+        return np.sqrt(np.abs(np.einsum("p...,pq,q...->...", np.conj(slopes), inverse, slopes)))
+
+    def told(moved: Innovations) -> Array:
+        return moved.C @ responses(moved.A, moved.B, count)
+
     values, left, right = linalg.eig(model.A, left=True, right=True)
     overlap = np.sum(left.conj() * right, axis=0)
-
-    def told(step: Array) -> Array:
-        moved = moved_by(model, step / scale)
-        by_pole = np.sum(left.conj() * ((moved.A - model.A) @ right), axis=0)
-        settle = np.linalg.pinv(np.eye(model.order) - moved.A)
-        return np.concatenate([by_pole, (moved.C @ settle @ moved.B).ravel()])
-
     with np.errstate(all="ignore"):
-        slopes = [(told(each) - told(-each)) / 2e-3 for each in 1e-3 * np.eye(len(side))]
-        found = np.sqrt(np.abs(np.einsum("pf,pq,qf->f", np.conj(slopes), inverse, slopes)))
-    of_poles, of_gains = np.split(found, [model.order])
-    of_poles = np.nan_to_num(of_poles / np.maximum(np.abs(overlap), 1e-300), nan=np.inf)
-    of_gains = np.nan_to_num(of_gains, posinf=0.0).reshape(len(model.C), -1)
+        by_pole = np.einsum("nf,pnm,mf->pf", left.conj(), dA, right)
+        of_poles = deviation(by_pole) / np.maximum(np.abs(overlap), 1e-300)
+        count = count_integrators(
+            model.A, lambda R: float(np.nan_to_num(deviation(np.einsum("ij,pji->p", R, dA))))
+        )
+        errors = deviation(np.array([told(up) - told(down) for up, down in sides]) / 2e-3)
+    of_poles = np.nan_to_num(of_poles, nan=np.inf)
     order = np.argsort(-np.abs(values), kind="stable")
-    return values[order], of_poles[order], of_gains
+    return values[order], of_poles[order], count, np.nan_to_num(errors, posinf=0.0)
 
 
 def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Array, Array]) -> Array:

@@ -10,6 +10,14 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
+from sb3_yann.control.gains import (
+    NORMAL,
+    SURE_ERRORS,
+    WIDE,
+    Gains,
+    count_integrators,
+    response_terms,
+)
 from sb3_yann.control.linear_system import combination, names
 from sb3_yann.log import Episode, split_episodes
 from sb3_yann.units import FLOAT32_ROUNDING
@@ -184,10 +192,6 @@ def _free_run(found: Regression, episodes: list[Episode]) -> float:
     return float(np.sqrt(total / max(count, 1)))
 
 
-WIDE = 0.5  # half-width from which an interval says only that the pole is not known
-NORMAL = 1.96  # standard deviations on either side that hold 95 %
-
-
 def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
     """Return the poles (n,), largest first, and their standard errors, inf of repeated poles.
 
@@ -204,19 +208,27 @@ def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
     return values[order], errors[order]
 
 
-def gain_errors(found: Regression, n: int, m: int) -> Array | None:
-    """Return standard errors (n, m) of the steady gains G, None where an integrator has none.
-
-    To first order ``dG = (I - A)^-1 (dA G + dB)``, the delta method.
-    """
-    try:
-        settle = np.linalg.inv(np.eye(n) - found.coefficients[:, :n])
-    except np.linalg.LinAlgError:
-        return None
-    moved = np.vstack([settle @ found.coefficients[:, n : n + m], np.eye(m)])
+def gains_of(found: Regression, n: int, m: int) -> Gains:
+    """Return what m held inputs do to n states in the end, with errors by the delta method."""
+    A, B = np.split(found.coefficients[:, : n + m], [n], axis=1)
     part = found.correlation[: n + m, : n + m]
-    rows = np.sum((settle @ found.covariance) * settle, axis=1)
-    return np.asarray(np.sqrt(np.abs(np.outer(rows, np.sum(moved * (part @ moved), axis=0)))))
+
+    def deviation(R: Array) -> float:
+        return float(np.sqrt(max(np.trace(R @ found.covariance @ R.T @ part[:n, :n]), 0.0)))
+
+    count = count_integrators(A, deviation)
+    errors = []
+    for terms in response_terms(A, B, count):
+        pairs = [
+            np.outer(
+                np.sum((left @ found.covariance) * other, axis=1),
+                np.sum(right * (part @ by), axis=0),
+            )
+            for left, right in terms
+            for other, by in terms
+        ]
+        errors.append(np.sqrt(np.abs(np.sum(pairs, axis=0))))
+    return Gains.of(A, B, count, errors)
 
 
 def pole_note(values: Array, errors: Array, noise: str = "process noise") -> str:
@@ -241,9 +253,6 @@ def pole_note(values: Array, errors: Array, noise: str = "process noise") -> str
 
 
 EXTRAPOLATED = 5.0  # spreads from the mean of the data beyond which a model is extrapolated
-SURE_ERRORS = 5.0
-"""Standard errors above which a direction does not integrate: those of an integrator are not normal
-(Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
 
 
 def operating_point(

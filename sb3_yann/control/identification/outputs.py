@@ -58,7 +58,9 @@ class Structure:
     idle: tuple[int, ...] = ()  # inputs and disturbances without effect beyond chance
     feedback: tuple[tuple[int, float], ...] = ()  # inputs that follow outputs; what does not
     curvature: Array = field(default_factory=lambda: np.zeros(0))  # (q,), share of the errors
-    poles: tuple[Array, Array, Array] = (np.zeros(0),) * 3  # with errors, also of gains (q, k)
+    poles: tuple[Array, Array] = (np.zeros(0),) * 2  # with errors
+    integrators: int = 0
+    gain_errors: Array = field(default_factory=lambda: np.zeros((3, 0, 0)))  # (3, q, k)
 
     @property
     def error(self) -> float:
@@ -96,6 +98,7 @@ def fit_structure(
         whole = Search(episodes, read, [], found.delays, tries)
         final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
     past = whole.past
+    *poles, integrators, gain_errors = errors_of(final.model, whole.chunks)
     return replace(
         found,
         model=final.model,
@@ -103,7 +106,9 @@ def fit_structure(
         idle=tuple(past.idle()),
         feedback=tuple(_feedback(episodes)),
         curvature=curvature_test(past.arx, past.rows)[0],
-        poles=errors_of(final.model, whole.chunks),
+        poles=(poles[0], poles[1]),
+        integrators=integrators,
+        gain_errors=gain_errors,
     )
 
 

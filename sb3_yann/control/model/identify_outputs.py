@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 
 from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_range
+from sb3_yann.control.gains import Gains
 from sb3_yann.control.identification.dead_time import (
     as_delays,
     exact_memory,
@@ -261,9 +262,9 @@ def identify_outputs(
     system = system_of(step, (n, m, d), (None, None, None), log.dt, [0] * m)
     drift = step.predict(np.concatenate([system.x_ss, system.u_ss, system.d_ss])[None])[0]
     A, B, E, C, K = _with_memory(model, m, found.delays)
-    of_gains = np.zeros(B.shape)
+    errors = np.zeros((3, *B.shape))
     if np.array_equal(model.C, np.eye(q, n)):  # the first states are the outputs
-        of_gains[:q] = found.poles[2][:, :m] * scale[:q, None] / scale[q : q + m]
+        errors[:, :q] = found.gain_errors[..., :m] * scale[:q, None] / scale[q : q + m]
     whole = LinearModel(
         A,
         B,
@@ -273,7 +274,7 @@ def identify_outputs(
         E if d else None,
         system.d_ss if d else None,
         notes=[*system.notes, *_notes(log, found, plain, step, model.noise), *_rates(log, every)],
-        gain_errors=of_gains,
+        gains=Gains.of(A, B, found.integrators, errors),
         state_names=_state_names(log, model, found.delays),
         input_names=log.input_names,
         units=dict(zip(log.input_names, log.units[q : q + m], strict=True)) if log.units else (),
@@ -435,4 +436,4 @@ def _notes(
         )
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
-    return [*notes, pole_note(*found.poles[:2], "process and sensor noise")]
+    return [*notes, pole_note(*found.poles, "process and sensor noise")]

@@ -17,6 +17,7 @@ from sb3_yann._validation import (
     check_vector,
     to_float,
 )
+from sb3_yann.control.gains import Gains
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.linear_system import (
     LinearSystem,
@@ -60,8 +61,9 @@ class LinearModel(LinearSystem):
     drift : array_like, shape (n,), optional
         Measured motion in one sample at the operating point, which the model leaves out. Zeros
         where it is within its uncertainty. Ignored and dropped as the notes are.
-    gain_errors : array_like, shape (n, m), optional
-        Standard errors of the steady gains, for the report. Ignored and dropped as the notes are.
+    gains : Gains, optional
+        What held inputs do in the end, with errors, for the report. Ignored and dropped as the
+        notes are.
     state_names, input_names : sequence of str, optional
         Names for reports, n and m of them. Equality ignores them.
     units : mapping from name to str, or sequence of n + m str, optional
@@ -84,7 +86,7 @@ class LinearModel(LinearSystem):
 
     notes: tuple[str, ...] = field(init=False, repr=False, compare=False)
     drift: Array = field(init=False, repr=False, compare=False)
-    gain_errors: Array | None = field(init=False, repr=False, compare=False)
+    gains: Gains | None = field(init=False, repr=False, compare=False)
     state_names: tuple[str, ...] = field(default=(), compare=False)
     input_names: tuple[str, ...] = field(default=(), compare=False)
     units: tuple[str, ...] = field(default=(), compare=False)
@@ -104,7 +106,7 @@ class LinearModel(LinearSystem):
         *,
         notes: Sequence[str] = (),
         drift: ArrayLike | None = None,
-        gain_errors: ArrayLike | None = None,
+        gains: Gains | None = None,
         state_names: Sequence[str] = (),
         input_names: Sequence[str] = (),
         units: Units = (),
@@ -126,8 +128,8 @@ class LinearModel(LinearSystem):
         u = check_vector("u_ss", u_ss, B.shape[1])
         d = check_vector("d_ss", d_ss, E.shape[1])
         moved = check_vector("drift", drift, n)
-        if gain_errors is not None:
-            gain_errors = check_array("gain_errors", gain_errors, B.shape)
+        if gains is not None:
+            check_array("gains.values", gains.values, B.shape)
         named = (
             as_names("state_names", state_names, n),
             as_names("input_names", input_names, u.size),
@@ -148,7 +150,7 @@ class LinearModel(LinearSystem):
             d,
             notes=tuple(notes),
             drift=moved,
-            gain_errors=gain_errors,
+            gains=gains,
             state_names=named[0],
             input_names=named[1],
             units=kept,

@@ -6,10 +6,10 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.identification.least_squares import NORMAL
+from sb3_yann.control.gains import NORMAL, ON_CIRCLE, SURE_ERRORS, Gains, count_integrators
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
-ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
+MAY_INTEGRATE = f"may integrate: it is 1 within {SURE_ERRORS:g} standard errors"
 UNREACHED = 1e-6
 SAME_SCALE = 2.0  # factor of balancing up to which states are of one size
 HARDLY_REACHED = 1e-3
@@ -25,9 +25,13 @@ FAST_SAMPLING = 50.0
 
 def describe(model: LinearSystem) -> str:
     """Return the report of `LinearModel.report`."""
-    modes = [f"  {_number(pole)}: {_mode(pole, model)}" for pole in poles(model)]
-    lines = [*_head(model), "Poles:", *modes, _stability(model)]
-    lines += [*_reach(model), *_scaling(model), *_sampling(model)]
+    others = _beside(model, model.gains)
+    modes = [
+        f"  {_number(pole)}: " + (_mode(pole, model) if np.any(pole == others) else MAY_INTEGRATE)
+        for pole in poles(model)
+    ]
+    lines = [*_head(model), "Poles:", *modes, _stability(model, others)]
+    lines += [*_reach(model), *_scaling(model), *_gains(model), *_sampling(model)]
     return "\n".join([*lines, *(f"Note: {note}" for note in model.notes)])
 
 
@@ -84,12 +88,15 @@ def _mode(pole: complex, model: LinearSystem) -> str:
     return words
 
 
-def _stability(model: LinearSystem) -> str:
-    sizes = np.abs(np.linalg.eigvals(model.A))
+def _stability(model: LinearSystem, others: Array) -> str:
+    """Return whether the plant is stable; ``others`` are the poles beside those of integrators."""
+    sizes = np.abs(others)
     growing = int(np.sum(sizes > 1 + ON_CIRCLE))
-    largest = f"the largest magnitude of a pole is {np.max(sizes):.6g}"
+    largest = f"the largest magnitude of a pole is {np.max(sizes, initial=0.0):.6g}"
     if growing:
-        return f"Unstable: {growing} of {sizes.size} poles grow, {largest}."
+        return f"Unstable: {growing} of {model.n_states} poles grow, {largest}."
+    if sizes.size < model.n_states:
+        return "On the border of stability, as far as the log shows: it may integrate."
     if np.max(sizes) >= 1 - ON_CIRCLE:
         return f"On the border of stability: some modes do not decay, {largest}."
     return f"Stable: {largest}."
@@ -139,7 +146,7 @@ def _reach(model: LinearSystem) -> list[str]:
 
 
 def _scaling(model: LinearSystem) -> list[str]:
-    """Return the lines on scaling and steady-state gains."""
+    """Return the line on scaling."""
     _, (factors, _) = linalg.matrix_balance(model.A, permute=False, separate=True)
     spread = np.max(factors) / np.min(factors)
     sizes = np.abs(model.B)
@@ -152,31 +159,57 @@ def _scaling(model: LinearSystem) -> list[str]:
             f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}"
             f"{balance if spread > SAME_SCALE else ''}.{advice}"
         )
-    if np.min(np.abs(np.linalg.eigvals(model.A) - 1)) > ON_CIRCLE:
-        gain = np.linalg.solve(np.eye(model.n_states) - model.A, model.B)
-        width = NORMAL * (0 * gain if model.gain_errors is None else model.gain_errors)
-        rounding = 1e-9 * np.max(np.abs(gain))
-        gain, width = (np.where(np.abs(each) < rounding, 0.0, each) for each in (gain, width))
-        # An unstable plant has this steady state but does not approach it.
-        stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
-        verb = "moves the state to" if stable else "would balance the state at"
-        held = "Held at 1"
-        away = ""
-        if np.any(model.x_ss) or np.any(model.u_ss):  # what follows are deviations
-            held = "Held at u_ss + 1"
-            away = "x_ss + "
-        states, inputs = labels_of(model)
-        lines += [
-            f"  {held}, {name} {verb} {away}{_vector(*of)}."
-            for name, *of in zip(inputs, gain.T, width.T, strict=True)
-        ]
-        if np.any(width):
-            lost = np.argwhere((np.abs(gain) <= width) & (width > 0))
-            none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in lost)
-            unsure = f" Not distinguishable from zero: {none}." if none else ""
-            noise = "process noise" if model.C is None else "process and sensor noise"
-            lines.append(f"  ± is a 95 % interval, under {noise}.{unsure}")
     return lines
+
+
+def _gains(model: LinearSystem) -> list[str]:
+    """Return the lines on what held inputs do in the end."""
+    gains = model.gains
+    if gains is None:
+        gains = Gains.of(model.A, model.B, count_integrators(model.A))
+    known = np.any(gains.errors, axis=1)
+    rows = np.flatnonzero(known if np.any(known) else np.ones_like(known))
+    rounding = 1e-9 * np.max(np.abs(gains.values))
+    values, width = (
+        np.where(np.abs(each) < rounding, 0.0, each)
+        for each in (gains.values, NORMAL * gains.errors)
+    )
+    states, inputs = labels_of(model)
+    units = model.units or ("",) * (len(states) + len(inputs))
+    pace, time = (model.dt, model.time_unit) if model.time_unit else (1.0, "sample")
+    rates = "", f" per {time}", f" per {time}²"
+
+    def effect(i: int, j: int) -> str:
+        degree = gains.degrees[i, j]
+        value, doubt = (each[i, j] / pace**degree for each in (values, width))
+        size = f"{value:+.4g}" if value else "0"
+        size += f" ± {doubt:.2g}" * bool(doubt)
+        return f"{states[i]} {size} {units[i]}".rstrip() + rates[degree]
+
+    # An unstable plant has this steady state but does not approach it.
+    stable = np.all(np.abs(_beside(model, gains)) < 1 - ON_CIRCLE)
+    verb = "does in the end" if stable else "would balance"
+    lines = [f"What one unit more of an input, held, {verb}:"]
+    for j, name in enumerate(with_units(model)[1]):
+        lines.append(f"  {name}: {', '.join(effect(i, j) for i in rows)}.")
+    if np.any(gains.degrees):
+        lines.append(
+            f"  What integrates moves on, by so much per {time}: it has no steady-state gain."
+        )
+    if np.any(width):
+        unsure = np.argwhere((np.abs(values) <= width) & (width > 0))
+        none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in unsure)
+        noise = "process noise" if model.C is None else "process and sensor noise"
+        text = f" Not distinguishable from zero: {none}." if none else ""
+        lines.append(f"  ± is a 95 % interval, under {noise}.{text}")
+    return lines
+
+
+def _beside(model: LinearSystem, gains: Gains | None) -> Array:
+    """Return the poles beside those that integrate, as far as a log shows."""
+    values = np.linalg.eigvals(model.A)
+    count = gains.integrators if gains is not None else 0
+    return np.asarray(values[np.argsort(np.abs(values - 1), kind="stable")][count:])
 
 
 def _sampling(model: LinearSystem) -> list[str]:

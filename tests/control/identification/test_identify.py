@@ -10,7 +10,10 @@ from scipy import stats
 from errors import Message, raises
 from sample_plants import played
 from sb3_yann import Identified, LinearModel, LinearMPC, Tracking, identify
+from sb3_yann.control.gains import Gains, responses
 from sb3_yann.control.identification.fit import fit_log
+from sb3_yann.control.identification.least_squares import gains_of, regress
+from sb3_yann.log import Episode
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
@@ -62,11 +65,41 @@ def test_steady_gains_have_errors_and_one_that_may_be_zero_is_named() -> None:
     G = np.linalg.solve(np.eye(2) - A, B)
     draws = [identify(*record(i, process=0.02)[:2], dt=1, held_out=0).model for i in range(200)]
     off = [np.linalg.solve(np.eye(2) - each.A, each.B) - G for each in draws]
-    share = np.mean(np.abs(off) <= 1.96 * np.array([each.gain_errors for each in draws]), axis=0)
+    share = np.mean(np.abs(off) <= 1.96 * np.array([each.gains.errors for each in draws]), axis=0)
     assert np.all(np.abs(share - 0.95) < 0.062), share
-    told = LinearModel(A, B, dt=1, gain_errors=[[5.0], [0.1]]).report()
-    assert f"({G[0, 0]:.4g} ± 9.8, {G[1, 0]:.4g} ± 0.2)." in told
+    known = Gains.of(A, B, 0, [np.array([[5.0], [0.1]])] * 3)
+    told = LinearModel(A, B, dt=1, gains=known).report()
+    assert f"x[0] {G[0, 0]:+.4g} ± 9.8, x[1] {G[1, 0]:+.4g} ± 0.2." in told
     assert "Not distinguishable from zero: u[0] on x[0]." in told
+
+
+INTEGRATING = {
+    "a level beside a lag": ([[1, 0], [0, 0.8]], [[0.05, -0.05], [0, 0.3]]),
+    "a level behind a lag": ([[1, 0.02], [0, 0.8]], [[0.05, -0.04], [0.3, 0]]),
+    "two in a row": ([[1, 0.1], [0, 1]], [[0.005], [0.1]]),
+    "a slow lag": ([[0.998]], [[0.02, -0.01]]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.003, 0.03])
+@pytest.mark.parametrize("plant", INTEGRATING)
+def test_rates_of_what_integrates_have_intervals_that_hold(plant: str, noise: float) -> None:
+    A, B = (np.array(each, float) for each in INTEGRATING[plant])
+    n, m = B.shape
+    integrators = int(np.sum(np.linalg.eigvals(A) > 0.99))
+    inside = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.uniform(-1, 1, (50, m)), 8, axis=0)
+        x = played(lambda x, u, r=rng: A @ x + B @ u + noise * r.normal(size=n), u, np.zeros(n))
+        gains = gains_of(regress([Episode(x, u, np.zeros((400, 0)))], (n, m, 0), None, 0.0), n, m)
+        if gains.integrators < integrators and plant == "a slow lag":
+            continue  # its gain is told, as of another lag
+        assert gains.integrators == integrators
+        true = np.take_along_axis(responses(A, B, integrators), gains.degrees[None], 0)[0]
+        inside.append(np.abs(gains.values - true) <= 1.96 * gains.errors)
+    assert len(inside) > 30 and np.mean(inside) > 0.9
 
 
 @pytest.mark.slow

@@ -261,9 +261,18 @@ def test_intervals_of_poles_and_gains_hold_the_truth_nearly_as_often_as_they_say
     for seed in range(20):
         u = steps(600, 2, seed)
         found = identify_outputs(played(u, **plant, C=C, seed=seed), u, dt=1, order=2)
-        told = found.model.gain_errors
-        assert told is not None and not told[1:].any()  # only the first state is an output
-        off = np.linalg.solve(np.eye(2) - found.model.A, found.model.B)[:1] - gains
-        inside.append(np.abs(off) <= 1.96 * told[:1])
+        told = found.model.gains
+        assert told is not None and not told.errors[1:].any()  # only the first state is an output
+        inside.append(np.abs(told.values[:1] - gains) <= 1.96 * told.errors[:1])
     assert np.mean(inside) > 0.85
     assert "± is a 95 % interval, under process and sensor noise." in found.report()
+
+
+def test_an_output_that_integrates_has_a_rate_and_no_gain() -> None:
+    tank = {"A": np.array([[1.0]]), "B": np.array([[0.05, -0.05]]), "C": np.array([[1.0]])}
+    u = steps(600, 2, 0, hold=8)
+    found = identify_outputs(played(u, **tank, seed=0, noise=0.02), u, dt=2, order=1, delay=0)
+    gains = found.model.gains
+    assert gains is not None and gains.integrators == 1 and np.all(gains.degrees == 1)
+    assert np.all(np.abs(gains.values - tank["B"]) <= 1.96 * gains.errors)
+    assert "may integrate" in found.report() and "per sample" in found.report()

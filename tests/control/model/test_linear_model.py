@@ -175,7 +175,7 @@ def test_names_and_units_are_shown() -> None:
     model = LinearModel(A, B, dt=1.0, **NAMES)
     report = model.report()
     assert "States: level (cm), T.top. Inputs: pump (V)." in report
-    assert "Held at 1, pump moves the state to" in report
+    assert "  pump (V): level +12.5 cm, T.top +2.5.\n" in report
     assert repr(model).startswith("LinearModel(states=['level (cm)', 'T.top'], inputs=['pump (V)']")
     assert "x_ss=[0.0, 0.0]" in repr(model)
     assert model.units == ("cm", "", "V")
@@ -219,11 +219,11 @@ def test_bad_names_are_named(changes: Any, message: Message) -> None:
         LinearModel(A, B, dt=1.0, **changes)
 
 
-def test_deviations_in_the_report_say_that_they_are() -> None:
-    """A gain is no state: one unit more than u_ss moves the state from x_ss."""
+def test_a_gain_in_the_report_says_that_it_is_a_change() -> None:
     model = LinearModel(A, B, dt=1.0, x_ss=[12, 350], u_ss=[3], **NAMES)
     assert "Scaling: entries of B from 0.5 to 1.\n" in model.report()  # nothing to balance
-    assert "Held at u_ss + 1, pump moves the state to x_ss + (12.5, 2.5)." in model.report()
+    assert "What one unit more of an input, held, does in the end:\n" in model.report()
+    assert "  pump (V): level +12.5 cm, T.top +2.5.\n" in model.report()
 
 
 @pytest.mark.parametrize(

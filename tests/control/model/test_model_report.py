@@ -89,7 +89,23 @@ def test_the_gain_of_an_input_is_that_of_a_long_run() -> None:
     x = np.zeros(2)
     for _ in range(1000):
         x = model.step(x, [1.0])
-    assert f"u[0] moves the state to ({x[0]:.4g}, {x[1]:.4g})" in model.report()
+    assert f"  u[0]: x[0] {x[0]:+.4g}, x[1] {x[1]:+.4g}." in model.report()
+
+
+def test_what_integrates_has_a_rate_in_its_own_units_and_no_gain() -> None:
+    cart = LinearModel(
+        [[1, 0.1], [0, 1]],
+        [[0.005], [0.1]],
+        0.1,
+        time_unit="s",
+        state_names=["position", "speed"],
+        input_names=["force"],
+        units=["m", "m/s", "N"],
+    )
+    assert "  force (N): position +1 m per s², speed +1 m/s per s.\n" in cart.report()
+    tank = LinearModel([[1, 0], [0.2, 0.5]], [[0.3, 0], [0, 1]], 1)
+    assert "  u[0]: x[0] +0.3 per sample, x[1] +0.12 per sample.\n" in tank.report()
+    assert "  u[1]: x[0] 0, x[1] +2.\n" in tank.report()
 
 
 def test_units_far_apart_are_reported() -> None:

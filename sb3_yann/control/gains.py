@@ -1,0 +1,125 @@
+"""What a held input does to the states in the end: gains, or slopes where a pole is 1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from sb3_yann._validation import Array, ReadOnlyArrays
+
+NORMAL = 1.96  # standard deviations on either side that hold 95 %
+WIDE = 0.5  # half-width from which an interval says only that the pole is not known
+ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
+SURE_ERRORS = 5.0
+"""Standard errors from 1 beyond which a pole does not integrate: those of an integrator are not
+normal (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74), nor are gains of a pole nearby."""
+FOLLOWS = 3.0  # standard errors from which a state is said to go on and on
+ROUNDING = 1e-7  # of a slope, relative to its parts
+
+
+@dataclass(frozen=True, eq=False)
+class Gains(ReadOnlyArrays):
+    """What states do in the end while one input is held at one unit more than at rest.
+
+    Attributes
+    ----------
+    values, errors : ndarray, shapes (n, m)
+        With their standard errors, zeros where nothing is known.
+    degrees : ndarray of int, shape (n, m)
+        0: the value is a steady-state gain. 1: the state integrates, by so much in a sample.
+        2: what it moves in a sample grows by so much in each.
+    integrators : int
+        Poles that are 1, or cannot surely be told from it: those nearest to 1.
+    """
+
+    values: Array
+    errors: Array
+    degrees: NDArray[np.int64]
+    integrators: int
+
+    @classmethod
+    def of(
+        cls, A: Array, B: Array, integrators: int, errors: Sequence[Array] | None = None
+    ) -> Gains:
+        """Return the gains of a model of so many integrators; ``errors`` are of `responses`."""
+        found = responses(A, B, integrators)
+        found[2] *= integrators > 1
+        widths = np.zeros(found.shape) if errors is None else np.array(errors)
+        P = np.abs(projector(A, integrators))
+        parts = np.abs(found[1:]) - ROUNDING * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
+        moves_on, speeds_up = parts > FOLLOWS * widths[1:]
+        # What one input moves on and on, another may move on too: its interval tells.
+        moves_on |= np.any(moves_on | speeds_up, axis=1, keepdims=True) & (widths[1] > 0)
+        degrees = np.where(speeds_up, 2, moves_on.astype(int))
+        pick = np.expand_dims(degrees, 0)
+        values, own = (np.take_along_axis(each, pick, 0)[0] for each in (found, widths))
+        return cls(values, own, degrees, integrators)
+
+
+def projector(A: Array, integrators: int) -> Array:
+    """Return the spectral projector (n, n) of so many poles, those nearest to 1."""
+    n = len(A)
+    if not integrators:
+        return np.zeros((n, n))
+    away = np.sort(np.abs(np.linalg.eigvals(A) - 1))
+    end = np.inf if integrators == n else (away[integrators - 1] + away[integrators]) / 2
+
+    def near(pole: complex) -> bool:
+        return bool(abs(pole - 1) < end)
+
+    right, left = (linalg.schur(each, "complex", sort=near)[1] for each in (A, A.T))
+    right, left = right[:, :integrators], left[:, :integrators]
+    return np.real(right @ np.linalg.solve(left.conj().T @ right, left.conj().T))
+
+
+def settled(A: Array, P: Array) -> Array:
+    """Return the inverse of ``I - A`` beside a spectral projector, on which it is zero."""
+    one = np.eye(len(A))
+    return np.asarray(np.linalg.solve(one - A + P, one - P))
+
+
+def responses(A: Array, B: Array, integrators: int) -> Array:
+    """Return steady-state gains without integrators, their slopes, and their growth, (3, n, m)."""
+    P = projector(A, integrators)
+    return np.array([settled(A, P) @ B, P @ B, (A @ P - P) @ B])
+
+
+def response_terms(A: Array, B: Array, integrators: int) -> list[list[tuple[Array, Array]]]:
+    """Return what changes the `responses` to first order: sums of ``left @ [dA dB] @ right``."""
+    P = projector(A, integrators)
+    R = settled(A, P)
+    N = A @ P - P
+    still = np.zeros((B.shape[1], B.shape[1]))
+    one = np.eye(B.shape[1])
+
+    def term(left: Array, by_A: Array, by_B: Array = still) -> tuple[Array, Array]:
+        return left, np.vstack([by_A, by_B])
+
+    gain = [term(R, R @ B, one), term(-R @ R, P @ B), term(-P, R @ R @ B)]
+    slope = [term(P, R @ B, one), term(R, P @ B), term(-N, R @ R @ B), term(-R @ R, N @ B)]
+    growth = [term(np.eye(len(A)), P @ B), *((A @ left - left, right) for left, right in slope)]
+    return [gain, slope, growth]
+
+
+def count_integrators(A: Array, deviation: Callable[[Array], float] = lambda R: 0.0) -> int:
+    """Return how many poles are 1, or cannot surely be told from it.
+
+    ``deviation(R)`` is the standard deviation of ``trace(R dA)``. With the inverse R of ``I - A``
+    that is the relative one of ``det(I - A)``: poles that repeat do not spoil it.
+    """
+    values = np.linalg.eigvals(A)
+    values = values[np.argsort(np.abs(values - 1), kind="stable")]
+    near = int(np.sum(np.abs(values - 1) < WIDE))
+    known = projector(A, near)
+    count = 0
+    while count < near:
+        if abs(values[count] - 1) > ON_CIRCLE:
+            R = settled(A, projector(A, count)) @ known
+            if not deviation(R) * SURE_ERRORS > 1:
+                break
+        count += 2 if values[count].imag else 1
+    return count
