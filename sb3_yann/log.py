@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -124,6 +125,17 @@ class Log:
         """The numbers n, m and d of states, inputs and disturbances."""
         first = self.episodes[0]
         return first.states.shape[1], first.inputs.shape[1], first.disturbances.shape[1]
+
+    def in_names(self, text: str) -> str:
+        """Return a text with the log's names in place of ``x[0]``, ``y[0]``, ``u[0]``, ``d[0]``."""
+        states, inputs, disturbances = self.state_names, self.input_names, self.disturbance_names
+        of = {"x": states, "y": states, "u": inputs, "d": disturbances}
+
+        def name(found: re.Match[str]) -> str:
+            number = int(found[2])
+            return of[found[1]][number] if number < len(of[found[1]]) else found[0]
+
+        return re.sub(r"\b([xyud])\[(\d+)\]", name, text)
 
     @property
     def every(self) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,13 +42,11 @@ class Gains(ReadOnlyArrays):
     integrators: int
 
     @classmethod
-    def of(
-        cls, A: Array, B: Array, integrators: int, errors: Sequence[Array] | None = None
-    ) -> Gains:
+    def of(cls, A: Array, B: Array, integrators: int, errors: Iterable[Array] = ()) -> Gains:
         """Return the gains of a model of so many integrators; ``errors`` are of `responses`."""
         found = responses(A, B, integrators)
         found[2] *= integrators > 1
-        widths = np.zeros(found.shape) if errors is None else np.array(errors)
+        widths = np.array([*errors] or np.zeros(found.shape))
         P = np.abs(projector(A, integrators))
         parts = np.abs(found[1:]) - ROUNDING * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
         moves_on, speeds_up = parts > FOLLOWS * widths[1:]

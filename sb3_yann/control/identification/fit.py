@@ -82,12 +82,13 @@ def fit_log(
     system = replace(_with_exact_memory(system, delays, sizes[0]), time_unit=log.time_unit)
     late = [] if any(delays) else input_notes(found, episodes, sizes)
     if late:
-        warn(" ".join(late))
+        warn(log.in_names(" ".join(late)))
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
     notes = [*system.notes, *_memory_notes(delays, sizes, system.u_ss), *quality, *shrunk, *late]
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
-    return LogFit(replace(system, notes=tuple(notes)), found, fits, tuple(delays))
+    system = replace(system, notes=tuple(map(log.in_names, notes)))
+    return LogFit(system, found, fits, tuple(delays))
 
 
 def require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> None:

@@ -467,10 +467,11 @@ def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, int, Ar
     dA = np.array([up.A - down.A for up, down in sides]) / 2e-3
 
     def deviation(slopes: Array) -> Array:
-        return np.sqrt(np.abs(np.einsum("p...,pq,q...->...", np.conj(slopes), inverse, slopes)))
+        square = np.einsum("p...,pq,q...->...", np.conj(slopes), inverse, slopes)
+        return np.asarray(np.sqrt(np.abs(square)))
 
     def told(moved: Innovations) -> Array:
-        return moved.C @ responses(moved.A, moved.B, count)
+        return np.asarray(moved.C @ responses(moved.A, moved.B, count))
 
     values, left, right = linalg.eig(model.A, left=True, right=True)
     overlap = np.sum(left.conj() * right, axis=0)

@@ -153,16 +153,19 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
         raise TypeError("identify takes a Log, or states and actions with dt=.")
     else:
         log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
-    found = fit_log(
-        log,
-        x_ss=x_ss,
-        u_ss=u_ss,
-        d_ss=d_ss,
-        offset=offset,
-        ridge=ridge,
-        held_out=held_out,
-        delay=delay,
-    )
+    try:
+        found = fit_log(
+            log,
+            x_ss=x_ss,
+            u_ss=u_ss,
+            d_ss=d_ss,
+            offset=offset,
+            ridge=ridge,
+            held_out=held_out,
+            delay=delay,
+        )
+    except ValueError as error:
+        raise ValueError(log.in_names(str(error))) from None
     model = LinearModel(**vars(found.system))
     if log.state_names:
         labelled = len(log.state_names) + len(log.input_names)

@@ -238,7 +238,7 @@ def identify_outputs(
     try:
         plain = regress(episodes, log.sizes, None, 0.0)
     except ValueError as error:
-        raise ValueError(str(error).replace("x[", "y[")) from None
+        raise ValueError(log.in_names(str(error).replace("x[", "y["))) from None
     share = check_range("held_out", held_out, 0, 0.5, "[]")
     center = plain.center
     scale = np.where(plain.spread > 0, plain.spread, 1.0)
@@ -394,9 +394,8 @@ def _notes(
     log: Log, found: Structure, plain: Regression, step: Regression, noise: Array
 ) -> list[str]:
     """Return notes on the fit, dead time, weak excitation, feedback, curvature and poles."""
-    m = log.sizes[1]
     n = found.model.order
-    driven = [*(log.input_names or names((0, m))), *names((0, 0, log.sizes[2]))]
+    driven = names((0, *log.sizes[1:]))
     notes = [
         f"From outputs: order {n}, fitted to {sum(map(len, log.episodes))} steps; one step differs "
         f"from the prediction by {listed_errors(noise, plain.spread)} (standard deviation of each "
@@ -436,4 +435,5 @@ def _notes(
         )
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
+    notes = [log.in_names(each) for each in notes]
     return [*notes, pole_note(*found.poles, "process and sensor noise")]

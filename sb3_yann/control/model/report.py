@@ -246,7 +246,5 @@ def _number(value: complex) -> str:
     return f"{value.real:.4f}" + (f" ± {abs(value.imag):.4f}i" if value.imag else "")
 
 
-def _vector(values: Array, width: Array | None = None) -> str:
-    """Return numbers, each with the half-width of its interval where that is known."""
-    known = zip(values, np.zeros(len(values)) if width is None else width, strict=True)
-    return f"({', '.join(f'{value:.4g}' + f' ± {w:.2g}' * bool(w) for value, w in known)})"
+def _vector(values: Array) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in values)})"

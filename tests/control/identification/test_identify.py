@@ -1,6 +1,7 @@
 """Data give the model back, with honest errors, and data that cannot are refused by name."""
 
 import inspect
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy import stats
 
 from errors import Message, raises
 from sample_plants import played
-from sb3_yann import Identified, LinearModel, LinearMPC, Tracking, identify
+from sb3_yann import Identified, LinearModel, LinearMPC, Log, Tracking, identify
 from sb3_yann.control.gains import Gains, responses
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.least_squares import gains_of, regress
@@ -260,11 +261,18 @@ def test_delay_of_an_input_that_is_held_is_named() -> None:
         identify(*delayed(3, hold=5), dt=1)
 
 
-def test_input_without_effect_is_warned_of() -> None:
+def test_input_without_effect_is_warned_of_by_the_log_s_name() -> None:
     x, u, _ = record(0, process=0.1)
-    other = np.random.default_rng(5).normal(size=u.shape)
+    both = np.hstack([u, np.random.default_rng(5).normal(size=u.shape)])
     with pytest.warns(UserWarning, match=r"u\[1\] has no effect on the next state beyond chance"):
-        identify(x, np.hstack([u, other]), dt=1)
+        identify(x, both, dt=1)
+    names = {"state_names": ("level", "T"), "input_names": ("pump", "heater")}
+    log = replace(Log.from_arrays(x, both, 1), **names)
+    with pytest.warns(UserWarning, match="heater has no effect on the next state beyond chance"):
+        assert "Note: heater has no effect" in identify(log).model.report()
+    still = replace(Log.from_arrays(x, 0 * both, 1), **names)
+    with pytest.raises(ValueError, match=r"do not excite the plant: .*heater never changes"):
+        identify(still)
 
 
 def test_sensor_noise_is_taken_for_no_delay() -> None:
