@@ -47,7 +47,7 @@ PRICE = 40.0
 MPC; twice as often after each look with an objection."""
 NEAR = 0.02
 """Share of what plans gain that a policy may lack when its fits end; a fit that brings less than
-half of it is the last."""
+half of it, to a policy that gains half of what they do, is the last."""
 RETURNS = 1000  # states whose returns the critic is fitted to
 RETURN_STEPS = 100  # steps of a return; the MPC's value counts after them
 CRITIC_BATCH = 256  # rows in a step of Adam on the critic
@@ -252,7 +252,8 @@ def imitate(
             promised = saved
             best = copy.deepcopy(layer.state_dict())
         done = teacher.saved(played.costs) >= (1 - NEAR) * teacher.saved(teacher.attainable)
-        if (done and not objection) or fit == FITS - 1 or since < fit:
+        vain = since < fit and most >= NEARLY * teacher.gain
+        if (done and not objection) or fit == FITS - 1 or vain:
             break
         teacher.show(policy_of(layer, teacher.problem), played)
     layer.load_state_dict(best)
