@@ -128,12 +128,12 @@ class Log:
 
     def in_names(self, text: str) -> str:
         """Return a text with the log's names in place of ``x[0]``, ``y[0]``, ``u[0]``, ``d[0]``."""
-        states, inputs, disturbances = self.state_names, self.input_names, self.disturbance_names
-        of = {"x": states, "y": states, "u": inputs, "d": disturbances}
+        of = {"u": self.input_names, "d": self.disturbance_names}
 
         def name(found: re.Match[str]) -> str:
+            known = of.get(found[1], self.state_names)
             number = int(found[2])
-            return of[found[1]][number] if number < len(of[found[1]]) else found[0]
+            return known[number] if number < len(known) else found[0]
 
         return re.sub(r"\b([xyud])\[(\d+)\]", name, text)
 

@@ -53,7 +53,7 @@ class Units(ReadOnlyArrays):
     def to_plant(self, theta: ArrayLike) -> Array:
         """Return theta in plant units, (..., n_theta), or (..., n) where only states are given."""
         values = np.asarray(theta, np.float64)
-        return values + self.theta_ss[: values.shape[-1]] if self.shifted else values
+        return _raised(values, self.theta_ss[: values.shape[-1]]) if self.shifted else values
 
     def input_to_deviations(self, u: ArrayLike) -> Array:
         """Return inputs (..., m) in deviations."""
@@ -63,7 +63,13 @@ class Units(ReadOnlyArrays):
     def input_to_plant(self, u: ArrayLike) -> Array:
         """Return inputs (..., m) as the plant takes them."""
         values = np.asarray(u, np.float64)
-        return values + self.u_ss if self.shifted else values
+        return _raised(values, self.u_ss) if self.shifted else values
+
+
+def _raised(values: Array, rest: Array) -> Array:
+    """Return deviations from a rest in plant units: what cancels but for rounding is zero."""
+    found = values + rest
+    return np.where(np.abs(found) <= 1e-13 * np.abs(rest), 0.0, found)
 
 
 def fields_in_deviations(problem: Any) -> dict[str, Any]:

@@ -197,7 +197,7 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(write) ->
     assert len(PlantTwin.fit(mpc, log, **given).episodes) == 2
 
 
-@pytest.mark.filterwarnings("ignore:u.0. has no effect")
+@pytest.mark.filterwarnings("ignore:valve has no effect")
 def test_a_state_that_is_often_read_is_cut_where_it_is_missing(write) -> None:
     rows = [f"{'' if k % 5 == 4 else np.sin(k)},{np.sin(3 * k)}" for k in range(40)]
     log = Log.from_csv(write("T,valve", *rows), ["T"], ["valve"], dt=1)

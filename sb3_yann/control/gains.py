@@ -18,6 +18,7 @@ SURE_ERRORS = 5.0
 """Standard errors from 1 beyond which a pole does not integrate: those of an integrator are not
 normal (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74), nor are gains of a pole nearby."""
 FOLLOWS = 3.0  # standard errors from which a state is said to go on and on
+LONG = 100  # samples in which the motion of one must grow by as much as it is, else it is a rate
 ROUNDING = 1e-7  # of a slope, relative to its parts
 
 
@@ -50,6 +51,7 @@ class Gains(ReadOnlyArrays):
         P = np.abs(projector(A, integrators))
         parts = np.abs(found[1:]) - ROUNDING * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
         moves_on, speeds_up = parts > FOLLOWS * widths[1:]
+        speeds_up &= LONG * parts[1] > parts[0]
         # What one input moves on and on, another may move on too: its interval tells.
         moves_on |= np.any(moves_on | speeds_up, axis=1, keepdims=True) & (widths[1] > 0)
         degrees = np.where(speeds_up, 2, moves_on.astype(int))
@@ -69,8 +71,9 @@ def projector(A: Array, integrators: int) -> Array:
     def near(pole: complex) -> bool:
         return bool(abs(pole - 1) < end)
 
-    right, left = (linalg.schur(each, "complex", sort=near)[1] for each in (A, A.T))
-    right, left = right[:, :integrators], left[:, :integrators]
+    right, left = (
+        linalg.schur(each, "complex", sort=near)[1][:, :integrators] for each in (A, A.T)
+    )
     return np.real(right @ np.linalg.solve(left.conj().T @ right, left.conj().T))
 
 

@@ -226,7 +226,7 @@ def evidence(
 def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:
     """Return what a twin explains, what it does not know, and whether to trust it, as text."""
     steps = sum(map(len, episodes))
-    said = [f"The log: {len(episodes)} episodes, {steps} steps."]
+    said = [f"The log: {len(episodes)} episode{'s' * (len(episodes) != 1)}, {steps} steps."]
     for pieces in filter(lambda each: len(each) > 1, records(problem, episodes)):
         said.append(
             f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "

@@ -106,6 +106,8 @@ def test_what_integrates_has_a_rate_in_its_own_units_and_no_gain() -> None:
     tank = LinearModel([[1, 0], [0.2, 0.5]], [[0.3, 0], [0, 1]], 1)
     assert "  u[0]: x[0] +0.3 per sample, x[1] +0.12 per sample.\n" in tank.report()
     assert "  u[1]: x[0] 0, x[1] +2.\n" in tank.report()
+    beside = LinearModel([[1, 0], [1e-6, 1]], [[0.2], [-3.2]], 1)  # hardly two in a row
+    assert "  u[0]: x[0] +0.2 per sample, x[1] -3.2 per sample.\n" in beside.report()
 
 
 def test_units_far_apart_are_reported() -> None:

@@ -25,6 +25,7 @@ from sb3_yann import (
     offset_free,
 )
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess, excess_of_episodes
+from sb3_yann.units import Units
 
 X_SS = np.array([350.0, 2.0])
 U_SS = np.array([10.0])
@@ -517,3 +518,9 @@ def test_a_plant_with_a_load_that_is_measured_settles_without_offset(measured) -
     assert x[0] == pytest.approx(0.7, abs=1e-6)
     with pytest.raises(ValueError, match="Measure what is tracked"):
         offset_free(MPC, measured=[1])
+
+
+def test_an_input_at_a_bound_of_zero_is_zero_rather_than_rounding() -> None:
+    units = Units(np.array([60.0, 0.0]), np.array([0.66, 0.5]))
+    assert units.input_to_plant([-0.66 + 7e-15, -0.4]).tolist() == [0.0, 0.5 - 0.4]
+    assert units.to_plant([[-60.0 - 7e-15, 1e-300]]).tolist() == [[0.0, 1e-300]]
