@@ -344,7 +344,8 @@ class _Search:
             note = f"max_steps = {self.simulator.max_steps:,} were too few to go on."
         except KeyboardInterrupt:
             if hasattr(self, "base"):
-                print(self.figures("Interrupted: this was played so far."), file=sys.stderr)
+                print("Interrupted; of what was played so far:", file=sys.stderr)
+                print(self.figures(""), file=sys.stderr)
             raise
         finally:
             self.simulator.close()

@@ -135,7 +135,7 @@ def test_ctrl_c_prints_what_has_been_played_so_far(capsys, monkeypatch) -> None:
     with pytest.raises(KeyboardInterrupt):
         headroom(heater(), Heater, n_starts=3)
     said = capsys.readouterr().err
-    assert "Verdict:" in said and "Interrupted: this was played so far." in said
+    assert "Interrupted; of what was played so far:\nVerdict:" in said
 
 
 class Ending(Heater):
