@@ -278,15 +278,11 @@ class SimulatedEpisodes(BaseCallback):
     def _on_training_end(self) -> None:
         self._pool.close()
 
-    @property
-    def _count(self) -> int:
-        """Number of episodes at a time: one at least for each column of the replay buffer."""
-        return max(self.per_episode, self.training_env.num_envs)
-
     def play(self) -> None:
         """Play episodes, and put their steps into the replay buffer."""
         first = self.seed + self.state.episodes
-        seeds = range(first, first + self._count)
+        count = max(self.per_episode, self.training_env.num_envs)  # a column of the buffer has one
+        seeds = range(first, first + count)
         explore = [_Exploration(self, np.random.default_rng([self.seed, k])) for k in seeds]
         scaled: list[list[Array]] = [[] for _ in seeds]
         space: Any = self.model.action_space

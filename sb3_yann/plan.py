@@ -498,7 +498,7 @@ def initial_guesses(
 
     least, best = played(first[0])
     cheaper: NDArray[np.bool_] = np.zeros(len(starts), dtype=bool)
-    others = [push(partial(_linear, K)) for K in _gains(problem) for push in pushes]
+    others = [push(lambda theta, K=K: theta @ K.T) for K in _gains(problem) for push in pushes]
     for policy in (*first[1:], *others):
         costs, inputs = played(policy)
         won = costs < least
@@ -511,10 +511,6 @@ def initial_guesses(
 def _pushed(u: Array, until: int, law: Feedback) -> Policy:
     """Return a policy with inputs u (m,) for some steps, those of a law after them."""
     return lambda t, theta: np.tile(u, (len(theta), 1)) if t < until else law(theta)
-
-
-def _linear(K: Array, theta: Array) -> Array:
-    return theta @ K.T
 
 
 def _gains(problem: LinearMPC) -> Iterator[Array]:

@@ -19,7 +19,7 @@ from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.rollout import Trajectories
 from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers import SetPoint
-from sb3_yann.wrappers.theta import require_vector
+from sb3_yann.wrappers.theta import below, require_vector
 
 MOSTLY = 0.5  # share of the starts beyond a box that is no chance
 WRONG = 0.5
@@ -221,11 +221,7 @@ def _push(env: gym.Env[Any, Any], action: Array, j: int) -> Array:
 
 def below_set_points(env: gym.Env[Any, Any]) -> bool:
     """Tell whether a wrapper draws set-points, of which the env's reward knows nothing."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, SetPoint):
-            return True
-        env = env.env
-    return False
+    return below(env, SetPoint) is not None
 
 
 def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:

@@ -237,9 +237,6 @@ def comment(lines: list[str]) -> str:
 def _definitions(data: ControllerArrays, precision: str) -> str:
     """Return sizes, options and tables."""
     numbers, indices = code.controller_tables(data, precision)
-    search_numbers, search_indices = code.search_tables(data)
-    numbers = {**numbers, **search_numbers}
-    indices = {**indices, **search_indices}
     walks = data["neighbors"].size > 0
     n_networks = len(data["pinned"])
     suffix = "f" if precision == "float" else ""

@@ -74,8 +74,13 @@ def search_tolerances(data: ControllerArrays, precision: str) -> dict[str, float
 # ---- Tables ----
 
 
-def controller_tables(data: ControllerArrays, precision: str) -> tuple[Tables, Tables]:
-    """Return the tables of numbers and those of indices, by their names in code."""
+def controller_tables(
+    data: ControllerArrays, precision: str, walk: bool = True
+) -> tuple[Tables, Tables]:
+    """Return the tables of numbers and those of indices, by their names in code.
+
+    Those of a search by a walk are last; without it, all regions are asked.
+    """
     same = "A b gains offsets obs_matrix obs_offset obs_rest seen_rest obs_min obs_max action_shift"
     numbers: Tables = {name: data[name] for name in same.split()}
     numbers["action_scale"] = action_scale(data, precision)
@@ -112,14 +117,10 @@ def controller_tables(data: ControllerArrays, precision: str) -> tuple[Tables, T
         if len(data["kept"]):
             numbers["kept"] = data["kept"]
         indices |= {"network_of": data["network_of"], "pinned": data["pinned"].astype(np.int64)}
+    if walk and data["neighbors"].size:
+        numbers["walk_slack"] = data["walk_slack"]
+        indices["neighbors"] = data["neighbors"]
     return numbers, indices
-
-
-def search_tables(data: ControllerArrays) -> tuple[Tables, Tables]:
-    """Return the tables of a walk; none where all regions are asked."""
-    if not data["neighbors"].size:
-        return {}, {}
-    return {"walk_slack": data["walk_slack"]}, {"neighbors": data["neighbors"]}
 
 
 def index_bytes(indices: Tables) -> int:
@@ -142,7 +143,6 @@ class Cost:
     def of(cls, data: ControllerArrays) -> Cost:
         """Return the cost of a controller's arrays."""
         numbers, indices = controller_tables(data, "double")
-        search_numbers, search_indices = search_tables(data)
         (_, m, n) = data["gains"].shape
         q = len(data["b"])
         n_obs = data["obs_matrix"].shape[1]
@@ -160,9 +160,9 @@ class Cost:
             data[name].size for name in ("est_next", "est_C", "est_gain") if name in data
         )
         return cls(
-            numbers=sum(each.size for each in [*numbers.values(), *search_numbers.values()]),
-            indices=sum(each.size for each in [*indices.values(), *search_indices.values()]),
-            index_bytes=index_bytes(indices | search_indices),
+            numbers=sum(each.size for each in numbers.values()),
+            indices=sum(each.size for each in indices.values()),
+            index_bytes=index_bytes(indices),
             multiplications=n * n_obs
             + search
             + program

@@ -183,7 +183,7 @@ def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:
     lines = [f"{name} : {kind} := {decimal(value, precision)};" for name, value in reals.items()]
     for name in ("frozen_after", "hold", "recover", "transfer"):
         lines.append(f"{name.upper()} : DINT := {int(data[name])};")
-    numbers, indices = code.controller_tables(data, precision)
+    numbers, indices = code.controller_tables(data, precision, walk=False)
     for name, values in numbers.items():
         kept = np.where(np.abs(values) < MIN_REAL, 0.0, np.clip(values, -MAX_REAL, MAX_REAL))
         texts = [decimal(float(each), precision) for each in kept.flat]

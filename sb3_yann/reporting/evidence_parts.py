@@ -140,9 +140,7 @@ def loops_part(subject: Subject) -> Part:
 
 
 def _change(old: float, new: float) -> str:
-    if not old:
-        return f"{new - old:+.4g}"
-    return f"{round(100 * (new - old) / abs(old), 2) + 0.0:+.2f} %"  # no "-0.00"
+    return change_in_percent((new - old) / abs(old)) if old else f"{new - old:+.4g}"
 
 
 def statistics_part(subject: Subject) -> Part:

@@ -14,7 +14,7 @@ from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import labels_of, missing_observer, with_units
-from sb3_yann.control.mpc.bound_excess import BoundNames
+from sb3_yann.control.mpc.bound_excess import BoundNames, costs_of
 from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
 from sb3_yann.reporting.subject import (
     OF_MPC,
@@ -110,7 +110,7 @@ def constraints_part(subject: Subject) -> Part:
         for episodes in subject.shown_loops.values():
             parts = [np.zeros(0)]
             beyond = 0
-            for x, u in _pairs(episodes):
+            for x, u in episodes.pairs:
                 values = series(x, u)
                 below, above = problem.limits_at(of, x[: len(values)])  # at run time
                 parts.append(values)
@@ -156,11 +156,8 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
     found = [make_finding(False if is_worse else passed, text)]
     if problem.soft.penalty:
         old, new = (
-            np.mean(
-                [np.sum(problem.deviations.stage_cost(x[:-1], u)) for x, u in _pairs(loops[who])]
-            )
-            + each.penalty.mean()
-            for who, each in ((OF_MPC, mpc), (OF_POLICY, policy))
+            np.mean([costs_of(problem, *pair)[0] for pair in loops[who].pairs])
+            for who in (OF_MPC, OF_POLICY)
         )
         costs_more = new > old * (1 + 1e-6) and policy.penalty.mean() > mpc.penalty.mean()
         text = (
@@ -175,10 +172,6 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
             text += f" In episode {worst} {words} with the policy."
         found.append(make_finding(not costs_more, text))
     return tuple(found)
-
-
-def _pairs(episodes: Trajectories) -> Iterator[tuple[Array, Array]]:
-    return zip(episodes.observations, episodes.actions, strict=True)
 
 
 def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, tuple[str, int], str, Any]]:

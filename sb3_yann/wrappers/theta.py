@@ -350,7 +350,7 @@ class MeasuredDisturbance(Appending):
         check_int("preview", preview, 0, "It counts samples ahead.")
         super().__init__(env, *_repeated(low, high, preview + 1))
         self.n_loads = len(self.low) // (preview + 1)
-        if _below(env, EstimateState) is not None:
+        if below(env, EstimateState) is not None:
             raise ValueError(
                 "The env is in ObserveDisturbance already, whose observer would take the measured "
                 "disturbance for an unknown one. Wrap it in MeasuredDisturbance first."
@@ -393,7 +393,7 @@ class MeasuredDisturbance(Appending):
         return np.asarray(d[np.minimum(np.arange(rows), len(d) - 1)].ravel())
 
 
-def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
+def below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
     """Return the outermost wrapper of a kind in an env, None where there is none."""
     while isinstance(env, gym.Wrapper):
         if isinstance(env, kind):
@@ -466,7 +466,7 @@ class EstimateState(Appending):
         free = np.full(observer.n_estimated, np.inf)
         low = -free if low is None else low
         high = free if high is None else high
-        self.measured: Any = _below(env, MeasuredDisturbance)
+        self.measured: Any = below(env, MeasuredDisturbance)
         _require_known(observer, self.measured)
         if np.size(low) == np.size(high) == observer.model.n_disturbances:
             low, high = (np.ravel(side)[-observer.n_estimated :] for side in (low, high))
