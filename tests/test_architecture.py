@@ -2,14 +2,13 @@
 
 import ast
 import os
-import subprocess
-import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import sb3_yann
+from fresh_process import run_python
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"sb3_yann": ROOT, "sb3_yann_envs": ROOT / "envs"}
@@ -136,13 +135,13 @@ LOADED = "; import sys; print(sorted({'torch', 'stable_baselines3'} & sys.module
     [
         "import sb3_yann",
         "import sb3_yann.control",
+        "from sb3_yann import Controller",
         "import gymnasium, sb3_yann_envs; "
         "gymnasium.make('CSTR-v0').observation_space.problem.explicit()",
     ],
 )
 def test_the_design_side_loads_neither_torch_nor_stable_baselines3(code: str) -> None:
-    done = subprocess.run([sys.executable, "-c", code + LOADED], capture_output=True, text=True)
-    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+    assert run_python(code + LOADED) == ("[]\n", "")
 
 
 @pytest.mark.parametrize(
@@ -157,8 +156,7 @@ def test_the_design_side_loads_neither_torch_nor_stable_baselines3(code: str) ->
 @pytest.mark.slow
 def test_the_alias_is_known_in_whichever_order_one_imports(imports: str) -> None:
     code = f"{imports}; print(DDPG.policy_aliases['YannPolicy'].__name__)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.stdout.strip(), done.stderr) == ("YannPolicy", "")
+    assert run_python(code) == ("YannPolicy\n", "")
 
 
 def test_names_for_type_checkers_are_those_that_are_loaded() -> None:
@@ -225,15 +223,11 @@ print(model.num_timesteps)
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="a home of its own kind")
-def test_it_works_without_a_home(tmp_path: Path) -> None:
+def test_it_works_without_a_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(("XDG_", "MPLC"))}
-    work = tmp_path / "work"
-    work.mkdir()
-    ran = subprocess.run(
-        [sys.executable, "-c", WORK],
-        cwd=work, env={**kept, "HOME": str(tmp_path / "file" / "home"), "MPLBACKEND": "Agg"},
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert (ran.returncode, ran.stdout) == (0, "120\n"), ran.stderr
-    assert (work / "law.png").exists()
+    for name in [name for name in os.environ if name.startswith(("XDG_", "MPLC"))]:
+        monkeypatch.delenv(name)
+    home = str(tmp_path / "file" / "home")
+    printed, _ = run_python(WORK, folder=tmp_path, HOME=home, MPLBACKEND="Agg")
+    assert printed == "120\n"
+    assert (tmp_path / "law.png").exists()

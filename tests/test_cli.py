@@ -1,7 +1,6 @@
 """The command `sb3-yann`: what it prints and writes, and what its exit codes say."""
 
 import shutil
-import subprocess
 import sys
 import zipfile
 
@@ -9,9 +8,11 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG, PPO, SAC
 
+from fresh_process import run_module
 from improvement_samples import quickest
 from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy, export
 from sb3_yann.cli import main
+from sb3_yann.evaluation import evaluate
 from twin_samples import Cart, problem
 
 PLANT = """
@@ -67,19 +68,8 @@ def test_evaluate_plays_the_mpc_beside_the_model(model, capsys) -> None:
     assert main(["evaluate", "cart.zip", "--env", "my_cart:Cart", "--episodes", "3"]) == 0
     printed = capsys.readouterr().out
     assert "3 episodes from seed 0" in printed
-    costs = [episode_cost(problem().explicit(), seed) for seed in range(3)]
+    costs = evaluate(problem().explicit(), Cart, range(3)).costs
     assert f"instead of {np.mean(costs):.5g} over 3" in printed
-
-
-def episode_cost(act, seed: int) -> float:
-    env = Cart()
-    x = env.reset(seed=seed)[0]
-    over = False
-    cost = 0.0
-    while not over:
-        x, reward, _, over, _ = env.step(act(x))
-        cost -= reward
-    return cost
 
 
 def test_plot_draws_a_law_from_its_file_from_a_model_and_from_a_problem(model, folder) -> None:
@@ -200,8 +190,4 @@ def test_ctrl_c_is_an_exit_code(folder, monkeypatch, capsys) -> None:
 
 
 def test_it_runs_as_a_module(folder) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "sb3_yann", "solve", "CSTR-v0"], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "The law has 7 regions" in done.stdout
+    assert "The law has 7 regions" in run_module(folder, "sb3_yann", "solve", "CSTR-v0")

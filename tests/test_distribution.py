@@ -1,8 +1,6 @@
 """What is installed: the wheel's contents, its metadata, and how the packages import."""
 
 import os
-import subprocess
-import sys
 import tarfile
 import zipfile
 from email.message import Message
@@ -14,6 +12,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import sb3_yann
+from fresh_process import run_python
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"sb3_yann": ROOT / "sb3_yann", "sb3_yann_envs": ROOT / "envs" / "sb3_yann_envs"}
@@ -125,7 +124,7 @@ def test_every_requirement_is_pinned_to_a_version_it_allows(metadata: Message) -
 @pytest.mark.parametrize(
     "package", [pytest.param("sb3_yann", marks=pytest.mark.slow), "sb3_yann_envs"]
 )
-def test_importing_prints_nothing_and_writes_no_file(package: str, tmp_path: Path) -> None:
+def test_importing_prints_nothing_and_writes_no_file(package: str, tmp_path, monkeypatch) -> None:
     # Matplotlib, which Stable-Baselines3 may load, keeps a font cache. Fill it first and
     # lend it, so that only what the package itself does can show.
     import matplotlib.font_manager
@@ -133,34 +132,21 @@ def test_importing_prints_nothing_and_writes_no_file(package: str, tmp_path: Pat
     folder = tmp_path / "empty"
     folder.mkdir()
     environment = {
-        **os.environ,
         "HOME": str(folder),
         "MPLCONFIGDIR": matplotlib.get_cachedir(),
         "PYTHONDONTWRITEBYTECODE": "1",
         "PYTHONPATH": os.pathsep.join(str(path.parent) for path in PACKAGES.values()),
         "TMPDIR": str(folder),
     }
-    for name in [name for name in environment if name.startswith("XDG_")]:
-        del environment[name]
-    result = subprocess.run(
-        [sys.executable, "-c", LOAD_ALL[package]],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    for name in [name for name in os.environ if name.startswith("XDG_")]:
+        monkeypatch.delenv(name)
+    assert run_python(LOAD_ALL[package], folder=folder, **environment) == ("", "")
     assert list(folder.rglob("*")) == []
 
 
 @pytest.mark.slow
 def test_an_import_compiles_nothing() -> None:
     program = f"{LOAD_ALL['sb3_yann']}; import sys; print(*sys.modules)"
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert ran.returncode == 0
-    assert {"sb3_yann.networks.yann", *(f"sb3_yann.{room}" for room in ROOMS)} <= {
-        *ran.stdout.split()
-    }
-    assert not {"numba", "sb3_yann._numba"} & {*ran.stdout.split()}
+    loaded = {*run_python(program)[0].split()}
+    assert {"sb3_yann.networks.yann", *(f"sb3_yann.{room}" for room in ROOMS)} <= loaded
+    assert not {"numba", "sb3_yann._numba"} & loaded

@@ -1,13 +1,11 @@
 """What is given wrongly is named at the door: what it was, what was expected, what to do."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DDPG
 
 import general_problems
-import twin_samples
 from errors import raises
 from guard_samples import Slide, make_guard, train
 from guard_samples import build as build_slide
@@ -148,10 +146,6 @@ def with_two_outputs() -> ObserveDisturbance:
             lambda: hand_made(high=np.inf).plot(),
             "box is not bounded in entries .* of theta: there is no frame to draw. Choose others",
         ),
-        (
-            lambda: PastInputs(LinearPlant(scalar_mpc()), [1], initial=[0, 0]),
-            r"initial has shape \(2,\), expected \(1,\)",
-        ),
         (with_two_outputs, r"low has shape \(2,\), but the observer estimates 1"),
         (
             lambda: build(policy_kwargs={"features_extractor_class": th.nn.Identity}),
@@ -203,11 +197,3 @@ def test_a_simulator_without_costs_on_new_starts_is_named() -> None:
     guard = make_guard(Costless, n_new_starts=5, n_final_starts=5)
     with pytest.raises(ValueError, match=r"finite number on none of 5 new starts .* must be"):
         train(build_slide(), 20, guard)
-
-
-def test_a_twins_env_says_how_it_is_used() -> None:
-    env = twin_samples.twin().env()
-    with pytest.raises(gym.error.ResetNeeded, match=r"Call env\.reset\(\) before"):
-        env.step(env.action_space.sample())
-    with pytest.raises(ValueError, match="must be finite numbers of the shape"):
-        env.reset(options={"state": np.zeros(7)})

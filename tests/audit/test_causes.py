@@ -1,4 +1,4 @@
-"""The audit against every wrapper that changes what rewards mean, and when it speaks."""
+"""The audit against wrappers that change what rewards mean, and when it speaks."""
 
 import dataclasses
 import functools
@@ -12,9 +12,9 @@ from gymnasium import wrappers
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from audit_samples import MPC, WRONG, Changed, audited, plant
 from sample_plants import LinearPlant, Sampled, asymmetric_pendulum_mpc, two_input_mpc
 from sb3_yann import (
+    ActionRepeat,
     AffineObservation,
     CostAudit,
     CostMismatchError,
@@ -32,6 +32,85 @@ from sb3_yann.audit.meaning import below_set_points, warn_of_own_reward
 from sb3_yann.improvement.simulator import of_law
 from sb3_yann.rollout import rollout
 from sb3_yann.wrappers import SetPoint
+
+MPC = two_input_mpc()
+
+
+class Changed(gym.Wrapper):
+    """Passes each step through a function (env, theta, action, outcome) -> outcome."""
+
+    def __init__(self, env: gym.Env, change) -> None:
+        super().__init__(env)
+        self.change = change
+
+    def step(self, action):
+        theta = self.unwrapped.x
+        return self.change(self.unwrapped, theta, action, self.env.step(action))
+
+
+def plant(mpc=MPC, steps: int = 20) -> gym.Env:
+    return wrappers.TimeLimit(LinearPlant(mpc, 2.0), steps)
+
+
+def audited(env, mpc=MPC, steps: int = 100, policy=None, learn: int = 110, **kwargs) -> CostAudit:
+    """Return what an audit finds in an env, with any warning that is not its own an error.
+
+    What the env shows is said: else the policy itself would object to some wrappers.
+    """
+    given = AffineObservation.identity(mpc.n_theta)
+    options = {"problem": mpc, "observation": given, **(policy or {})}
+    model = DDPG(YannPolicy, env, policy_kwargs=options, seed=0, gradient_steps=0, buffer_size=500)
+    audit = CostAudit(steps, **kwargs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CostMismatchWarning)
+        model.learn(learn, callback=[NoActionNoise(), audit])
+    return audit
+
+
+def at_the_next_state(env, theta, action, outcome):
+    observation, _, *rest = outcome
+    return observation, -float(MPC.stage_cost(observation, action)), *rest
+
+
+WEIGHED = dataclasses.replace(MPC, Q=np.diag([1, 2, 3]), R=MPC.R / 2, terminal=None)
+
+# What is done to the env; of those below also what it is taken for, and what else is said.
+UNKNOWN = {
+    "NormalizeReward": lambda: wrappers.NormalizeReward(plant()),
+    "DelayObservation by two": lambda: wrappers.DelayObservation(plant(), 2),
+    "StickyAction": lambda: wrappers.StickyAction(plant(), 0.3),
+    "ActionRepeat": lambda: ActionRepeat(plant(), 2),
+    "other weights": lambda: plant(WEIGHED),
+}
+WRONG = {
+    **{kind: (make, "unknown", "step by step: weights, units") for kind, make in UNKNOWN.items()},
+    "TransformReward: sign": (
+        lambda: wrappers.TransformReward(plant(), lambda reward: -reward),
+        "sign flipped",
+        "The learner would maximize it",
+    ),
+    "TransformReward: scale": (
+        lambda: wrappers.TransformReward(plant(), lambda reward: 0.01 * reward),
+        "scaled",
+        'policy_kwargs={"critic": {"reward_scale": 0.01, "reward_offset": 0}}',
+    ),
+    "TransformReward: scale and offset": (
+        lambda: wrappers.TransformReward(plant(), lambda reward: 0.5 * reward + 10),
+        "scaled and shifted",
+        '"reward_scale": 0.5',
+    ),
+    "TransformReward: constant": (
+        lambda: wrappers.TransformReward(plant(), lambda reward: 1.0),
+        "constant",
+        "every reward is 1",
+    ),
+    "TransformReward: bent": (
+        lambda: wrappers.TransformReward(plant(), lambda reward: -np.sqrt(-reward)),
+        "unknown",
+        "R² = 0.9",
+    ),
+    "the next state": (lambda: Changed(plant(), at_the_next_state), "next state", "c(s', u)"),
+}
 
 
 @pytest.mark.parametrize("wrong", WRONG)

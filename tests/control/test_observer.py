@@ -91,22 +91,6 @@ def test_bad_measurements_are_named() -> None:
         DisturbanceObserver(LOADED).update([1, 2], [np.nan])
 
 
-def test_the_observer_of_an_offset_free_mpc_knows_no_units() -> None:
-    """A temperature in thousandths of a degree is estimated as fast as one in degrees."""
-    units = np.diag([1.0, 1000.0])
-    A = units @ THERMAL.A @ np.linalg.inv(units)
-    B = units @ THERMAL.B
-    gains = []
-    for model, unit in ((THERMAL, np.eye(2)), (LinearModel(A, B, 1.0), units)):
-        Q = np.linalg.inv(unit @ unit)
-        half = np.diag(unit) * 5
-        box = {"theta_min": -half, "theta_max": half, "u_min": -1, "u_max": 1}
-        _, observer = offset_free(LinearMPC(model, Q=Q, R=[[1]], horizon=2, **box))
-        gains.append(observer.gain)
-    both = np.kron(np.eye(2), units)  # of the states and of their disturbances
-    np.testing.assert_allclose(gains[1], both @ gains[0] @ np.linalg.inv(units), rtol=1e-6)
-
-
 def test_a_measured_disturbance_is_told_and_no_part_of_the_estimate() -> None:
     E = np.array([[0.3, 0.1], [-0.2, 1.0]])
     model = LinearModel([[0.7, 0.2], [0.0, 0.9]], [[0.1], [0.4]], 1, E=E, estimated=[1])

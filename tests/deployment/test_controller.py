@@ -1,7 +1,5 @@
 """The numpy-only controller is what the model predicts, and falls back when a reading fails."""
 
-import subprocess
-import sys
 import tempfile
 import zipfile
 from pathlib import Path
@@ -20,6 +18,7 @@ import general_problems
 import sb3_yann._archive
 import sb3_yann.deployment.controller
 from deployed import CASES, disturbed, in_float64, observations, policy_of
+from fresh_process import run_python
 from random_problems import examples, problems
 from sample_laws import reactor_in_plant_units, solved
 from sb3_yann import (
@@ -125,16 +124,8 @@ sys.meta_path.insert(0, Wall())
 from controller import Controller
 print(*Controller.load("plant.npz")([0.1, 0.2, -0.1, 3.0]))
 """
-    found = subprocess.run(
-        [sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert np.allclose(float(found.stdout), controller([0.1, 0.2, -0.1, 3.0]), rtol=1e-14)
-
-
-def test_importing_it_loads_no_torch():
-    lines = "import sys; from sb3_yann import Controller; print('torch' in sys.modules)"
-    found = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True)
-    assert found.stdout.strip() == "False", found.stderr
+    printed, _ = run_python(lines, folder=tmp_path, PYTHONPATH="")
+    assert np.allclose(float(printed), controller([0.1, 0.2, -0.1, 3.0]), rtol=1e-14)
 
 
 # ---- Faults ----

@@ -9,7 +9,7 @@ from stable_baselines3 import DDPG
 
 import unit_samples as units
 from sb3_yann import YannPolicy
-from sb3_yann.env_pool import EnvPool, maker
+from sb3_yann.env_pool import EnvPool
 from sb3_yann.evaluation import Trajectories, evaluate
 from sb3_yann_envs import problems
 
@@ -98,12 +98,6 @@ def test_episodes_of_different_length_wait_for_nobody() -> None:
     assert_equal(episodes, evaluate(Tenth(), Countdown(), [3, 1, 4]))
 
 
-def test_envs_made_for_the_episodes_are_closed() -> None:
-    before = Countdown.open
-    evaluate(Tenth(), Countdown, [3, 1, 4])
-    assert Countdown.open == before
-
-
 def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> None:
     made: list[Countdown] = []
 
@@ -179,9 +173,3 @@ class Goal(gym.Wrapper):
 def test_an_end_that_is_a_success_is_no_termination_that_counts() -> None:
     act = lambda _: [0.0]  # noqa: E731
     assert not evaluate(act, lambda: Goal(gym.make("CSTR-v0")), [0]).terminated.any()
-
-
-def test_headroom_and_improve_make_their_envs_by_such_a_name_too() -> None:
-    made = maker(f"{__name__}:short_reactor")()
-    assert isinstance(made, gym.Env) and made.spec.max_episode_steps == 3
-    assert maker("sb3_yann_envs:CSTR-v0")().spec.id == "CSTR-v0"

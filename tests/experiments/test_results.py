@@ -107,16 +107,6 @@ def test_the_report_is_whole(tmp_path) -> None:
     assert "| CSTR | 200 | **YANN-RL** | 1 | 200.00 |" in text
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("missing", ["MPC", "optimum", "YANN-RL", "DDPG", "MPC optimum YANN-RL"])
-def test_the_report_does_without(missing, tmp_path) -> None:
-    everything = {**reactor(seeds=2), **pendulum()}
-    left = {run: out for run, out in everything.items() if run.learner not in missing}
-    text = write_report(left, tmp_path, notes=tmp_path / "none.md")[0].read_text(encoding="utf-8")
-    for row in text.splitlines():
-        assert not row.startswith(f"| {missing} |") and "nan" not in row
-
-
 @pytest.fixture
 def catalog(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
@@ -329,19 +319,3 @@ def test_a_long_run_holds_the_short_one() -> None:
         long.at(7)
     fixed = outcome(Run("CSTR", "MPC", 0, 0))
     assert fixed.at(50) is fixed
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"checkpoints": []}, "checkpoints"),
-        ({"test_costs": np.zeros((1, 4))}, "each checkpoint"),
-        ({"test_violations": np.zeros((3, 3))}, "differ in shape"),
-        ({"training_costs": np.zeros(1)}, "differ in length"),
-        ({"extra": {"bad": np.array([None])}}, "plain arrays"),
-    ],
-)
-def test_an_outcome_must_fit_together(change, message) -> None:
-    good = outcome(RUNS[1])
-    with pytest.raises(ValueError, match=message):
-        Outcome(**{**vars(good), **change})

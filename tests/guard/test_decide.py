@@ -83,11 +83,7 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
 
 
 def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> None:
-    simulator = partial(OftenRight, after=FIRST + 10)
-    model = build(gradient_steps=0)
-    guard = make_guard(simulator, n_new_starts=20, rule=WHOLE)
-    again = At([2 * STEPS], spoil_left)
-    train(model, 2 * STEPS, At([STEPS], spoil_left), again, guard)
+    _, guard = tried(spoil_left, spoil_left, env=OftenRight, n_new_starts=20, rule=WHOLE)
     first, second = guard.decisions[:2]
     assert "new starts" in first.reason
     assert "new starts" not in second.reason and "costs" in second.reason
@@ -96,22 +92,12 @@ def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> No
 
 def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
     # The first five new starts show the right only: all of it is accepted.
-    simulator = partial(OftenRight, after=FIRST + 15)
-    model = build(gradient_steps=0)
-    guard = make_guard(simulator, n_new_starts=20, rule=WHOLE)
-
-    def a_little_better(policy) -> None:
-        correct(policy, RIGHT, 0.4)
-
-    def still_better(policy) -> None:
-        correct(policy, RIGHT, 0.5)
-
     def spoiled(policy) -> None:
-        a_little_better(policy)
+        correct(policy, RIGHT, 0.4)
         correct(policy, LEFT, -2.0)
 
-    steps = [At([STEPS], spoiled), At([2 * STEPS], still_better)]
-    train(model, 2 * STEPS, *steps, guard)
+    simulator = partial(OftenRight, after=FIRST + 15)
+    model, guard = tried(spoiled, good, env=simulator, n_new_starts=20, rule=WHOLE)
     assert verdicts(guard) == ["accepted", "accepted", "rejected"]  # the last one at the end
     assert actor_bits(model.policy) == accepted_bits(guard)
     assert is_mpc(model)
@@ -119,13 +105,11 @@ def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() 
 
 
 GENTLE = {"cvar_alpha": 0.05, "backtrack": True}
-SHARED_NETWORK = {"networks": "shared"}
 
 
 def test_of_a_step_too_far_half_is_accepted() -> None:
-    model = build(gradient_steps=0, actor=SHARED_NETWORK)
-    guard = make_guard(n_new_starts=0, rule=GENTLE)
-    train(model, STEPS, At([STEPS], lambda policy: push(policy, 1.2)), guard)
+    too_far = partial(push, size=1.2)
+    model, guard = tried(too_far, actor={"networks": "shared"}, n_new_starts=0, rule=GENTLE)
     decision, *_ = guard.decisions
     assert (decision.verdict, decision.share) == ("accepted in part", 0.5)
     assert decision.candidate_cost > decision.accepted_cost < decision.mpc_cost
@@ -134,10 +118,8 @@ def test_of_a_step_too_far_half_is_accepted() -> None:
 
 def test_at_the_end_half_of_a_correction_is_kept_that_loses() -> None:
     """On the left, which only the last starts show, the whole costs more, and half costs less."""
-    model = build(gradient_steps=0)
-    rule = {**GENTLE, "by_region": False}
-    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=60, rule=rule)
-    train(model, STEPS, At([STEPS], lambda policy: push_left(policy)), guard)
+    options = {"n_new_starts": 0, "n_final_starts": 60, "rule": GENTLE | WHOLE}
+    model, guard = tried(push_left, env=OftenRight, **options)
     last = guard.decisions[-1]
     assert last.reason.startswith("at the end") and "50 % of its correction is kept" in last.reason
     assert last_layer(model)[:, :, -1].abs().max().item() == pytest.approx(0.6)
@@ -392,11 +374,8 @@ def push(policy: YannPolicy, size: float) -> None:
 
 @SHARED
 def test_a_better_network_is_accepted_and_a_worse_one_is_not(actor) -> None:
-    model = build(gradient_steps=0, actor=actor)
-    guard = make_guard(n_new_starts=0)
-    good = At([STEPS], lambda policy: push(policy, 0.4))
-    bad = At([2 * STEPS], lambda policy: push(policy, -0.4))
-    train(model, 2 * STEPS, good, bad, guard)
+    moves = [partial(push, size=size) for size in (0.4, -0.4)]
+    model, guard = tried(*moves, actor=actor, n_new_starts=0)
     first, second = guard.decisions[:2]
     assert first.verdict == "accepted"
     assert first.accepted_cost < first.mpc_cost
@@ -412,9 +391,7 @@ def restless(policy) -> None:
 
 
 def decided(max_input_step):
-    rule = {"max_input_step": max_input_step, **WHOLE}
-    model, guard = tried(restless, rule=rule, n_new_starts=50)
-    return model, guard
+    return tried(restless, rule={"max_input_step": max_input_step, **WHOLE}, n_new_starts=50)
 
 
 @pytest.mark.parametrize("max_input_step", [None, 3.0])
@@ -447,9 +424,8 @@ def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
 
 @pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
 def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, seeds) -> None:
-    model = build(gradient_steps=0)
-    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule=WHOLE)
-    train(model, STEPS, At([STEPS], spoil_left), guard)
+    options = {"n_new_starts": 0, "n_final_starts": final, "rule": WHOLE}
+    model, guard = tried(spoil_left, env=OftenRight, **options)
     assert guard.state.evidence.next_seed == FIRST + 10 + seeds
     assert is_mpc(model) == (final is not None)
     if final is not None:

@@ -28,6 +28,7 @@ from guard_samples import (
     make_guard,
     overwrite,
     train,
+    tried,
     verdicts,
 )
 from sb3_yann import Decision
@@ -44,12 +45,7 @@ def half_good(policy) -> None:
     correct(policy, RIGHT, 0.3)
 
 
-def three_decisions(*guards, model=None, **kwargs):
-    model = build(gradient_steps=0, **kwargs) if model is None else model
-    acts = [half_good, partial(overwrite, value=np.nan), better]
-    moves = [At([(i + 1) * STEPS], act) for i, act in enumerate(acts)]
-    train(model, 3 * STEPS, *moves, *guards)
-    return model
+THREE = half_good, partial(overwrite, value=np.nan), better
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -59,8 +55,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
     path = tmp_path / "new" / "guard.csv"
-    guard = make_guard(log_path=str(path))
-    three_decisions(guard)
+    _, guard = tried(*THREE, log_path=str(path))
     written = rows(path)
     assert [*written[0]] == NAMES
     assert verdicts(guard) == ["accepted in part", "rejected", "accepted"]
@@ -97,22 +92,20 @@ def test_a_full_disk_ends_no_training_and_the_record_is_completed_later(
             raise OSError(28, "No space left on device")
         return own(decisions)
 
-    guard = make_guard(log_path=path)
     monkeypatch.setattr(record, "as_csv", at_times)
     with pytest.warns(UserWarning, match=r"guard\.csv could not be written .*No space"):
-        three_decisions(guard)
+        _, guard = tried(*THREE, log_path=path)
     assert [row["verdict"] for row in rows(path)] == verdicts(guard)
     assert len(guard.decisions) == 3
 
 
 def test_a_record_of_another_run_is_kept_beside(tmp_path) -> None:
     path = tmp_path / "guard.csv"
-    three_decisions(make_guard(log_path=path))
+    tried(*THREE, log_path=path)
     before = path.read_bytes()
     (tmp_path / "guard.1.csv").write_text("mine")
     with pytest.warns(UserWarning, match=r"guard\.csv held .* it is .*guard\.2\.csv now"):
-        other = make_guard(log_path=path)
-        train(build(gradient_steps=0), STEPS, other)
+        _, other = tried(better, log_path=path)
     assert (tmp_path / "guard.2.csv").read_bytes() == before
     assert (tmp_path / "guard.1.csv").read_text() == "mine"
     assert len(rows(path)) == len(other.decisions)
@@ -121,7 +114,9 @@ def test_a_record_of_another_run_is_kept_beside(tmp_path) -> None:
 def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:
     guard = make_guard()
     model = build(gradient_steps=0, tensorboard_log=str(tmp_path))
-    three_decisions(guard, At([3 * STEPS], partial(correct, region=RIGHT, value=0.45)), model=model)
+    moves = [At([(i + 1) * STEPS], act) for i, act in enumerate(THREE)]
+    last = At([3 * STEPS], partial(correct, region=RIGHT, value=0.45))
+    train(model, 3 * STEPS, *moves, guard, last)
     shown = scalars(tmp_path)
     assert shown["guard/accepted"] == [1, 1, 2, 2]
     assert shown["guard/rejected"] == [0, 1, 1, 2]

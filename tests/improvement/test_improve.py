@@ -15,6 +15,7 @@ from gymnasium.wrappers import TimeLimit
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
+from guard_samples import random_states
 from improvement_samples import FEW, Counted, Elsewhere, Plain, Spring, bits, model_of, quick
 from sb3_yann import (
     LinearMPC,
@@ -31,7 +32,7 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import Check, Improvement
 from sb3_yann.improvement.imitation import fit_layer
 from sb3_yann.wrappers import SetPoint
-from twin_samples import Calm, observed_env, offset_free_problem, problem
+from twin_samples import POLYNOMIALS, Calm, observed_env, offset_free_problem, problem
 from weights import is_mpc
 
 UNSEEN = range(900, 930)
@@ -169,29 +170,20 @@ def test_what_was_learnt_before_is_kept_or_bettered() -> None:
 
 
 def test_a_seed_repeats_it_and_no_global_random_state_moves() -> None:
-    np.random.seed(3)  # noqa: NPY002
     th.manual_seed(3)
     model = model_of()
-    np.random.seed(3)  # noqa: NPY002
-    th.manual_seed(3)
+    drawn = random_states()
     found = improve(model, Spring, **FEW)
-    drawn = np.random.rand(), float(th.rand(1))  # noqa: NPY002
-    np.random.seed(3)  # noqa: NPY002
-    th.manual_seed(3)
-    assert drawn == (np.random.rand(), float(th.rand(1)))  # noqa: NPY002
+    assert random_states() == drawn
     weights, before, _ = pickle.loads(better())
     assert bits(model) == weights and found.policy == before.policy
     assert found.checks == before.checks
 
 
 def test_an_mpc_gets_a_model_with_one_network_and_moves_no_random_state(tmp_path) -> None:
-    np.random.seed(3)  # noqa: NPY002
-    th.manual_seed(3)
+    drawn = random_states()
     found = improve(problem(), Spring, **{**FEW, "rounds": 2, "updates": 400})
-    drawn = np.random.rand(), float(th.rand(1))  # noqa: NPY002
-    np.random.seed(3)  # noqa: NPY002
-    th.manual_seed(3)
-    assert drawn == (np.random.rand(), float(th.rand(1)))  # noqa: NPY002
+    assert random_states() == drawn
     assert isinstance(found.model, DDPG) and found.model.policy.problem == problem()
     assert found.accepted and relative(found.model).mean() < 0.99
     assert found.export(tmp_path / "controller.npz").paths
@@ -397,17 +389,14 @@ def twin_of(make=Spring, episodes: int = 10) -> PlantTwin:
     """Return the twin of episodes of a plant's MPC."""
     mpc = make().observation_space.problem
     played = evaluate(mpc.explicit(), make, range(episodes))
-    pairs = [*zip(played.observations, played.actions, strict=True)]
-    return PlantTwin.fit(mpc, pairs, updates=1500)
+    return PlantTwin.fit(mpc, played.pairs, updates=1500)
 
 
 def reactor(seeds: range) -> PlantTwin:
     """Return the reactor's twin from episodes of its MPC."""
     mpc = DDPG("YannPolicy", "CSTR-v0", device="cpu").policy.problem
     played = evaluate(mpc.explicit(), "CSTR-v0", seeds)
-    kinds = ["none", "linear", "quadratic"]
-    pairs = [*zip(played.observations, played.actions, strict=True)]
-    return PlantTwin.fit(mpc, pairs, residuals=kinds)
+    return PlantTwin.fit(mpc, played.pairs, residuals=POLYNOMIALS)
 
 
 @pytest.mark.slow

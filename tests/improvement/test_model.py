@@ -209,6 +209,8 @@ def test_slopes_of_a_plant_are_those_of_its_steps(make, members) -> None:
     theta = half * rng.uniform(-1, 1, (4, 3, mpc.n_theta))
     u = rng.uniform(-0.5, 0.5, (4, 3, 1))
     A, B = plant.jacobians(theta, u, numbers)
+    held = mpc.layout.constant
+    np.testing.assert_array_equal(plant.step(theta[0], u[0], numbers)[:, held], theta[0][:, held])
     for t in range(4):
         for j, e in enumerate(size * np.eye(mpc.n_theta)):
             ends = [plant.step(theta[t] + s * e, u[t], numbers) for s in (1, -1)]

@@ -17,6 +17,7 @@ from sb3_yann import LinearModel, LinearMPC, OutputBounds, Tracking
 from sb3_yann.control.mpc.bound_excess import Bounds
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from twin_samples import problem
+from weights import shake
 
 
 @cache
@@ -254,9 +255,7 @@ def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:
 @pytest.mark.parametrize("kind", [YannLayer, SharedYannLayer])
 def test_a_frozen_layer_acts_as_the_layer_and_refuses_another_width(kind: Any) -> None:
     layer = kind(problem().explicit(), (8, 8), max_correction=0.3)
-    with th.no_grad():
-        for each in layer.network.weights():
-            each.add_(0.3 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
+    shake(layer, 0.3)
     layer.confine(0.3 * problem().theta_min, 0.4 * problem().theta_max)
     theta = np.random.default_rng(0).uniform(-3, 3, (50, 2))
     theta[7] = np.inf

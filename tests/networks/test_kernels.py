@@ -10,17 +10,9 @@ from sample_laws import box_points, law_of
 from sb3_yann.networks import AfterstateValue, LinearPrediction, Ranges, YannLayer
 from sb3_yann.networks._kernels.stack import tanh
 from sb3_yann_envs import problems
-from weights import later_layers, network_of
+from weights import later_layers, network_of, shake
 
 NAMES = ["pendulum", "reactor", "two inputs", "asymmetric bounds"]
-
-
-def shaken(module: th.nn.Module, size: float, seed: int = 0) -> None:
-    """Move all weights at random."""
-    generator = th.Generator().manual_seed(seed)
-    with th.no_grad():
-        for each in module.parameters():
-            each += size * th.randn(each.shape, generator=generator, dtype=each.dtype)
 
 
 def by_torch(module: th.nn.Module) -> th.nn.Module:
@@ -56,7 +48,7 @@ def test_the_layer_is_that_of_torch_inside_and_outside_the_domain(
     law = law_of(name, infeasible)
     options = {"rate": rate_of(law)} if options == "rate" else options
     layer = YannLayer(law, **options)
-    shaken(layer, size)
+    shake(layer, size)
     plain = by_torch(layer)
     theta = box_points(law, 400, stretch=1.5)
     ours = layer(theta)
@@ -70,7 +62,7 @@ def test_the_layer_is_that_of_torch_inside_and_outside_the_domain(
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_by_row_are_those_of_the_regions_in_use_and_nothing_else(name: str) -> None:
     layer = YannLayer(law_of(name))
-    shaken(layer, 0.1)
+    shake(layer, 0.1)
     theta = box_points(law_of(name), 30)
     dense = gradients(layer(theta), layer)
     layer.row_gradients = True
@@ -82,7 +74,7 @@ def test_gradients_by_row_are_those_of_the_regions_in_use_and_nothing_else(name:
 
 def test_a_theta_that_needs_a_gradient_gets_one() -> None:
     layer = YannLayer(law_of("reactor"))
-    shaken(layer, 0.1)
+    shake(layer, 0.1)
     theta = box_points(law_of("reactor"), 10).requires_grad_()
     layer(theta).sum().backward()
     assert theta.grad is not None and th.any(theta.grad != 0)
@@ -91,7 +83,7 @@ def test_a_theta_that_needs_a_gradient_gets_one() -> None:
 def test_weights_that_change_before_the_backward_pass_are_noticed() -> None:
     layer = YannLayer(law_of("reactor"))
     actions = layer(box_points(law_of("reactor"), 10))
-    shaken(layer, 0.1)
+    shake(layer, 0.1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         actions.sum().backward()
 
@@ -120,7 +112,7 @@ def value(pinned: bool, hidden=(64, 64), gamma: float = 0.99) -> AfterstateValue
 @pytest.mark.parametrize("dtype", [th.float32, th.float64])
 def test_the_value_is_that_of_torch(pinned: bool, hidden, dtype: th.dtype) -> None:
     ours = value(pinned, hidden)
-    shaken(ours, 0.1)
+    shake(ours, 0.1)
     plain = by_torch(ours)
     theta = box_points(law_of("reactor"), 100)
     points = th.cat([theta, th.linspace(-1, 1, 100)[:, None]], 1).to(dtype)
@@ -158,7 +150,7 @@ def test_shapes_that_do_not_fit_are_refused_before_compiled_code_reads_them(shap
 @pytest.mark.filterwarnings("ignore")
 def test_what_torch_traces_still_depends_on_the_state() -> None:
     for module, n in ((YannLayer(law_of("reactor")), 4), (value(True), 5)):
-        shaken(network_of(module), 0.1)
+        shake(network_of(module), 0.1)
         one, other = th.rand(2, 6, n)
         with th.no_grad():
             traced = th.jit.trace(module, one)
@@ -182,7 +174,7 @@ class Double(th.nn.Module):
 @pytest.mark.parametrize("name", ["layer", "value"])
 def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None:
     module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
-    shaken(module, 0.1)
+    shake(module, 0.1)
     th.nn.utils.parametrize.register_parametrization(later_layers(module)[-1], "weight", Double())
     theta = box_points(law_of("reactor"), 50)
     points = th.cat([theta, th.linspace(-1, 1, 50)[:, None]], 1)[:, :n]
@@ -195,7 +187,7 @@ def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None
 
 def test_autocast_runs_the_operations_of_torch() -> None:
     layer = YannLayer(law_of("reactor"))
-    shaken(layer, 0.1)
+    shake(layer, 0.1)
     theta = box_points(law_of("reactor"), 20)
     exact = layer(theta)
     with th.autocast("cpu"):
@@ -206,7 +198,7 @@ def test_autocast_runs_the_operations_of_torch() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_regions_are_those_whose_networks_are_used(name: str) -> None:
     layer = YannLayer(law_of(name, "nearest_region"))
-    shaken(layer, 0.1)
+    shake(layer, 0.1)
     theta = box_points(law_of(name, "nearest_region"), 60, stretch=1.5)
     layer.row_gradients = True
     for row, region in zip(theta, layer.regions(theta), strict=True):

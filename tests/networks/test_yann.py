@@ -53,9 +53,6 @@ def test_points_of_a_facet_that_float32_holds_exactly_go_to_the_first_region() -
     assert law.locate(theta.numpy()).tolist() == [0, 1, 1, 1]
 
 
-# --- the bounds --------------------------------------------------------------------------------
-
-
 # --- the bound on the correction ---------------------------------------------------------------
 
 

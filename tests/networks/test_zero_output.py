@@ -247,16 +247,6 @@ def test_each_row_is_trained_as_if_it_had_an_adam_of_its_own(dense: bool) -> Non
     assert th.allclose(trained(dense), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("dense", [False, True])
-def test_rows_without_a_gradient_do_not_move_not_even_by_momentum(dense: bool) -> None:
-    # the eleventh step has rows 0 and 1
-    before = trained(dense, 10)
-    after = trained(dense, 11)
-    moved = (before != after).flatten(1).any(1)
-    assert moved.tolist() == [True, True, False, False, False]
-    assert th.equal(after[2], th.ones(2, 3))
-
-
 def test_it_goes_on_from_a_saved_state() -> None:
     gradients = steps(dense=False)
     one = th.nn.Parameter(th.ones(ROWS, 2, 3))

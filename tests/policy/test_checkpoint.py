@@ -14,6 +14,7 @@ from stable_baselines3 import DDPG, PPO, SAC, TD3
 from guard_samples import RIGHT, build, correct, randomize
 from sb3_yann import retarget
 from sb3_yann.policy.checkpoint import ActorCheckpoint
+from weights import network_of, shake
 
 
 def pair() -> tuple[Any, ActorCheckpoint, ActorCheckpoint]:
@@ -60,9 +61,7 @@ def learnt(algorithm: Any = DDPG, **options: Any) -> Any:
     model = algorithm(
         "YannPolicy", "CSTR-v0", policy_kwargs=options, device="cpu", gamma=0.98, batch_size=32
     )
-    with th.no_grad():
-        for weight in model.policy.actor.mu.network.weights():
-            weight.add_(0.1 * th.randn(weight.shape, generator=th.Generator().manual_seed(0)))
+    shake(network_of(model), 0.1)
     return model
 
 

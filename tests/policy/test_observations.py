@@ -270,8 +270,9 @@ def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> Non
     model.learn(120, callback=[NoActionNoise(), ControlDiagnostics(), guard])
     seen = law().locate(model.policy.theta(env.normalize_obs(env.get_original_obs())).numpy())
     assert guard.state.evidence.scores.visits[:, seen].any()
-    evidence = guard.state.evidence
-    assert evidence.starts.mpc.costs == pytest.approx(mpc_costs(evidence.starts.seeds))
+    starts = guard.state.evidence.starts
+    costs = evaluate(law(), TimeLimit(LinearPlant(MPC), 20), starts.seeds).costs
+    assert starts.mpc.costs == pytest.approx(costs)
     model.save(tmp_path / "model")
     loaded = DDPG.load(tmp_path / "model", env=env)
     np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])
@@ -317,19 +318,6 @@ def test_a_loaded_model_whose_statistics_are_lost_is_named(tmp_path) -> None:
     whole.save(tmp_path / "again")
     with pytest.warns(UserWarning, match="its env has none"):
         DDPG.load(tmp_path / "again", env=plain)
-
-
-def mpc_costs(seeds) -> list[float]:
-    """Return the cost of the explicit law itself, in float64."""
-    costs = []
-    for seed in seeds:
-        plant = LinearPlant(MPC)
-        cost = 0.0
-        plant.reset(seed=seed)
-        for _ in range(20):
-            cost -= plant.step(law()(plant.x))[1]
-        costs.append(cost)
-    return costs
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from sample_plants import LinearPlant, Sampled
 from sb3_yann import AffineObservation, LinearModel, LinearMPC, YannPolicy
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann_envs import problems
+from weights import shake
 
 
 @pytest.mark.parametrize(
@@ -241,10 +242,7 @@ OTHERS = {
 def model_of(kind: str, algorithm=DDPG, **changes) -> Any:
     """A model whose networks, and whose target's, have learnt something: noise."""
     model = build(algorithm, scalar_mpc(**changes), KINDS[kind])
-    generator = th.Generator().manual_seed(len(changes))
-    with th.no_grad():
-        for parameter in model.policy.parameters():
-            parameter.add_(0.01 * th.randn(parameter.shape, generator=generator))
+    shake(model.policy, 0.01, len(changes))
     return model
 
 

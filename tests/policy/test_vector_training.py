@@ -10,15 +10,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sample_plants import LinearPlant, Sampled, two_input_mpc
+from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import (
-    ActionRepeat,
     AffineObservation,
     ControlDiagnostics,
     CostAudit,
     ImprovementGuard,
-    LinearModel,
-    LinearMPC,
     NoActionNoise,
     YannPolicy,
 )
@@ -151,46 +148,3 @@ def test_an_end_by_the_env_is_one_to_the_critic() -> None:
     model.learn(4 * STEPS, callback=NoActionNoise())
     assert transitions(model, "timeouts").sum() == 0  # also where the limit comes at the same step
     assert transitions(model, "dones").sum() == 4
-
-
-# --- action repeat --------------------------------------------------------------------------------
-
-
-class Continuous(Sampled):
-    """A cart, x'' = u, sampled every 0.02 s."""
-
-    model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], 0.02)
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    starts = (-0.5, 0.5)
-
-    def cost(self, u):
-        return self.x @ self.x + 0.1 * u @ u
-
-    def moved(self, u):
-        return self.model.step(self.x, u)
-
-
-def test_a_model_of_k_times_the_sampling_time_is_right_for_k_repetitions() -> None:
-    k = 5
-    dt = Continuous.model.dt
-    model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], k * dt)
-    mpc = LinearMPC(
-        model, Q=k * np.eye(2), R=[[k * 0.1]], horizon=5, x_min=-3, x_max=3, u_min=-1, u_max=1
-    )
-    learner = DDPG(
-        YannPolicy,
-        DummyVecEnv([lambda: TimeLimit(ActionRepeat(Continuous(), k), 30)] * 2),
-        policy_kwargs={"problem": mpc},
-        seed=0,
-        gradient_steps=0,
-        buffer_size=500,
-    )
-    audit = CostAudit(tolerance=0.3, strict=True)  # the cost changes a little in between
-    learner.learn(120, callback=[NoActionNoise(), audit])
-    assert audit.finding.scale == pytest.approx(1, abs=0.15)
-    x = transitions(learner, "observations").reshape(-1, 2).astype(np.float64)
-    following = transitions(learner, "next_observations").reshape(-1, 2)
-    u = transitions(learner, "actions").reshape(-1, 1)
-    np.testing.assert_allclose(model.step(x, u), following, atol=1e-6)
-    np.testing.assert_allclose(learner.predict(x.astype(np.float32))[0], u, atol=1e-6)

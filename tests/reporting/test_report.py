@@ -100,7 +100,7 @@ def whole(tmp_path_factory) -> tuple[Path, DDPG]:
     model.learn(60, callback=[NoActionNoise(), guard])
     mpc = model.policy.problem
     log = evaluate(mpc.explicit(), "ClippedPendulum-v0", range(5))
-    twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], n_members=1)
+    twin = PlantTwin.fit(mpc, log.pairs, n_members=1)
     costs = np.array([10.0, 20.0])
     room = Headroom(costs, costs, costs, costs - 0.5, 0.0, 0.0, 1 / 30, "learn", "a simulator")
     path = tmp_path_factory.mktemp("report") / "new folder" / "whole.html"
@@ -430,10 +430,8 @@ def test_a_report_that_fails_leaves_the_last_one_as_it_was(tmp_path) -> None:
 
 
 def test_of_a_twin_alone_its_episodes_are_played_and_said_to_be_no_plant_s(tmp_path) -> None:
-    mpc = twin_samples.problem()
-    log = evaluate(mpc.explicit(), twin_samples.Cart, range(5))
-    twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], n_members=1)
-    model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": mpc}, device="cpu")
+    twin = twin_samples.twin()
+    model = DDPG("YannPolicy", twin.env(), device="cpu")
     text = report(model, tmp_path / "r.html", twin=twin, seeds=range(2)).read_text()
     assert "The env is a twin, fitted to the plant&#x27;s log: the plant has played none" in text
     assert "Closed loops against the MPC" in text and "samples for which a move" not in text
@@ -450,12 +448,8 @@ def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
         report(model, path, twin=3)
     with pytest.raises(ValueError, match="has not watched this model"):
         report(model, path, guard=make_guard())
-    log = evaluate(twin_samples.problem().explicit(), twin_samples.Cart, range(3))
-    twin = PlantTwin.fit(
-        twin_samples.problem(), [*zip(log.observations, log.actions, strict=True)], n_members=1
-    )
     with pytest.raises(ValueError, match="The twin is one of"):
-        report(model, path, twin=twin)
+        report(model, path, twin=twin_samples.twin())
     with pytest.raises(ValueError, match="seeds is empty"):
         report(model, path, seeds=[])
     with pytest.raises(ValueError, match=r"seeds = 0\.5 must be a whole number"):

@@ -11,7 +11,6 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_yann import ImprovementGuard, NoActionNoise
-from sparse_qp import FEATURES, worst_difference
 
 STEPS = int(os.environ.get("LONG_STEPS", 40_000))
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -46,22 +45,3 @@ def test_nothing_grows(tmp_path) -> None:
     assert memory[-5:].mean() < 1.05 * memory[8:12].mean()
     assert files[-1] <= files[10]
     assert threads[-1] <= threads[10]
-
-
-CASES = [*(((name,), 200) for name in FEATURES), (FEATURES, 100)]
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(("features", "count"), CASES, ids=lambda each: str(each))
-def test_random_problems_agree_with_sparse_programs(
-    features: tuple[str, ...], count: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found = [worst_difference(features, seed, points=4) for seed in range(count)]
-    worst = max(range(count), key=lambda seed: found[seed][0])
-    points = sum(each[1] for each in found)
-    with capsys.disabled():
-        print(
-            f"\n{' + '.join(features)}: {count} problems, {points} points, worst "
-            f"{found[worst][0]:.1e} half-ranges (seed {worst})"
-        )
-    assert points > 2 * count and found[worst][0] < 1e-8

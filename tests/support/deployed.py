@@ -18,9 +18,17 @@ from gymnasium import spaces
 import general_problems
 import sample_laws
 from policy_samples import make_policy
-from sb3_yann import AffineObservation, Checks, LinearMPC, RateLimits, YannPolicy, export
+from sb3_yann import (
+    AffineObservation,
+    Checks,
+    LinearMPC,
+    RateLimits,
+    YannPolicy,
+    export,
+    with_extra,
+)
 from sb3_yann.deployment.controller import Controller
-from weights import network_of
+from weights import shake
 
 COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
@@ -35,10 +43,7 @@ def disturbed(mpc: LinearMPC, size: float = 0.4, seed: int = 1, **kwargs: Any) -
     high = mpc.u_max.astype(np.float32)
     inputs = spaces.Box(low, high, dtype=np.float32)
     policy = make_policy(kwargs.pop("observation_space"), inputs, problem=mpc, **kwargs)
-    generator = th.Generator().manual_seed(seed)
-    with th.no_grad():
-        for weight in network_of(policy).parameters():
-            weight.add_(size * th.randn(weight.shape, generator=generator))
+    shake(policy.actor, size, seed)
     return policy
 
 
@@ -88,6 +93,7 @@ CASES: dict[str, Callable[[], YannPolicy]] = {
         ),
         keep_bounds=False,
     ),
+    "extra signals": lambda: disturbed(with_extra(sample_laws.solved("reactor"), -1, 1)),
     "nothing learnt": lambda: disturbed(sample_laws.solved("reactor"), size=0.0),
 }
 

@@ -9,27 +9,28 @@ ROOT = Path(__file__).parents[2]
 
 
 def run_python(
-    code: str, *args: str, stdin: bytes = b"", timeout: float | None = None
-) -> subprocess.CompletedProcess[bytes]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.run(
-        [sys.executable, "-c", code, *args],
-        input=stdin,
-        capture_output=True,
-        env=environment,
-        timeout=timeout,
-    )
+    code: str, *arguments: object, folder: Path = ROOT, **environment: str
+) -> tuple[str, str]:
+    """Run lines of code, and return what they printed and what they said on stderr."""
+    done = _run(folder, "-c", code, *arguments, **environment)
+    return done.stdout, done.stderr
 
 
-def run_module(folder: Path, module: str, *arguments: str) -> str:
+def run_module(folder: Path, module: str, *arguments: object) -> str:
     """Run ``python -m module`` in a folder, and return what it printed."""
+    return _run(folder, "-m", module, *arguments).stdout
+
+
+def _run(folder: Path, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    # The root comes first: `tests` has folders of the same names as what is run.
+    path = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
     done = subprocess.run(
-        [sys.executable, "-m", module, *arguments],
+        [sys.executable, *map(str, arguments)],
         cwd=folder,
+        env={**os.environ, "PYTHONPATH": path, **environment},
         capture_output=True,
         text=True,
-        # The root comes first: `tests` has folders of the same names as what is run.
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])},
+        timeout=1800,
     )
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    return done

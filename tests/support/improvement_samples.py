@@ -82,13 +82,11 @@ class Elsewhere(Spring):
         self.observation_space = ProblemBox(low, high, problem=moved())
         self.action_space = gym.spaces.Box(np.float32(PUSH - 1), np.float32(PUSH + 1))
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        return (self.x + POINT).astype(np.float32), {}
+    def shown(self) -> np.ndarray:
+        return (self.x + POINT).astype(np.float32)
 
     def step(self, action: Any) -> Any:
-        _, *rest = super().step(np.asarray(action, float) - PUSH)
-        return (self.x + POINT).astype(np.float32), *rest
+        return super().step(np.asarray(action, float) - PUSH)
 
 
 class Counted(Spring):

@@ -1,5 +1,6 @@
 """A small plant that its linear model does not describe, its MPC, and logs of it."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -90,28 +91,9 @@ def twin(episodes: int = 5) -> PlantTwin:
     return PlantTwin.fit(problem(), log(episodes), residuals=POLYNOMIALS)
 
 
-def mean_cost(act: Any, seeds: range = range(900, 940)) -> np.ndarray:
-    """Return the costs of a policy on the plant."""
-    env = Cart()
-    costs = []
-    for seed in seeds:
-        x = env.reset(seed=seed)[0]
-        over = False
-        cost = 0.0
-        while not over:
-            x, reward, _, over, _ = env.step(act(x))
-            cost -= reward
-        costs.append(cost)
-    return np.array(costs)
-
-
 def rated() -> PlantTwin:
     """The cart's twin with bounds on the rate of its input."""
-    plain = problem()
-    mpc = LinearMPC(
-        plain.model, Q=plain.Q, R=plain.R, horizon=3, u_min=-1, u_max=1, theta_min=[-3, -3],
-        theta_max=[3, 3], rate=RateLimits(-0.3, 0.3),
-    )  # fmt: skip
+    mpc = replace(problem(), rate=RateLimits(-0.3, 0.3))
     return PlantTwin.fit(mpc, log(4), residuals=POLYNOMIALS)
 
 
@@ -122,12 +104,7 @@ D_MAX = 0.02
 @cache
 def offset_free_problem() -> tuple[LinearMPC, Any]:
     """The cart's MPC with a set-point and a disturbance, and the observer that estimates it."""
-    plain = problem()
-    tracking = LinearMPC(
-        plain.model, Q=plain.Q, R=plain.R, horizon=2, u_min=-1, u_max=1, theta_min=[-3, -3],
-        theta_max=[3, 3], tracking=Tracking([0], -0.5, 0.5),
-    )  # fmt: skip
-    mpc, _ = offset_free(tracking, D_MAX)
+    mpc, _ = offset_free(replace(problem(), horizon=2, tracking=Tracking([0], -0.5, 0.5)), D_MAX)
     return mpc, DisturbanceObserver(mpc.model, disturbance_noise=0.05)  # a slow one
 
 

@@ -24,6 +24,14 @@ def is_mpc(owner: Any) -> bool:
     return network_of(owner).is_zero()
 
 
+@th.no_grad()
+def shake(owner: Any, size: float, seed: int = 0) -> None:
+    """Add noise of this size to all parameters."""
+    generator = th.Generator().manual_seed(seed)
+    for each in owner.parameters():
+        each += size * th.randn(each.shape, generator=generator, dtype=each.dtype)
+
+
 def first_layer(owner: Any) -> th.nn.Parameter:
     """Return weights and, as the last column, biases: (n_regions, n_nodes, out, in + 1)."""
     return network_of(owner).first.nodes

@@ -254,8 +254,7 @@ def test_a_gain_that_depends_on_the_level_is_no_unit() -> None:
 
 @cache
 def reactor():
-    played = evaluate(problems.cstr().explicit(), "CSTR-v0", seeds=range(3))
-    return [*zip(played.observations, played.actions, strict=True)]
+    return evaluate(problems.cstr().explicit(), "CSTR-v0", seeds=range(3)).pairs
 
 
 KELVIN = np.array([0.0, 0.0, *cstr.X_SS[2:]])

@@ -1,7 +1,7 @@
 """What a policy changes on the plant: intervals over all twins that a log does not refute."""
 
 import copy
-from typing import Any
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -160,43 +160,22 @@ class Motor(Sampled):
         return np.array([place, speed])
 
 
-def episodes(mpc: LinearMPC, act: Any, seeds: range) -> tuple[list[Any], np.ndarray]:
-    """Return a log of the motor, and what each episode cost."""
-    env = Motor(mpc)
-    law = mpc.law()
-    found = []
-    costs = []
-    for seed in seeds:
-        x = env.reset(seed=seed)[0]
-        over = False
-        cost = 0.0
-        states = [x]
-        actions = []
-        while not over:
-            actions.append(np.atleast_1d((act or law)(x)))
-            x, reward, _, over, _ = env.step(actions[-1])
-            states.append(x)
-            cost -= reward
-        found.append((np.array(states, float), np.array(actions, float)))
-        costs.append(cost)
-    return found, np.array(costs)
-
-
 @pytest.mark.slow
 def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_networks(
     monkeypatch,
 ) -> None:
     monkeypatch.setattr(plant_twin, "LONG_LOG", 100)
     mpc = motor()
-    logged = episodes(mpc, None, range(100, 130))[0]
-    _, before = episodes(mpc, None, TESTS)
+    make = partial(Motor, mpc)
+    logged = evaluate(mpc.law(), make, range(100, 130)).pairs
+    before = evaluate(mpc.law(), make, TESTS).costs
     for kinds in (("none", "linear", "quadratic"), ("none", "network")):
         twin = PlantTwin.fit(mpc, logged, residuals=kinds)
         assert twin.trusted
         model = DDPG("YannPolicy", Motor(mpc), device="cpu", seed=0)
         found = improve(model, twin)
         assert found.accepted == ("network" in kinds)
-    costs = episodes(mpc, lambda x: model.predict(x)[0], TESTS)[1]
+    costs = evaluate(model, make, TESTS).costs
     assert costs.mean() < 0.99 * before.mean() and np.all(costs < before)
     assert costs.mean() / before.mean() - 1 == pytest.approx(found.change, abs=0.02)
 

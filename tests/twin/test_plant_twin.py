@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from stable_baselines3 import DDPG
 
 from general_problems import solved
@@ -221,11 +220,6 @@ def test_the_report_counts_what_it_leaves_out_and_says_what_the_log_does_not_sho
     none = dataclasses.replace(given, predicted=np.zeros(0), actual=np.zeros(0))
     for part in ("Error of free runs", "Cost of held-out"):
         assert part in text and part not in report(mpc, still, "linear", none)
-
-
-def lines(axes: Axes) -> dict[str, np.ndarray]:
-    """Return what is drawn, by its label or its colour."""
-    return {str(each.get_label()): np.array(each.get_data()) for each in axes.lines}
 
 
 def test_without_a_second_episode_the_pictures_are_empty() -> None:

@@ -23,7 +23,6 @@ from sb3_yann import (
     with_extra,
 )
 from sb3_yann._validation import Array
-from sb3_yann.plan import TwinPlant
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.log import Episode, EstimatedDisturbanceWarning, observer_of, warn_of_estimates
 from sb3_yann.twin.row_layout import RowLayout
@@ -201,24 +200,6 @@ def test_starts_begin_with_the_estimate_of_an_observer_that_begins() -> None:
         np.testing.assert_array_equal(drawn[:, row.state], drawn[:, :2])
         np.testing.assert_array_equal(drawn[:, [3, 4]], 0.0)
     assert all(each.shape == (5,) for each in found.starts.shown)
-
-
-def test_a_plan_in_it_takes_the_estimate_for_constant() -> None:
-    found = observed()
-    rng = np.random.default_rng(0)
-    plant = TwinPlant(found.dynamics, [0, 3])
-    rows = np.arange(2)
-    theta = found.dynamics.row.shown(found.starts.draw_logged(2, rng))
-    u = np.full((2, 1), 0.3)
-    A, B = (each[0] for each in plant.jacobians(theta[None], u[None], rows))
-    after = plant.step(theta, u, rows)
-    step = 1e-6
-    np.testing.assert_array_equal(after[:, 2:], theta[:, 2:])
-    for j in range(5):
-        moved = plant.step(theta + step * np.eye(5)[j], u, rows)
-        np.testing.assert_allclose(A[..., j], (moved - after) / step, atol=1e-4)
-    np.testing.assert_allclose(B[..., 0], (plant.step(theta, u + step, rows) - after) / step,
-                               atol=1e-4)  # fmt: skip
 
 
 def test_the_observer_is_found_among_the_wrappers() -> None:

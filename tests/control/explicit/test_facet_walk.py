@@ -116,9 +116,6 @@ def test_a_region_thinner_than_a_millionth_of_the_box_is_found() -> None:
     assert relative_error(slim, law(points), inputs) <= 1e-9
 
 
-"""x, y >= 0 and 3 x + 4 y <= 12: corners at (0, 0), (4, 0) and (0, 3); the inner circle has 1."""
-
-
 def polygon(seed: int, rows: int = 9) -> tuple[np.ndarray, np.ndarray]:
     """Return a bounded polyhedron of unit rows about a point near the origin."""
     rng = np.random.default_rng(seed)

@@ -1,9 +1,6 @@
 """A walk along a line finds the region that a scan of all regions finds."""
 
-import os
 import pickle
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fresh_process import run_python
 from random_problems import (
     as_range,
     balls,
@@ -145,16 +143,10 @@ def test_without_a_compiler_the_law_is_the_same(tmp_path: Path) -> None:
         "points = np.random.default_rng(0).uniform(-7.5, 7.5, (200, 2))\n"
         "print(law(points).tobytes().hex(), law(points[0]).tobytes().hex())"
     )
-    here = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    outputs = [
-        subprocess.run(
-            [sys.executable, "-c", program, tmp_path / "law.npz"],
-            env={**here, "NUMBA_DISABLE_JIT": off},
-            capture_output=True, text=True, check=True, cwd=Path(__file__).parent,
-        ).stdout
-        for off in "01"
-    ]  # fmt: skip
-    assert outputs[0] == outputs[1]
+    compiled, plain = (
+        run_python(program, tmp_path / "law.npz", NUMBA_DISABLE_JIT=off)[0] for off in "01"
+    )
+    assert compiled == plain
 
 
 # ---- What holds for the law of any problem: random plants, bounds, units and parts of theta ----

@@ -11,7 +11,7 @@ import pytest
 from scipy import linalg
 
 from errors import Message, raises
-from general_problems import PROBLEMS, THERMAL, servo, solved
+from general_problems import PROBLEMS, servo, solved
 from sample_problems import box_points
 from sb3_yann import (
     DisturbanceBounds,
@@ -26,11 +26,10 @@ from sb3_yann import (
     Tracking,
     export,
 )
-from sb3_yann.control import lqr
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
 from sb3_yann.deployment.controller import Controller
 from sb3_yann.wrappers import PlantEnv
-from sparse_qp import FEATURES, SparseQP, draw, online_answers, relative_error, worst_difference
+from sparse_qp import FEATURES, draw, online_answers, relative_error, worst_difference
 
 CART = LinearModel([[1, 1], [0, 1]], [[0], [1]], dt=1.0)
 BOUNDS: dict[str, Any] = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 1}
@@ -51,11 +50,14 @@ def test_outputs_may_be_called_by_the_names_of_their_states() -> None:
         cart(model, tracking=Tracking(["T"], -1, 1))
 
 
+@pytest.mark.parametrize(
+    "seeds", [range(1, 3), pytest.param(range(200), marks=pytest.mark.nightly)]
+)
 @pytest.mark.parametrize("features", [*((name,) for name in FEATURES), FEATURES])
-def test_laws_are_those_of_a_sparse_program_of_another_solver(features: tuple[str, ...]) -> None:
-    found = [worst_difference(features, seed, points=4) for seed in (1, 2)]
+def test_laws_are_those_of_a_sparse_program_of_another_solver(features, seeds: range) -> None:
+    found = [worst_difference(features, seed, points=4) for seed in seeds]
     assert max(each[0] for each in found) < 1e-8
-    assert sum(each[1] for each in found) >= 3
+    assert sum(each[1] for each in found) > len(seeds)
 
 
 @pytest.mark.parametrize(
@@ -248,38 +250,6 @@ def test_four_states_and_a_horizon_of_twenty_have_few_regions_with_a_control_hor
     assert regions < 2000, regions
 
 
-def test_a_preview_makes_up_for_a_dead_time_as_well_as_a_sparse_program() -> None:
-    n = 6
-    A = np.eye(n, k=-1)
-    B = np.eye(n, 1, k=-1)
-    # the input acts five samples later
-    A[0, 0] = 0.9
-    A[1, 0] = 0
-    A[0, 5] = 0.1
-    given: dict[str, Any] = {"Q": np.diag([1.0] + [0] * 5), "R": [[0.01]], "horizon": 12}
-    given |= {"x_min": -4, "x_max": 4, "u_min": -4, "u_max": 4}
-
-    def ahead(preview: int) -> LinearMPC:
-        tracking = Tracking([0], -4, 4, preview=preview)
-        return LinearMPC(LinearModel(A, B, 1.0), **given, tracking=tracking)
-
-    references = np.repeat([0.0, 1.0, -0.5], 12)
-
-    def cost(act: Any, preview: int) -> float:
-        x = np.zeros(n)
-        total = 0.0
-        for k in range(len(references)):
-            known = references[np.minimum(np.arange(k, k + preview + 1), len(references) - 1)]
-            u = act(np.concatenate([x, known]))
-            total += (x[0] - references[k]) ** 2 + 0.01 * (u[0] - references[k]) ** 2
-            x = A @ x + B @ u
-        return total
-
-    best = cost(SparseQP(ahead(12)), 12)
-    costs = [cost(ahead(preview).online(), preview) for preview in (9, 0)]
-    assert costs[0] < 1.02 * best < 0.3 * costs[1]
-
-
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_law_and_domain_are_those_of_an_online_qp(name: str) -> None:
     mpc = solved(name)
@@ -318,14 +288,6 @@ def soft_cost(mpc: LinearMPC, units: np.ndarray) -> float:
     return float(x @ np.abs(mpc.Q) @ x + x @ np.abs(mpc.terminal.cost) @ x + 0.3)
 
 
-def test_the_law_reaches_beyond_a_soft_bound_without_a_note() -> None:
-    soft = {"x_min": -1.2, "x_max": 1.2, "soft": SoftBounds(1, penalty=300)}
-    law = servo(**soft).explicit()
-    assert law.in_domain([2.0, 0.0, 0.5])
-    with pytest.warns(UserWarning, match=r"bounds -1.2 to 1.2 of x\[0\], .* the law ends there"):
-        servo(**soft, theta_min=-1.2, theta_max=1.2)
-
-
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
     mpc = solved(name)
@@ -351,24 +313,6 @@ def test_stage_cost_is_the_formula() -> None:
     e = theta[:2] - x_s
     expected = e @ mpc.Q @ e + 0.1 * (u - u_s) ** 2 + 2.0 * (0.4 - 0.2) ** 2
     assert mpc.stage_cost(theta, u) == pytest.approx(float(expected[0]))
-
-
-def test_a_weight_on_the_rate_has_the_gain_of_the_augmented_lqr() -> None:
-    box = {"x_min": None, "x_max": None, "theta_min": -9, "theta_max": 9}
-    mpc = servo(rate=RateLimits(R_du=[[2.0]]), **box, u_min=-90, u_max=90)
-    A = THERMAL.A
-    B = THERMAL.B
-    bigger = LinearModel(
-        np.block([[A, np.zeros((2, 1))], [np.zeros((1, 3))]]), np.vstack([B, [[1.0]]]), 1.0
-    )
-    Q = np.diag([1, 1, 2.0])
-    R = np.array([[0.1 + 2.0]])
-    N = np.array([[0], [0], [-2.0]])
-    P = lqr.riccati(bigger, Q, R, cross=N)
-    K = lqr.gain(bigger, R, P, cross=N)
-    law = mpc.explicit()
-    gain = law.gains[law.locate(np.zeros(4))]
-    np.testing.assert_allclose(gain[:, [0, 1, 3]], -K, rtol=1e-9, atol=1e-12)
 
 
 BAD: list[tuple[Callable[[], dict[str, Any]], Message]] = [

@@ -28,18 +28,6 @@ def test_so_is_the_explicit_law(pole, horizon) -> None:
     assert compared and max(online, explicit) < 1e-8
 
 
-@pytest.mark.parametrize("horizon", [15, 45, 90])
-def test_without_active_constraints_the_law_is_the_regulator(horizon) -> None:
-    A = np.array([[1.7, 0.2], [0.0, 0.6]])
-    B = np.array([[0.4], [1.0]])
-    Q = np.diag([2.0, 0.5])
-    R = np.array([[0.3]])
-    P = linalg.solve_discrete_are(A, B, Q, R)
-    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    mpc = LinearMPC(LinearModel(A, B, dt=1), Q=Q, R=R, horizon=horizon, **BOX)
-    assert np.abs(mpc.online().gain([0.0, 0.0]) + K).max() < 1e-10
-
-
 def test_a_stable_plant_is_condensed_in_its_inputs() -> None:
     mpc = LinearMPC(LinearModel([[0.9]], [[1.0]], dt=1), Q=[[1]], R=[[1]], horizon=40, **BOX)
     assert mpc.condensed().feedback is None

@@ -64,15 +64,6 @@ def test_a_problem_names_its_bounds() -> None:
     assert "r_min=[" in repr(servo())
 
 
-def test_a_start_in_deviations_is_refused() -> None:
-    hot = LinearModel([[0.9]], [[0.5]], 1, x_ss=[350], u_ss=[40], state_names=["temperature"])
-    limits = {"x_min": 330, "x_max": 370, "u_min": 20, "u_max": 60}
-    mpc = LinearMPC(hot, Q=[[1]], R=[[1]], horizon=2, **limits)
-    with pytest.raises(ValueError, match=r"temperature = 2 is shown.*this is a deviation"):
-        mpc.simulate([2.0], 5)
-    assert mpc.simulate([352.0], 5)[0][0] == 352
-
-
 def heater() -> Plant:
     """Shows a temperature near 350 K, takes a power of 20 to 60 kW."""
     return Plant(lambda x, u: 350 + 0.9 * (x - 350) + 0.05 * (u - 40), (300, 400), (20, 60), 350)
@@ -153,31 +144,6 @@ def test_active_constraints_are_shares_of_the_feasible_parameters() -> None:
 def test_a_seed_below_zero_is_named() -> None:
     with pytest.raises(ValueError, match="seed = -1 must be a whole number of at least 0"):
         solved("servo").report(seed=-1)
-
-
-def test_boxes_and_points_are_as_the_plant_shows_them_where_it_does_not_rest_at_zero() -> None:
-    model = LinearModel([[0.9]], [[0.1]], 2.5, x_ss=[300.0], u_ss=[40.0], state_names=["T"])
-    mpc = LinearMPC(
-        model, Q=[[1]], R=[[1]], horizon=3, u_min=38, u_max=43, theta_min=295, theta_max=307,
-        tracking=Tracking([0], 299, 302),
-    )  # fmt: skip
-    lines = mpc.report(samples=20).splitlines()
-    assert lines[0] == (
-        "Parameters of the law, 2, in plant units; the operating point is in brackets:"
-    )
-    assert lines[1].split() == "T 295 to 307 [300] state 0".split()
-    assert lines[2].split()[-9:] == "299 to 302 [300] reference of tracked output 0".split()
-    assert "Horizon: 3 steps of 2.5." in lines
-    at = next(i for i, line in enumerate(lines) if line.startswith("The law at a few parameters"))
-    assert lines[at + 1] == "  [300, 300] -> u = [40]"
-    rng = np.random.default_rng(0)
-    law = mpc.explicit()
-    own = mpc.deviations
-    points = rng.uniform(own.theta_min, own.theta_max, (20, 2))
-    for line, theta in zip(lines[at + 2 :], points, strict=False):
-        shown = ", ".join(f"{each:.4g}" for each in theta + 300)
-        assert line == f"  [{shown}] -> u = [{law(theta)[0] + 40:.4g}]"
-    assert len(lines) == at + 5
 
 
 def test_a_parameter_without_a_solution_is_said_to_be_none() -> None:

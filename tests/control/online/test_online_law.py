@@ -255,13 +255,3 @@ def test_a_penalty_beyond_all_digits_of_float64_gives_the_law_of_one_that_is_wit
     expected = cart(1e6).explicit()(1e6 * points)
     for solve in (LinearMPC.online, LinearMPC.explicit):
         np.testing.assert_allclose(solve(cart(unit))(unit * points), expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("unit", [1e-4, 1e4])
-def test_a_law_is_the_same_whatever_the_unit_of_the_states(unit: float) -> None:
-    points = np.random.default_rng(0).uniform(-1.4, 1.4, (200, 2)) * [1, 0.5]
-    one = cart()
-    other = cart(unit, soft=SoftBounds(x=unit, penalty=1e3))
-    for solve in (LinearMPC.online, LinearMPC.explicit):
-        expected = solve(one)(points)
-        np.testing.assert_allclose(solve(other)(unit * points), expected, rtol=0, atol=1e-9)
