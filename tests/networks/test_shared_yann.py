@@ -41,12 +41,6 @@ def drawn(mpc: LinearMPC, count: int = 64) -> th.Tensor:
     return th.as_tensor(theta)
 
 
-def as_inputs(mpc: LinearMPC, actions: th.Tensor) -> np.ndarray:
-    low = mpc.u_min
-    high = mpc.u_max
-    return low + (actions.detach().double().numpy() + 1) / 2 * (high - low)
-
-
 def test_the_equilibrium_stays_where_it_is_unless_it_is_not_pinned() -> None:
     origin = th.zeros(1, 4)
     rest = layer_of(reactor(), "online")(origin)
