@@ -238,8 +238,11 @@ class LawLayer(nn.Module):
 
 
 def clamp_theta(theta: th.Tensor, ends: th.Tensor | None) -> th.Tensor:
-    """Return theta (batch, n) between ends (2, n), see `MPCProblem.clamped`; as it is for None."""
-    return theta if ends is None else theta.double().clamp(ends[0], ends[1])
+    """Return theta (batch, n) between ends (2, n), NaN where infinite; as it is for None."""
+    if ends is None:
+        return theta
+    theta = theta.double()
+    return th.where(theta.isfinite(), theta.clamp(ends[0], ends[1]), th.nan)
 
 
 def _kept_in_actions(kept: KeptSet, middle: Array, half_range: Array) -> Array:
@@ -358,7 +361,8 @@ class YannLayer(LawLayer):
 
     def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array, Array]:
         inputs: Array = np.empty((len(theta), self.base_law.n_inputs))
-        return *self.base_law.packed, inputs, self.base_law.clamp(theta)
+        known = np.where(np.isfinite(theta), theta, np.nan)  # clamping hides what is infinite
+        return *self.base_law.packed, inputs, self.base_law.clamp(known)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
         constants = "gains", "offsets", "resting", "half_space_A", "half_space_b"

@@ -15,6 +15,7 @@ from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+import general_problems
 from policy_samples import make_policy
 from random_problems import examples
 from random_problems import problems as random_problems
@@ -195,6 +196,18 @@ def test_where_an_observation_is_not_finite_the_law_acts_and_says_so(net_arch, b
         assert np.isfinite(model.predict(LOST[0])[0]).all()
     with pytest.warns(NonFiniteWarning):
         assert model.policy(th.as_tensor(LOST)).isfinite().all()
+
+
+@pytest.mark.parametrize("net_arch", [[3], [3, 3]], ids=["torch", "compiled"])
+@pytest.mark.parametrize("networks", ["per_region", "shared"])
+def test_an_infinite_set_point_is_not_the_end_of_its_range(networks, net_arch) -> None:
+    mpc = general_problems.solved("servo")
+    policy = policy_of(mpc, net_arch=net_arch, networks=networks)
+    seen = np.float32([[0.3, 0.2, np.inf], [0.3, 0.2, 0.0], [0.3, 0.2, 1.0]])
+    with pytest.warns(NonFiniteWarning, match=r"entries \[2\]"):
+        lost, rests, end = policy.predict(seen)[0]
+    np.testing.assert_allclose(lost, rests, atol=1e-6)
+    assert abs(end - rests) > 0.01
 
 
 @pytest.mark.parametrize("net_arch", [[3], [3, 3]], ids=["torch", "compiled"])
