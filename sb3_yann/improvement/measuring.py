@@ -487,6 +487,10 @@ class _Search:
         parts = offset, max(0.0, known - offset), total - max(offset, known)
         whole = Headroom(base, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
+        if verdict == [*ADVICE][1]:  # where it loses from some starts, others may bring less
+            by_observer = dataclasses.replace(whole, best_costs=observer)
+            if not offset > SURE * by_observer.standard_error:
+                verdict = UNKNOWN
         lost = -gain(base, self.played.get("plan", base)) if self.poor else 0.0
         if lost > 0 and verdict_of(*parts) == "keep the MPC":
             verdict = UNKNOWN

@@ -277,7 +277,7 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
             "pinned": pin_equilibrium,
             "n_outputs": n_outputs,
         }
-        ends = None if problem.clamped is None else th.as_tensor(problem.clamped)
+        ends = None if problem.clamped is None else th.as_tensor(np.array(problem.clamped))
         self.register_buffer("clamped", ends, persistent=False)
         self.q_networks = []
         for i in range(n_critics):

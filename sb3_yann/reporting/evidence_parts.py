@@ -91,7 +91,7 @@ def loops_part(subject: Subject) -> Part:
         "and by the policy from the same start, without any noise of actions. A cost is minus the "
         "sum of the rewards."
     )
-    if isinstance(getattr(subject.env, "unwrapped", None), TwinEnv):
+    if _in_twin(subject):
         how += " The env is a twin, fitted to the plant's log: the plant has played none of them."
     state = subject.state
     known = set() if state is None else {*state.evidence.starts.seeds} & {*subject.seeds}
@@ -143,6 +143,10 @@ def _change(old: float, new: float) -> str:
     return change_in_percent((new - old) / abs(old)) if old else f"{new - old:+.4g}"
 
 
+def _in_twin(subject: Subject) -> bool:
+    return isinstance(getattr(subject.env, "unwrapped", None), TwinEnv)
+
+
 def statistics_part(subject: Subject) -> Part:
     """Return what the closed loops prove, in words."""
     title = "Statistics in words"
@@ -166,7 +170,8 @@ def statistics_part(subject: Subject) -> Part:
         width = 100 * Difference.relative(change, mpc.costs).room(0.025)
         passed = True if mean + width < 0 else False if mean - width > 0 else None
         text = (
-            f"On average the cost changes by {mean:+.2f} %; the change lies between "
+            f"On average the cost {'in the twin ' * _in_twin(subject)}changes by {mean:+.2f} %; "
+            "the change lies between "
             f"{mean - width:+.2f} and {mean + width:+.2f} % with a confidence of 95 %, by "
             f"Student's interval of {count} pairs, and of the MPC's mean."
         )

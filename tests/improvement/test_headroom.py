@@ -163,6 +163,18 @@ def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
     assert abs(without[-1, 0] - without[-1, 1]) > 0.02
 
 
+def test_an_observer_that_pays_from_one_start_of_three_is_not_known_to_pay() -> None:
+    class Seldom(Heater):
+        def reset(self, *, seed=None, options=None):
+            found = super().reset(seed=seed)
+            self.load = 0.2 * (seed == 1)
+            return found
+
+    found = headroom(heater(), Seldom, n_starts=3, max_steps=NO_PLANS)
+    assert found.offset > 0.02 and found.verdict == "not known"
+    assert "may be chance on so few starts" in found.report()
+
+
 def test_a_disturbance_beyond_the_default_is_reported() -> None:
     plant = partial(Heater, load=0.6)
     found = headroom(heater(), plant, n_starts=3, max_steps=NO_PLANS)

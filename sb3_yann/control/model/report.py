@@ -201,6 +201,8 @@ def _gains(model: LinearSystem) -> list[str]:
         none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in unsure)
         noise = "process noise" if model.C is None else "process and sensor noise"
         text = f" Not distinguishable from zero: {none}." if none else ""
+        if any("standard errors do not tell" in each for each in model.notes):
+            noise += " alone: the notes say what there is besides, by which gains err more"
         lines.append(f"  ± is a 95 % interval, under {noise}.{text}")
     return lines
 
