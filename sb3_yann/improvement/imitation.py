@@ -241,10 +241,6 @@ def imitate(
         score = teacher.score(played.costs)
         saved = teacher.saved(played.costs, teacher.usual)
         objection = teacher.objection(played)
-        say(
-            f"fit {fit + 1}, in the model: policy {change_in_percent(-saved)}, plans "
-            f"{change_in_percent(-teacher.gain)}{'; ' * bool(objection)}{objection}"
-        )
         if score > most + NEAR / 2 * teacher.gain:
             since = fit
         if score > most:
@@ -253,11 +249,18 @@ def imitate(
             best = copy.deepcopy(layer.state_dict())
         done = teacher.saved(played.costs) >= (1 - NEAR) * teacher.saved(teacher.attainable)
         vain = since < fit and most >= NEARLY * teacher.gain
-        if (done and not objection) or fit == FITS - 1 or vain:
+        over = (done and not objection) or fit == FITS - 1 or vain
+        descends = over and teacher.scenarios.members is None
+        say(
+            f"fit {fit + 1}, in the model: policy {change_in_percent(-saved)}, plans "
+            f"{change_in_percent(-teacher.gain)}{'; ' * bool(objection)}{objection}"
+            f"{'; the descent is next' * descends}"
+        )
+        if over:
             break
         teacher.show(policy_of(layer, teacher.problem), played)
     layer.load_state_dict(best)
-    if teacher.scenarios.members is None:
+    if descends:
         promised = refine(layer, teacher)
         say(f"descent, in the model: policy {change_in_percent(-promised)}")
     return promised

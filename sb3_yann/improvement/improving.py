@@ -166,8 +166,8 @@ class Improvement:
             last = self._last
             change = f"{self._change(last.change, last)}: not accepted" if last else ""
             return summary_lines(said, change=change, steps=steps, next=self._next())
-        last = next((each for each in reversed(self.checks) if each.accepted), None)
-        rows = {"change": self._change(self.change, last)}
+        last = self._accepted
+        rows = {"change": self.change_in_words}
         if last is not None:
             rows["worst_start"] = f"{change_in_percent(last.worst)} of the MPC's mean cost"
             rows["worst_start"] += " in the twin: the plant's may be worse" * (source == "twin")
@@ -176,6 +176,15 @@ class Improvement:
         more = f'report(result.model, "report.html", {which}), then '
         more += "Commissioning(result.model, plant, shadow=True)"
         return summary_lines("Accepted: a better policy.", **rows, steps=steps, next=more)
+
+    @property
+    def _accepted(self) -> Check | None:
+        return next((each for each in reversed(self.checks) if each.accepted), None)
+
+    @property
+    def change_in_words(self) -> str:
+        """The change of what was accepted, with its interval: in the simulator, or on the plant."""
+        return self._change(self.change, self._accepted)
 
     def _change(self, change: float, check: Check | None) -> str:
         """Return a change with the interval of its check: in the simulator, or on the plant."""

@@ -421,8 +421,10 @@ def improve_part(subject: Subject) -> Part:
     now = subject.improved
     state = subject.state
     if now is not None:
-        place = f"{now.where} ({now.episodes} episodes, {100 * now.change:+.2f} %)"
-        text = f"The policy is the one that improve accepted last, in {place}."
+        text = (
+            f"The policy is the one that improve accepted last, in {now.where} ({now.episodes} "
+            f"episodes): {now.change_in_words}."
+        )
         finding = make_finding(True, text)
     elif not any(each.accepted for each in found):
         finding = Finding("note", f"improve was at work. {found[-1].reason}")
