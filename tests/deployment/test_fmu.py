@@ -237,7 +237,10 @@ def test_an_interrupt_leaves_no_files_of_the_compiler_and_none_of_its_processes(
     temporary.mkdir()
     (tmp_path / "cc").write_text(SLOW.format(told))
     (tmp_path / "cc").chmod(0o755)
-    program = "from sb3_yann.deployment import c_code\nc_code._library({'a.c': 'int a;'})"
+    program = (
+        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"  # as in front
+        "from sb3_yann.deployment import c_code\nc_code._library({'a.c': 'int a;'})"
+    )
     path = f"{tmp_path}:{os.environ['PATH']}"
     environment = {**os.environ, "TMPDIR": str(temporary), "PATH": path}
     running = subprocess.Popen(
