@@ -454,7 +454,7 @@ def reidentified(
         x, u = _rest(problem, A, B, residual.predict(middle)[0])
     note = f"Re-identified from {len(log)} episodes: {choice.name}."
     own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
-    own |= {"notes": [*model.notes, note], "drift": None, "gains": None}
+    own |= {"notes": [note], "drift": None, "gains": None}  # what was said of the given one
     found = LinearModel(**{**vars(model), **own})
     terminal = Terminal(set="invariant" if len(problem.terminal.set[1]) else None)
     return replace(problem, model=found, terminal=terminal)

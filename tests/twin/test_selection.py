@@ -108,8 +108,11 @@ def test_a_log_of_the_cart_corrects_its_model_and_keeps_all_else() -> None:
 
 
 def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() -> None:
-    mpc = dataclasses.replace(tank(), model=tank().model.named(["level"], units={"level": "cm"}))
+    named = tank().model.named(["level"], units={"level": "cm"})
+    noted = LinearModel(**{**vars(named), "notes": ["Fitted once."]})
+    mpc = dataclasses.replace(tank(), model=noted)
     found = PlantTwin.fit(mpc, worn_log(mpc)).reidentified()
+    assert [each[:13] for each in found.model.notes] == ["Re-identified"]  # what is true of it
     assert (found.model.state_names, found.model.units) == (("level",), ("cm", ""))
     np.testing.assert_allclose(found.model.B, [[PUMP]], rtol=0.05)
     np.testing.assert_allclose(found.model.x_ss, [5.0], atol=1e-9)  # so that r stays what it is

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
+from sb3_yann.control.gains import UNTOLD
 from sb3_yann.control.identification.least_squares import (
     WEAK,
     Regression,
@@ -261,13 +262,12 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
             f"Earlier states and inputs explain {listed(explained)} % of the residuals' variance, "
             "more than sensor noise lets them: there is a state that is not measured, or dead "
             "time. Append earlier readings and inputs to the states, or measure what is missing. "
-            "The standard errors do not tell that."
+            + UNTOLD
         ]
     if np.any(colored):
         notes.append(
             f"The residuals of neighboring steps are correlated ({listed(own)}): "
-            "there is sensor noise, which biases A towards zero, or an unmodeled state. The "
-            "standard errors do not tell that."
+            f"there is sensor noise, which biases A towards zero, or an unmodeled state. {UNTOLD}"
         )
     return notes
 

@@ -6,7 +6,14 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.gains import NORMAL, ON_CIRCLE, SURE_ERRORS, Gains, count_integrators
+from sb3_yann.control.gains import (
+    NORMAL,
+    ON_CIRCLE,
+    SURE_ERRORS,
+    UNTOLD,
+    Gains,
+    count_integrators,
+)
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
 MAY_INTEGRATE = f"may integrate: it is 1 within {SURE_ERRORS:g} standard errors"
@@ -201,7 +208,7 @@ def _gains(model: LinearSystem) -> list[str]:
         none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in unsure)
         noise = "process noise" if model.C is None else "process and sensor noise"
         text = f" Not distinguishable from zero: {none}." if none else ""
-        if any("standard errors do not tell" in each for each in model.notes):
+        if any(each.endswith(UNTOLD) for each in model.notes):
             noise += " alone: the notes say what there is besides, by which gains err more"
         lines.append(f"  ± is a 95 % interval, under {noise}.{text}")
     return lines

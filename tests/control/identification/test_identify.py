@@ -128,6 +128,7 @@ def test_sensor_noise_biases_the_poles_as_stated(sensor: float, bias: float, wit
     if sensor == 0.1:  # beyond the intervals, and reported
         assert not any(coverage(each)[0] or coverage(each)[3] for each in draws)
         assert all("sensor noise" in each.model.report() for each in draws)
+        assert all("under process noise alone" in each.model.report() for each in draws)
 
 
 def test_episodes_are_not_joined_at_their_ends() -> None:
