@@ -98,9 +98,14 @@ class Logged:
 
     @cached_property
     def excitation(self) -> Array:
-        """How much of each input's variance (m,) is its own: not the MPC's, nor linear in theta."""
-        theta = self.row.shown(self.rows)
-        columns = np.column_stack([np.ones(len(theta)), theta, self.law])
+        """How much of each input's variance (m,) neither the MPC nor a line in theta explains.
+
+        Set-points and bounds that change count as held: what they move is excitation.
+        """
+        theta = self.row.shown(self.rows).copy()
+        asked = np.r_[self.problem.layout.reference, self.problem.layout.limits]
+        theta[:, asked] = theta[:, asked].mean(axis=0)
+        columns = np.column_stack([np.ones(len(theta)), theta, law_of(self.problem)(theta)])
         left = self.inputs - columns @ np.linalg.lstsq(columns, self.inputs, rcond=None)[0]
         variance = np.var(self.inputs, axis=0)
         share = np.var(left, axis=0) / np.maximum(variance, 1e-300)

@@ -257,7 +257,7 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
         if (more := len(trust.actual) - 10) > 0:
             said.append(f"  ... and {more} more")
         said.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
-    said.append("Inputs: how much they move, and how much of that does not follow the MPC:")
+    said.append("Inputs: how much they move, and how much of that set-points or tests add:")
     inputs = labels_of(problem.model)[1]
     for name, own, moves in zip(inputs, trust.excitation, trust.moves, strict=True):
         rests = "rests on the given B" if own < ALONE else "is known from the log"

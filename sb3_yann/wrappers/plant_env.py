@@ -144,15 +144,15 @@ UNITS_OF_TIME = (24.0, 60.0, 1000.0, 1440.0, 3600.0, 86400.0)
 class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     """The equations ``dx/dt = f(x, u)`` as an env in plant units.
 
-    The reward is minus the stage cost of the MPC. It shows the state, and what else theta holds, in
-    the order of ``mpc.layout.names``: set-points and bounds that change, drawn uniformly from their
-    ranges and held for the episode, or for ``hold`` steps, and the previous input. No
-    :class:`SetPoint` is needed around it. The state alone is float64, with more of theta it is
-    float32, and ``info["state"]`` is exact. The inputs are held
-    for a sample, ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps``
-    equal steps. ``reset(options={"state": x})`` begins in a state. Where the state is no longer
-    finite an episode terminates, in the last one that was, with ``info["violation"]``; a warning
-    says where f was not.
+    It shows theta, in the order of ``mpc.layout.names``: the state, and what else the MPC has. Of
+    ``tracking=Tracking([0], r_min, r_max)`` theta is ``[x, r]``: the set-point r is drawn uniformly
+    between r_min and r_max at each reset, and held for the episode, or drawn anew every ``hold``
+    steps; so are bounds that change. No :class:`SetPoint` is needed around it. The reward is minus
+    the MPC's stage cost. The state alone is float64, with more of theta it is float32, and
+    ``info["state"]`` is exact. The inputs are held for a sample, ``mpc.model.dt``, in which the
+    classical Runge-Kutta method takes ``substeps`` equal steps. ``reset(options={"state": x})``
+    begins in a state. Where it is no longer finite an episode terminates, in the last one that was,
+    with ``info["violation"]``; a warning says where f was not.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         either side of ``mpc.model.x_ss``, and ends where that box does.
     max_episode_steps : int, default 100
     hold : int, optional
-        Steps after which another set-point is drawn, as of :class:`SetPoint`.
+        Steps after which another set-point is drawn; by default it stays for the episode.
     observer : DisturbanceObserver, optional
         What estimates the disturbances of the MPC, as :func:`offset_free` returns it.
     substeps : int, default 10

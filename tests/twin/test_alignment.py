@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
+from sb3_yann import LinearModel, LinearMPC, PlantEnv, PlantTwin, Tracking, identify
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.alignment import Logged
 from sb3_yann_envs import cstr, problems
@@ -303,6 +303,18 @@ def test_the_input_of_an_mpc_in_a_closed_loop_is_not_its_own() -> None:
     rng = np.random.default_rng(0)
     dithered = [(x, np.clip(u + rng.normal(0, 10, u.shape), -55, 55)) for x, u in reactor()]
     assert PlantTwin.fit(problems.cstr(), dithered).trust.excitation > 0.02
+
+
+def test_set_points_excite_a_closed_loop() -> None:
+    mpc = LinearMPC(
+        LinearModel([[0.9]], [[0.1]], 1.0), Q=[[1]], R=[[1]], horizon=3, u_min=-1, u_max=1,
+        theta_min=-2, theta_max=2, tracking=Tracking([0], -0.5, 0.5),
+    )  # fmt: skip
+    worn = PlantEnv(lambda x, u: np.log(0.9) * (x - 0.8 * u), mpc, hold=25)
+    log = evaluate(mpc.explicit(), worn, seeds=range(5))
+    twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], residuals=SELECT)
+    assert "its gain is known from the log" in twin.report() and not twin.trust.advice
+    assert twin.reidentified().model.B == pytest.approx(0.8 * mpc.model.B, rel=0.01)
 
 
 def test_a_plant_that_is_not_linear_is_led_on_to_where_it_rests() -> None:

@@ -342,12 +342,17 @@ class LinearMPC(MPCProblem):
         Raises
         ------
         ValueError
-            If it lies beyond a bound of x, u or y.
+            If it lies beyond a bound of x, u or y: the law then rests elsewhere, within the bounds,
+            and the stage cost counts from this point all the same.
         """
         return steady_state(self, r, d)
 
     def stage_cost(self, theta: ArrayLike, u: ArrayLike) -> Array:
-        """Return the stage cost, without penalties, at theta (..., n_theta) and u (..., m)."""
+        """Return the stage cost, without penalties, at theta (..., n_theta) and u (..., m).
+
+        Q and R weigh distances from x_s and u_s of theta's r and d, within the bounds or not: where
+        :meth:`is_reachable` says no, a part of the cost stays with any controller.
+        """
         errors = self.error_system
         at = self.units.to_deviations(to_float("theta", theta))
         v = self.units.input_to_deviations(to_float("u", u)) - at @ errors.to_input.T
