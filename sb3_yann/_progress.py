@@ -79,10 +79,17 @@ class _Lines:
         sys.stderr.flush()
 
 
-def bar(what: str, items: Iterable[Any] | None = None, total: int | None = None) -> Any:
-    """Return a bar over items, or one to ``update``; those inside each other share a line."""
+def bar(
+    what: str, items: Iterable[Any] | None = None, total: int | None = None, timed: bool = False
+) -> Any:
+    """Return a bar over items, or one to ``update``; those inside each other share a line.
+
+    A ``timed`` one foretells its end among parts too, in a file after three seconds.
+    """
     watched = is_watched()
-    of_parts = _parts.get()
+    of_parts = _parts.get() and not timed
+    if timed:
+        _Lines.latest = -math.inf
     counted = total is not None or isinstance(items, Sized)
     words = "  {desc}: {n_fmt}" + " of {total_fmt}" * counted
     if not of_parts:
@@ -109,7 +116,7 @@ class Progress:
         self.steps = steps
 
     def __call__(self, text: str, left: float = 0.0, detail: bool = False) -> None:
-        """Write a line; ``left`` are the seconds that the rest may take, 0 where nobody knows.
+        """Write a line; ``left`` are the seconds that the rest may take, no bound; 0 is not known.
 
         In a file a ``detail`` is left out, unless there was no other line for thirty seconds.
         """
@@ -117,8 +124,8 @@ class Progress:
         if _silent.get() or passed < DELAY:
             return
         steps = "" if self.steps is None else f" {self.steps():>9,} steps"
-        most = f", up to about {left:.0f} s left" if left > 0 else ""
-        line = f"[{passed:5.0f} s{steps}{most}] {text}"
+        rest = f", about {left:.0f} s left" if left > 0 else ""
+        line = f"[{passed:5.0f} s{steps}{rest}] {text}"
         if is_watched():
             _Bar.write(line, file=sys.stderr)
         else:

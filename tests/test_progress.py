@@ -39,8 +39,8 @@ class Terminal(io.StringIO):
         return True
 
 
-def counted(clock: Clock, each: float, n: int = 100) -> None:
-    made = bar("plans", total=n)
+def counted(clock: Clock, each: float, n: int = 100, timed: bool = False) -> None:
+    made = bar("plans", total=n, timed=timed)
     made._time = clock
     made.start_t = made.last_print_t = clock()
     for _ in range(n):
@@ -89,7 +89,7 @@ def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     clock.now += 5.0
     progress("a round is over", left=20.0)
     assert capsys.readouterr().err == (
-        "[    5 s     1,234 steps, up to about 20 s left] a round is over\n"
+        "[    5 s     1,234 steps, about 20 s left] a round is over\n"
     )
 
 
@@ -102,6 +102,9 @@ def test_bars_of_parts_count_foretell_nothing_and_leave_little_in_a_file_but_the
         for seconds, lines in ((1.0, ["plans: 3 of 100"]), (1.9, []), (1.9, ["plans: 7 of 100"])):
             counted(clock, seconds)
             assert capsys.readouterr().err.splitlines() == lines
+        Progress()("what is counted next")
+        counted(clock, each=1.0, n=20, timed=True)  # what nothing else foretells
+        assert capsys.readouterr().err == "plans: 3 of 20, 00:03 so far, 00:17 left\n"
         screen = Terminal()
         monkeypatch.setattr(sys, "stderr", screen)
         monkeypatch.setattr(sys, "__stderr__", screen)

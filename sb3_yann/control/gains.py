@@ -20,7 +20,7 @@ normal (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74), nor are gains of a pole 
 FOLLOWS = 3.0  # standard errors from which a state is said to go on and on
 LONG = 100  # samples in which the motion of one must grow by as much as it is, else it is a rate
 ROUNDING = 1e-7  # of a slope, relative to its parts
-UNTOLD = "The standard errors do not tell that."  # ends notes on what they leave out
+UNTOLD = "Standard errors and intervals do not tell that."  # ends notes on what they leave out
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,6 +91,12 @@ class Check:
     starts: int = 0
 
     @property
+    def starts_in_words(self) -> str:
+        """From how many starts of a simulator, and of which; empty in a twin."""
+        which = f"{self.starts} new starts" if self.final else f"the first {self.starts} starts"
+        return which * bool(self.starts)
+
+    @property
     def verdict(self) -> str:
         """Whether it was accepted, or why not, in words."""
         if self.accepted:
@@ -375,7 +381,7 @@ def confirm(
     for _ in trial.stages(act, LOOKS):
         found, verdict = trial.check(number, level, final=True)
         count = len(trial.starts.seeds)
-        say(f"{count} pairs: {100 * found.change:+.2f} %", count)
+        say(f"confirmation, {count} new starts: {100 * found.change:+.2f} %", count)
         enough = LOOKS[-1] if trial.rides_a_bound else ENOUGH
         most = max(-found.change, 2 * found.error - found.logged)  # what it may gain
         hopeless = count > FIRST_LOOK and (verdict.is_hopeless or most < RULE.least_gain)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -189,11 +190,16 @@ class Improvement:
     def _change(self, change: float, check: Check | None) -> str:
         """Return a change with the interval of its check: in the simulator, or on the plant."""
         interval = None if check is None else check.interval
-        if self.where == "the twin" and interval is not None:
+        cost = "of the MPC's mean cost"
+        if self.where == "the twin":
+            found = f"{change_in_percent(change)} {cost} in the twin, from starts like the log's"
+            if interval is None:
+                return found
             low, high = (100 * each for each in interval)
-            more = f"; on the plant {low:+.2f} to {high:+.2f} % (90 %)"
-            return f"{self._change(change, None)}{more}"
-        return f"{change_in_percent(change, interval)} of the MPC's mean cost in {self.where}"
+            return f"{found}; on the plant {low:+.2f} to {high:+.2f} % (90 %)"
+        found = f"{change_in_percent(change, interval)} {cost} in the simulator"
+        starts = check.starts_in_words if check else ""
+        return found + f", from {starts}" * bool(starts)
 
     def _next(self) -> str:
         """Return what leads on after a refusal."""
@@ -202,6 +208,8 @@ class Improvement:
             return f"keep the MPC and {cure}; then fit the twin anew"
         if "too little to teach" in self.note:
             return "keep the MPC: there is little to gain"
+        if "Ctrl-C" in self.note:
+            return "keep the MPC, or start again"
         if "max_steps" in self.note:
             return "give more max_steps, or keep the MPC"
         if self.where == "the twin":
@@ -327,14 +335,18 @@ def improve(
             require_problem_of_twin(policy, twin.problem)
             twin.require_trust()
         work = _Work(policy, n_starts, rounds, updates, seed, _Progress(rounds), confine)
-        if isinstance(twin, PlantTwin):
-            work.confine_to(twin)
-            found = work.in_twin(twin)
-            found = replace(found, source=repr(twin), episodes=len(twin.episodes))
-        else:
-            # A simulator is not the env that VecNormalize normalizes.
-            seen = None if model.get_vec_normalize_env() else policy.observation
-            found = work.with_simulator(twin, max_steps, seen)
+        try:
+            if isinstance(twin, PlantTwin):
+                work.confine_to(twin)
+                found = work.in_twin(twin)
+                found = replace(found, source=repr(twin), episodes=len(twin.episodes))
+            else:
+                # A simulator is not the env that VecNormalize normalizes.
+                seen = None if model.get_vec_normalize_env() else policy.observation
+                found = work.with_simulator(twin, max_steps, seen)
+        except KeyboardInterrupt:
+            print(work.interrupted(), file=sys.stderr)
+            raise
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}
     prints = fingerprint(policy.actor.state_dict())
@@ -354,7 +366,7 @@ def fingerprint(state: dict[str, th.Tensor]) -> str:
 
 
 class _Progress:
-    """Lines that say what is done, and how long the rest takes at most."""
+    """Lines that say what is done, and about how long the rest takes."""
 
     def __init__(self, rounds: int) -> None:
         self.rounds = rounds
@@ -413,6 +425,13 @@ class _Work:
         self.checks: list[Check] = []
         self.hard: Scenarios | None = None  # what the last check in a twin has lost
         self.has_learnt = not self.layer.network.is_zero()
+
+    def interrupted(self) -> Improvement:
+        """Return what was found before Ctrl-C."""
+        played = self.say.simulator
+        where = ("the simulator", played.name, played.played, played.steps) if played else ()
+        note = "Ctrl-C ended the search"
+        return Improvement(tuple(self.checks), 0.0, False, None, *where, note=note)
 
     def act(self) -> Any:
         """Return the layer as it is now as a policy."""
@@ -490,8 +509,8 @@ class _Work:
             shown = teacher
             self.say.end_of_round()
             self.say(
-                f"round {number + 1} of at most {self.rounds}, in the twin: policy "
-                f"{change_in_percent(-gained)}, {plans}"
+                f"round {number + 1} of at most {self.rounds}, from the plans' starts in the twin: "
+                f"policy {change_in_percent(-gained)}, {plans}"
             )
             if passes(1.0):
                 return improvement(True)
@@ -534,7 +553,8 @@ class _Work:
                 found = replace(found, accepted=False, reason=reason)
             else:
                 found = self._forecast(trial.twin, found)
-        self.note(found, f"{share:.0%} of the correction", found.verdict)
+        how = f"{share:.0%} of the correction, {trial.n_known} starts like the log's in each member"
+        self.note(found, how, found.verdict)
         return found
 
     def note(self, found: Check, how: str, verdict: str, pairs: int = 0) -> None:
@@ -545,6 +565,7 @@ class _Work:
 
     def _forecast(self, twin: PlantTwin, check: Check) -> Check:
         """Return a check with what the layer changes on the plant; it must surely gain."""
+        self.say.write(f"its change on the plant, by {len(twin.judges)} models of the log")
         change, low, high, cure = twin.forecast(self.act())
         found = replace(check, logged=change, error=(high - low) / 2, interval=(low, high))
         if high < 0:
@@ -573,7 +594,7 @@ class _Work:
             if self.has_learnt:
                 next(trial.stages(self.act(), [FIRST_LOOK]))
                 before, _ = trial.check(0, RULE.significance, final=False)
-                self.note(before, f"learnt before, {FIRST_LOOK} starts", before.verdict)
+                self.note(before, f"learnt before, {before.starts_in_words}", before.verdict)
             else:
                 trial.extend(FIRST_LOOK)
                 assert trial.played is not None
@@ -634,9 +655,9 @@ class _Work:
             self.say.end_of_round()
             changes = found.logged, -promised, -teacher.gain
             own, modelled, planned = map(change_in_percent, changes)
-            how = f"round {number + 1} of at most {self.rounds}, {len(trial.scores.costs)} starts"
-            verdict = f"a start's own change {own} on average, in the model {modelled}, "
-            verdict += f"plans {planned}"
+            how = f"round {number + 1} of at most {self.rounds}, {found.starts_in_words}"
+            verdict = f"a start's own change {own} on average; from other starts in the model "
+            verdict += f"{modelled}, plans {planned}"
             self.note(found, how, verdict)
             lost = trial.lost
             useful = found.safe and found.change < least
@@ -663,8 +684,7 @@ class _Work:
             found, trial = confirm(self.act(), simulator, len(self.checks) + 1, self.say, share)
             if found.accepted and not found.change < best:
                 found = replace(found, accepted=False, reason="the model's own policy is as good")
-            how = f"confirmation on {len(trial.scores.costs)} new starts"
-            self.note(found, how, found.verdict, LOOKS[-1])
+            self.note(found, f"confirmation, {found.starts_in_words}", found.verdict, LOOKS[-1])
             if found.accepted:
                 self.accept(model)
                 return True

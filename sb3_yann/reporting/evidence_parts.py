@@ -444,7 +444,7 @@ def improve_part(subject: Subject) -> Part:
     tried = [
         [
             f"{k}.{j}",
-            str(of.starts or ""),
+            of.starts_in_words,
             change_in_percent(of.change),
             change_in_percent(of.worst),
             of.verdict,
@@ -518,10 +518,12 @@ def again_part(subject: Subject) -> Part:
         except PackageNotFoundError:
             versions.append([library, "not installed"])
     versions.append(["system", f"{platform.system()} {platform.machine()}"])
-    names = (
-        "gamma", "learning_rate", "batch_size", "buffer_size", "tau", "train_freq",
-        "gradient_steps", "learning_starts", "action_noise", "seed", "num_timesteps",
-    )  # fmt: skip
+    names: tuple[str, ...] = "gamma", "seed"
+    if model.num_timesteps:  # what `improve` alone has made knows no other
+        names += (
+            "learning_rate", "batch_size", "buffer_size", "tau", "train_freq", "gradient_steps",
+            "learning_starts", "action_noise", "num_timesteps",
+        )  # fmt: skip
     own = {name.replace("_", " "): getattr(model, name, None) for name in names}
     own |= {f"policy: {k}": value for k, value in model.policy_kwargs.items() if k != "problem"}
     settings = []

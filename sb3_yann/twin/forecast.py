@@ -215,7 +215,7 @@ def forecast(
     begins = [np.stack([each.thetas[:1] for each in episodes]), drawn.reshape(count, some, -1)]
     found: list[tuple[float, float, float, str]] = []
     plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
-    for judge in bar("forecasts by models of the log", judges):
+    for judge in bar("forecasts by models of the log", judges, timed=True):
         law = law_of(judge.dynamics.problem)
         for remembers in (False, True):
             if (judge.refuted and not remembers) or (remembers and not own.explains):

@@ -215,9 +215,10 @@ def test_lines_say_what_is_done_and_read_well_in_a_file(capsys, monkeypatch) -> 
     assert not any("\r" in line or "\x1b" in line for line in lines)
     assert "episodes of the MPC, half with random inputs" in lines[0]
     shown = next(line for line in lines if "] candidate 1, round 1 of at most" in line)
-    assert ", in the model -" in shown and ", plans -" in shown and " s left]" in shown
-    assert any(" pairs: -" in line for line in lines)
-    last = f"candidate {len(found.checks)}, confirmation on"
+    assert ", the first 10 starts: -" in shown and "; from other starts in the model -" in shown
+    assert ", plans -" in shown and " s left]" in shown
+    assert any("] confirmation, 10 new starts: -" in line for line in lines)
+    last = f"candidate {len(found.checks)}, confirmation, "
     assert last in lines[-1] and lines[-1].endswith(f"{100 * found.change:+.2f} %, accepted")
     assert not any("fit 1" in line or " of 30" in line for line in lines)  # of little use there
     improve(model_of(Plain), Plain, progress_bar=False, **FEW)
@@ -228,7 +229,7 @@ def test_lines_say_what_is_done_and_read_well_in_a_file(capsys, monkeypatch) -> 
     ("where", "error"),
     [("imitate", KeyboardInterrupt), ("confirm", MemoryError), ("refit_critic", KeyboardInterrupt)],
 )
-def test_what_is_cut_off_leaves_the_model_as_it_was(monkeypatch, where, error) -> None:
+def test_what_is_cut_off_leaves_the_model_as_it_was(monkeypatch, capsys, where, error) -> None:
     def cut(*_):
         raise error
 
@@ -242,6 +243,11 @@ def test_what_is_cut_off_leaves_the_model_as_it_was(monkeypatch, where, error) -
     assert bits(model) == before and is_mpc(model)
     assert not hasattr(model, "improvements")
     assert Counted.closed == Counted.made - made
+    if where == "imitate":
+        with pytest.raises(error):
+            improve(model, twin_of(), **FEW)
+    said = capsys.readouterr().err.count("Ctrl-C ended the search. The model is as it was.")
+    assert said == {"imitate": 2, "confirm": 0, "refit_critic": 1}[where]
 
 
 def test_a_reward_of_its_own_is_named_at_the_caller_s_line() -> None:
@@ -431,6 +437,7 @@ def test_a_policy_of_a_twin_gains_on_the_plant(capsys, monkeypatch) -> None:
     lines = [each for each in capsys.readouterr().err.splitlines() if each.startswith("[")]
     assert lines[-1].endswith("no objection")
     assert any("in the twin: policy -" in line and ", plans -" in line for line in lines)
+    assert any("change on the plant, by " in line for line in lines)
     assert relative(model).mean() < 0.995 and relative(model).max() < 1.01
     again = model_of()
     assert improve(again, twin_of(), **ENOUGH).checks == found.checks
@@ -543,22 +550,23 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     assert found.reason == "" and str(found) == found.report()
     assert found.report().splitlines()[:5] == [
         "Accepted: a better policy.",
-        "  change       -2.10 % of the MPC's mean cost in the twin",
+        "  change       -2.10 % of the MPC's mean cost in the twin, from starts like the log's",
         "  worst start  +0.04 % of the MPC's mean cost in the twin: the plant's may be worse",
         "  violations   no more than the MPC's",
         "  steps        2 candidates tried",
     ]
     sure = replace(passed, interval=(-0.03, -0.002))
     twin = Improvement((sure,), -0.021, True)
-    assert "in the twin; on the plant -3.00 to -0.20 % (90 %)" in str(twin)
-    there = str(replace(twin, where="the simulator", steps=5000))
-    assert "change       -2.10 % (-3.00 to -0.20 %, 90 %) of the MPC's mean cost" in there
+    assert "from starts like the log's; on the plant -3.00 to -0.20 % (90 %)" in str(twin)
+    decided = replace(sure, starts=40, final=True)
+    there = str(replace(twin, checks=(decided,), where="the simulator", steps=5000))
+    said = "change       -2.10 % (-3.00 to -0.20 %, 90 %) of the MPC's mean cost in the simulator"
+    assert f"{said}, from 40 new starts" in there
     assert "steps        5,000 of the simulator, 1 candidate tried" in there
-    assert Improvement((refused,), 0.0, accepted=False).report().splitlines()[:3] == [
-        "Nothing better was found: 2 starts with violations. The model is as it was.",
-        "  change       -3.00 % of the MPC's mean cost in the twin: not accepted",
-        "  steps        1 candidate tried",
-    ]
+    said, change, steps, _ = Improvement((refused,), 0.0, accepted=False).report().splitlines()
+    assert said == "Nothing better was found: 2 starts with violations. The model is as it was."
+    assert change.startswith("  change       -3.00 % of") and change.endswith(": not accepted")
+    assert steps == "  steps        1 candidate tried"
     small = Check(1, True, "", -4e-4, 0.0, True)
     assert "-0.04 % in the twin is too little, or not sure" in str(
         Improvement((small,), 0.0, accepted=False)

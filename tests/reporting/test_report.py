@@ -360,6 +360,7 @@ def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) ->
     ):  # fmt: skip
         assert said in text
     assert "nothing has confirmed" not in text and found.settings["n_starts"] == 7
+    assert "gamma 0.99 seed" in text and "learning starts" not in text  # nothing was learnt
 
 
 def test_a_policy_that_was_changed_after_improve_fails(improved) -> None:

@@ -223,7 +223,9 @@ def quality_notes(
         )
     if ridge > 0:
         notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
-    return [*notes, *_residual_notes(found, fitted, n), pole_note(*pole_errors(found, n))]
+    notes += _residual_notes(found, fitted, n)
+    noise = "process noise" + " alone" * any(each.endswith(UNTOLD) for each in notes)
+    return [*notes, pole_note(*pole_errors(found, n), noise)]
 
 
 def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[str]:

@@ -70,7 +70,10 @@ class Identified(ReadOnlyArrays):
         return self.model.report()
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
-        """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E"."""
+        """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E".
+
+        It is one under process noise alone: of sensor noise it knows nothing.
+        """
         name = check_choice("name", name, ("A", "B", "E"))
         level = check_range("level", level, 0, 1, "()")
         value = getattr(self.model, name)
