@@ -116,7 +116,7 @@ class Progress:
         self.steps = steps
 
     def __call__(self, text: str, left: float = 0.0, detail: bool = False) -> None:
-        """Write a line; ``left`` are the seconds that the rest may take, no bound; 0 is not known.
+        """Write a line; ``left`` are the seconds that the rest may take, 0 where nobody knows.
 
         In a file a ``detail`` is left out, unless there was no other line for thirty seconds.
         """
@@ -124,7 +124,7 @@ class Progress:
         if _silent.get() or passed < DELAY:
             return
         steps = "" if self.steps is None else f" {self.steps():>9,} steps"
-        rest = f", about {left:.0f} s left" if left > 0 else ""
+        rest = f", about {left:.0f} s more if all is needed" if left > 0 else ""
         line = f"[{passed:5.0f} s{steps}{rest}] {text}"
         if is_watched():
             _Bar.write(line, file=sys.stderr)

@@ -317,7 +317,7 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
     if not len(active):
         return plans
     failed: Rows = np.zeros(k, dtype=np.intp)
-    for _ in bar(f"{k} plans: rounds, at most", range(rounds)):
+    for _ in bar(f"{k} plans: rounds, at most", range(rounds), timed=True):
         old = plans.of(active)
         corrections, gains = _backward(plant, task, old, rows[active], damping[active])
         plans.gains[:, active] = gains

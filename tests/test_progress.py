@@ -89,7 +89,7 @@ def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     clock.now += 5.0
     progress("a round is over", left=20.0)
     assert capsys.readouterr().err == (
-        "[    5 s     1,234 steps, about 20 s left] a round is over\n"
+        "[    5 s     1,234 steps, about 20 s more if all is needed] a round is over\n"
     )
 
 

@@ -291,7 +291,8 @@ def refine(layer: LawLayer, teacher: Teacher) -> float:
     most = (False, -np.inf)
     since = 0
     best = copy.deepcopy(layer.state_dict())
-    for k in bar("the policy descends in the model: steps of Adam", range(DESCENTS + 1)):
+    what = "the policy descends in the model: steps of Adam, at most"
+    for k in bar(what, range(DESCENTS + 1), timed=True):
         if k % LOOK == 0:
             played = teacher.play(layer)
             passes = not teacher.objection(played)
@@ -356,7 +357,8 @@ def fit_layer(
     to = th.as_tensor(wanted[finite], dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
-    for k in bar("the policy learns from plans: steps of Adam", range(updates if len(at) else 0)):
+    what = "the policy learns from plans: steps of Adam"
+    for k in bar(what, range(updates if len(at) else 0), timed=True):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()

@@ -244,7 +244,7 @@ def improve(
     Where the actor keeps the problem's bounds, and no ``bounds_margin`` was given, it keeps as far
     from them as the MPC's model errs in 95 % of the steps. The model ends with the policy that was
     accepted and a critic that is refitted to it, else as it was. It saves and goes on learning as
-    any other.
+    any other. Ctrl-C prints what was found so far, and leaves the model as it was.
 
     Parameters
     ----------
@@ -428,10 +428,9 @@ class _Work:
 
     def interrupted(self) -> Improvement:
         """Return what was found before Ctrl-C."""
+        found = Improvement(tuple(self.checks), 0.0, False, note="Ctrl-C ended the search")
         played = self.say.simulator
-        where = ("the simulator", played.name, played.played, played.steps) if played else ()
-        note = "Ctrl-C ended the search"
-        return Improvement(tuple(self.checks), 0.0, False, None, *where, note=note)
+        return replace(found, where="the simulator", steps=played.steps) if played else found
 
     def act(self) -> Any:
         """Return the layer as it is now as a policy."""

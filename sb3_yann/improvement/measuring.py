@@ -44,6 +44,10 @@ CURE = (
     "mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, observer, "
     "mpc.disturbances.d_min, mpc.disturbances.d_max)."
 )
+CURE_IN_TWIN = (
+    "mpc, observer = offset_free(mpc), and export(mpc, path, estimator=observer), or on to "
+    "improve(mpc, PlantTwin.fit(mpc, log, observer=observer))."
+)
 ADVICE = {
     "keep the MPC": f"little was found to gain over the MPC, less than {100 * WORTH:g} %. It is no "
     "bound: improve(mpc, {source}) may still find some of it, or more.",
@@ -141,7 +145,8 @@ class Headroom:
                 ("more by nonlinearity and constraints", -self.nonlinearity),
             )
         )
-        steps = f"{self.steps:,} of the env. {self.note}".strip() if self.steps else self.note
+        where = "twin" if self.source == "the twin" else "env"
+        steps = f"{self.steps:,} of the {where}. {self.note}".strip() if self.steps else self.note
         return summary_lines(
             f"Verdict: {self.verdict}. By its own stage cost, from starts of {self.source}:",
             **paired_rows(self.best_costs, self.mpc_costs),
@@ -183,6 +188,8 @@ class Headroom:
             return f"nothing was found, but {poor}"
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
         advice = ADVICE[self.verdict].format(source=source)
+        if self.source == "the twin":
+            advice = advice.replace(CURE, CURE_IN_TWIN)
         if self.d_max is not None:  # the disturbances of this plant
             largest = ", ".join(f"{each:.3g}" for each in self.d_max)
             advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
@@ -354,7 +361,8 @@ class _Search:
     def say(self, text: str, left: float = 0.0) -> None:
         """Write a line with the gain that was found."""
         gained = f"{0.0 - 100 * gain(self.base.costs, self.best):+.2f} %"
-        self.progress(f"{text}; the best so far: {gained}", left)
+        whose = "the best so far" if self.random else "the best of each start so far"
+        self.progress(f"{text}; {whose}: {gained}", left)
 
     @property
     def best(self) -> Array:

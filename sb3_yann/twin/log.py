@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -56,7 +57,7 @@ def as_episodes(
     beyond their bounds are a ValueError.
     """
     layout = problem.layout
-    pairs = [tuple(map(_as_columns, each)) for each in _pairs(episodes)]
+    pairs = [tuple(map(_as_columns, each)) for each in as_pairs(episodes)]
     states, actions = map(list, zip(*pairs, strict=True))
     states = as_matrices("states", states)
     actions = as_matrices("actions", actions)
@@ -91,6 +92,14 @@ def as_episodes(
         own = {name: values[i] for name, values in beside.items()}
         found.append(Episode(x if whole else _theta(problem, i, x, u, own), u))
     return tuple(found)
+
+
+def fingerprint(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> str:
+    """Return a line with the SHA-256 of a log's states and inputs."""
+    digest = hashlib.sha256()
+    for array in chain.from_iterable(pairs):
+        digest.update(np.asarray(array, np.float64).tobytes())
+    return f"Fingerprint of its states and inputs (SHA-256): {digest.hexdigest()[:16]}."
 
 
 def without_copies(episodes: tuple[Episode, ...]) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
@@ -148,7 +157,8 @@ def more_of(problem: LinearMPC, episodes: tuple[Episode, ...], count: int) -> st
     return f"{rows:,} rows" + f" ({hours:.3g} h)" * (hours > 0)
 
 
-def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
+def as_pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
+    """Return states and actions of each episode."""
     if not isinstance(episodes, Iterable):
         raise TypeError(
             f"episodes must be a list of pairs (states, actions), got {type(episodes).__name__}. "

@@ -22,6 +22,8 @@ from sb3_yann.twin.hidden import GUESS, shoot
 from sb3_yann.twin.log import (
     Episode,
     as_episodes,
+    as_pairs,
+    fingerprint,
     pieces,
     warn_of_estimates,
     without_copies,
@@ -86,7 +88,7 @@ class PlantTwin(LearntModel):
     trust : Trust
         The evidence.
     notes : tuple of str
-        What of the log was left out.
+        The log's fingerprint, and what of it was left out.
     judges : tuple of Judge
         Twins that the log does not refute, each fitted without every fold of the episodes.
 
@@ -194,11 +196,12 @@ class PlantTwin(LearntModel):
                 )
             episodes = whole
         row = RowLayout(problem, observer)
+        episodes = given = as_pairs(episodes)
         if observer is not None:
             episodes, disturbances = row.estimated(episodes, disturbances)
         log = as_episodes(problem, episodes, references, disturbances)
         log, copied = without_copies(log)
-        notes += copied
+        notes = (fingerprint(given), *notes, *copied)
         if observer is None:
             warn_of_estimates(problem, log)
         log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)

@@ -157,7 +157,7 @@ class _Networks:
         """Yield before each gradient; then step."""
         adam = th.optim.Adam(self.weights, lr=rate)
         schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
-        for _ in bar("networks of a model: steps of Adam", range(updates)):
+        for _ in bar("networks of a model: steps of Adam", range(updates), timed=True):
             adam.zero_grad()
             yield
             th.nn.utils.clip_grad_norm_(self.weights, 10.0)

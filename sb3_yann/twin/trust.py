@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -227,17 +226,7 @@ def evidence(
 def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:
     """Return what a twin explains, what it does not know, and whether to trust it, as text."""
     steps = sum(map(len, episodes))
-    digest = hashlib.sha256()
-    units = problem.units
-    for each in episodes:
-        theta = units.to_plant(each.thetas[:, : problem.n_theta])
-        # In float32: an MPC of another operating point rounds otherwise.
-        for array in (theta, units.input_to_plant(each.actions)):
-            digest.update(np.float32(array).tobytes())
-    said = [
-        f"The log: {len(episodes)} episode{'s' * (len(episodes) != 1)}, {steps} steps, fingerprint "
-        f"{digest.hexdigest()[:12]} (SHA-256)."
-    ]
+    said = [f"The log: {len(episodes)} episode{'s' * (len(episodes) != 1)}, {steps} steps."]
     for pieces in filter(lambda each: len(each) > 1, records(problem, episodes)):
         said.append(
             f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "

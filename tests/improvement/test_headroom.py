@@ -112,7 +112,7 @@ def test_where_the_model_is_the_plant_there_is_nothing_to_gain(capsys, monkeypat
     assert found.steps == Counted.steps_taken and f"{found.steps:,} of the env." in str(found)
     lines = [each for each in capsys.readouterr().err.splitlines() if each.startswith("[")]
     assert "5 episodes of the MPC" in lines[0] and f"{found.steps:,} steps] plans" in lines[-1]
-    assert "the best so far: -0.0" in lines[-1]
+    assert "the best of each start so far: -0.0" in lines[-1]
 
 
 def test_it_takes_no_step_more_than_it_may() -> None:
@@ -339,6 +339,9 @@ def test_an_observer_that_pays_on_average_alone_is_advised_with_its_worst_start(
     assert "Not from every start" in found.report() and "worst start +20.00 %" in found.report()
     gains = dataclasses.replace(found, observer_played=costs - 1)
     assert "Not from every start" not in gains.report()
+    there = dataclasses.replace(gains, source="the twin", steps=9, d_max=np.array([2.0])).report()
+    assert "offset_free(mpc, d_max=[2]), and export(mpc, path, estimator=observer), or" in there
+    assert "PlantTwin.fit(mpc, log, observer=observer))" in there and "9 of the twin" in there
 
 
 def test_nothing_found_with_plans_of_a_poor_model_is_not_called_little() -> None:

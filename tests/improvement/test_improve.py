@@ -216,7 +216,7 @@ def test_lines_say_what_is_done_and_read_well_in_a_file(capsys, monkeypatch) -> 
     assert "episodes of the MPC, half with random inputs" in lines[0]
     shown = next(line for line in lines if "] candidate 1, round 1 of at most" in line)
     assert ", the first 10 starts: -" in shown and "; from other starts in the model -" in shown
-    assert ", plans -" in shown and " s left]" in shown
+    assert ", plans -" in shown and " s more if all is needed]" in shown
     assert any("] confirmation, 10 new starts: -" in line for line in lines)
     last = f"candidate {len(found.checks)}, confirmation, "
     assert last in lines[-1] and lines[-1].endswith(f"{100 * found.change:+.2f} %, accepted")

@@ -40,6 +40,11 @@ def offset_free(
 
     Measured disturbances of the MPC stay, before the estimated ones: the observer takes them.
 
+    Each estimate is one more entry of theta, and the explicit law has regions for all of its range:
+    often a thousand with a large ``d_max``. Then :meth:`LinearMPC.law` and policies solve it
+    online, with an :class:`OnlineLawWarning`: the same law, as fast to train on. Where it has to be
+    explicit, call :meth:`LinearMPC.explicit` first, or shorten the horizon.
+
     Parameters
     ----------
     mpc : LinearMPC

@@ -493,9 +493,10 @@ class LinearMPC(MPCProblem):
             if isinstance(found, PiecewiseAffine):
                 return found
             warn(
-                f"The program will be solved online, at each point. {found} To skip the search, "
-                "and this warning, choose problem.law('online'), or law='online' of a policy. An "
-                "online law is exported as C, FMU or npz, not as Structured Text or ONNX.",
+                "The program will be solved online, at each point. It is the same law, and "
+                f"policies train on it as well. {found} To skip the search, and this warning, "
+                "choose problem.law('online'), or law='online' of a policy. An online law is "
+                "exported as C, FMU or npz, not as Structured Text or ONNX.",
                 OnlineLawWarning,
             )
         vars(self)[ONLINE_CHOSEN] = True

@@ -91,8 +91,8 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
 
 def _offset(problem: MPCProblem) -> Iterator[str]:
     if problem.layout.n_references and not problem.layout.n_disturbances:
-        yield "There is no integral action: a plant that is not its model may rest beside its set-"
-        yield "points. offset_free(mpc) has it, and may cost less or more on the way there:"
+        yield "There is no integral action: a plant that is not its model may rest beside its"
+        yield "set-points. offset_free(mpc) has it, and may cost less or more on the way there:"
         yield "  headroom(mpc, env) plays it in a simulator. Add it where that gains."
 
 
@@ -102,8 +102,8 @@ def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> It
     if len(problem.tracking.C):
         parts = problem.layout
         now = np.split(points[:, parts.now], [parts.n_references], axis=1)
-        reachable = is_reachable(problem, *now)
-        yield f"  {_percent(reachable.sum(), len(points))} have a reachable steady state;"
+        share = _percent(is_reachable(problem, *now).sum(), len(points))
+        yield f"  {share} have a reachable steady state, at other set-points some cost stays;"
     kept = _stay_feasible(problem, law, feasible).sum() if len(feasible) else 0
     kept_share = f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible"
     yield f"{kept_share} for {LOOP_STEPS} steps in closed loop on the model."
