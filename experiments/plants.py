@@ -227,7 +227,7 @@ def bioreactor() -> TextbookPlant:
     spread = (0.2, 0.1)
     wanted = ((1.0,), (1.55,))
     return TextbookPlant(
-        _integrated(slope, 0.5, 2), model, *boxes, spread, weights, (0,), wanted, 40, 80
+        _integrated(slope, 0.5, 10), model, *boxes, spread, weights, (0,), wanted, 40, 80
     )
 
 
