@@ -186,7 +186,9 @@ def test_signals_come_last_whatever_else_theta_holds() -> None:
     halved = observations() * [0.5, 1]
     expected = tank().explicit().plant_input(observations()[:, :1])
     np.testing.assert_allclose(mapped.predict(halved)[0], expected, atol=6e-5)
-    found = improve(model, lambda: Last(PreviousInput(Tank(), [3.0])), rounds=1, n_starts=12, updates=500)
+    found = improve(
+        model, lambda: Last(PreviousInput(Tank(), [3.0])), rounds=1, n_starts=12, updates=500
+    )
     assert found.accepted and found.change < -0.05
 
 
