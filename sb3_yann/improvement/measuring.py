@@ -48,10 +48,11 @@ CURE_IN_TWIN = (
     "mpc, observer = offset_free(mpc), and export(mpc, path, estimator=observer), or on to "
     "improve(mpc, PlantTwin.fit(mpc, log, observer=observer))."
 )
+"""How an observer is added, where there is an env, and where there is a log alone."""
 ADVICE = {
     "keep the MPC": f"little was found to gain over the MPC, less than {100 * WORTH:g} %. It is no "
     "bound: improve(mpc, {source}) may still find some of it, or more.",
-    "add ObserveDisturbance first": f"that brings most of it: {CURE}",
+    "add ObserveDisturbance first": "that brings most of it: {observer}",
     "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
     "headroom(...).reidentified.",
     "learn": "most of it is beyond a linear model: improve(mpc, {source}), or DDPG under an "
@@ -145,7 +146,7 @@ class Headroom:
                 ("more by nonlinearity and constraints", -self.nonlinearity),
             )
         )
-        where = "twin" if self.source == "the twin" else "env"
+        where = "twin" if self._in_twin else "env"
         steps = f"{self.steps:,} of the {where}. {self.note}".strip() if self.steps else self.note
         return summary_lines(
             f"Verdict: {self.verdict}. By its own stage cost, from starts of {self.source}:",
@@ -158,6 +159,10 @@ class Headroom:
         )
 
     __str__ = report
+
+    @property
+    def _in_twin(self) -> bool:
+        return self.source == "the twin"
 
     def _as_played(self, costs: Array | None) -> str:
         """Return what came of another MPC, losses included."""
@@ -187,9 +192,8 @@ class Headroom:
         if self.verdict == UNKNOWN:
             return f"nothing was found, but {poor}"
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
-        advice = ADVICE[self.verdict].format(source=source)
-        if self.source == "the twin":
-            advice = advice.replace(CURE, CURE_IN_TWIN)
+        observer = CURE_IN_TWIN if self._in_twin else CURE
+        advice = ADVICE[self.verdict].format(source=source, observer=observer)
         if self.d_max is not None:  # the disturbances of this plant
             largest = ", ".join(f"{each:.3g}" for each in self.d_max)
             advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")

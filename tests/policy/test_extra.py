@@ -186,9 +186,7 @@ def test_signals_come_last_whatever_else_theta_holds() -> None:
     halved = observations() * [0.5, 1]
     expected = tank().explicit().plant_input(observations()[:, :1])
     np.testing.assert_allclose(mapped.predict(halved)[0], expected, atol=6e-5)
-    found = improve(
-        model, lambda: Last(PreviousInput(Tank(), [3.0])), rounds=1, n_starts=12, updates=500
-    )
+    found = improve(model, lambda: Last(PreviousInput(Tank(), [3.0])), rounds=2, updates=1000)
     assert found.accepted and found.change < -0.05
 
 
@@ -245,12 +243,12 @@ def test_improve_learns_what_a_signal_does(tmp_path: Any) -> None:
     told = LinearModel([[0.8]], [[0.5]], dt=1.0, x_ss=[10], u_ss=[3], E=[[0.02]], d_ss=[295])
     oracle = replace(tank(), model=told, disturbances=DisturbanceBounds(*FEED))
     model = build(problem=mpc, extra=0)
-    found = improve(model, Tank, rounds=1, n_starts=12, updates=500)
+    found = improve(model, Tank, rounds=2, updates=1500)
     law = mpc.law().plant_input
     rng = np.random.default_rng(100)
     log = evaluate(lambda x: np.clip(law(x) + rng.uniform(-1, 1), 0, 6), Tank, range(100, 115))
     twin = PlantTwin.fit(mpc, log.pairs, residuals=["linear"])
-    learnt = improve(mpc, twin, rounds=1, n_starts=12, updates=500)
+    learnt = improve(mpc, twin, rounds=2, n_starts=20, updates=1500)
     assert found.accepted and learnt.accepted
     acting = mpc.law(), oracle.law(), found.model, learnt.model
     base, least, *costs = (evaluate(each, Tank, range(40)).costs.sum() for each in acting)

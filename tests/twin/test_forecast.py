@@ -173,7 +173,7 @@ def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_ne
         twin = PlantTwin.fit(mpc, logged, residuals=kinds)
         assert twin.trusted
         model = DDPG("YannPolicy", Motor(mpc), device="cpu", seed=0)
-        found = improve(model, twin, n_starts=12, updates=1000)
+        found = improve(model, twin)
         assert found.accepted == ("network" in kinds)
     costs = evaluate(model, make, TESTS).costs
     assert costs.mean() < 0.99 * before.mean() and np.all(costs < before)
