@@ -32,7 +32,7 @@ from weights import is_mpc
 
 def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioning:
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
-    options = {"batch": 5, "updates": 1000, "max_correction": 0.2} | options
+    options = {"batch": 5, "updates": 400, "max_correction": 0.2} | options
     return Commissioning(model, env, log_path=path, **options)
 
 

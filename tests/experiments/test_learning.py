@@ -1,5 +1,7 @@
 """The learning tables hold what their runs do, and every plant shows the theta of its MPC."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,8 @@ from experiments.measures import OBSERVER
 from experiments.pictures import _shares, save_in_short
 from experiments.plants import CASES
 from experiments.runner import Outcome, Run, save
+from sb3_yann.improvement import simulator
+from sb3_yann.twin.selection import fit_ensemble
 
 pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
 
@@ -104,6 +108,7 @@ def test_each_plant_shows_the_theta_of_its_mpc(name, tmp_path, monkeypatch) -> N
 
 @pytest.mark.slow
 def test_a_run_compares_with_the_mpc_on_the_same_episodes(monkeypatch) -> None:
+    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=1000))
     monkeypatch.setattr(learning, "TESTS", range(2000, 2004))
     plans = execute(Run("pH", PLANNED, 40, 0))
     law = CASES["pH"]().mpc.explicit()

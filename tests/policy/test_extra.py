@@ -11,6 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
+from improvement_samples import quick
 from sample_plants import Sampled
 from sb3_yann import (
     AffineObservation,
@@ -161,7 +162,8 @@ def test_bounds_are_kept_whatever_the_networks_make_of_a_signal() -> None:
     assert ahead.min() > -1e-5 and ahead.max() < 20 + 1e-5
 
 
-def test_signals_come_last_whatever_else_theta_holds() -> None:
+def test_signals_come_last_whatever_else_theta_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick(monkeypatch)
     slow = tank(rate=RateLimits(-1, 1))
 
     class Last(gym.ObservationWrapper[Array, Array, Array]):
@@ -186,7 +188,8 @@ def test_signals_come_last_whatever_else_theta_holds() -> None:
     halved = observations() * [0.5, 1]
     expected = tank().explicit().plant_input(observations()[:, :1])
     np.testing.assert_allclose(mapped.predict(halved)[0], expected, atol=6e-5)
-    found = improve(model, lambda: Last(PreviousInput(Tank(), [3.0])), rounds=2, updates=1000)
+    quicker = {"n_starts": 10, "rounds": 2, "updates": 1000}
+    found = improve(model, lambda: Last(PreviousInput(Tank(), [3.0])), **quicker)
     assert found.accepted and found.change < -0.05
 
 
@@ -234,27 +237,28 @@ def test_retarget_keeps_what_was_learnt_of_a_signal() -> None:
     np.testing.assert_allclose(apart[0][inside], apart[1][inside], atol=1e-4)
 
 
-def test_improve_learns_what_a_signal_does(tmp_path: Any) -> None:
+def test_improve_learns_what_a_signal_does(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a simulator and from a log: most of what the MPC loses that does not know the feed.
 
     Headroom is that of who knows it, the guard keeps what was learnt, the page names the signal.
     """
+    quick(monkeypatch)
     mpc = with_extra(tank(), *FEED)
     told = LinearModel([[0.8]], [[0.5]], dt=1.0, x_ss=[10], u_ss=[3], E=[[0.02]], d_ss=[295])
     oracle = replace(tank(), model=told, disturbances=DisturbanceBounds(*FEED))
     model = build(problem=mpc, extra=0)
-    found = improve(model, Tank, rounds=2, updates=1500)
+    found = improve(model, Tank, n_starts=10, rounds=2, updates=1500)
     law = mpc.law().plant_input
     rng = np.random.default_rng(100)
     log = evaluate(lambda x: np.clip(law(x) + rng.uniform(-1, 1), 0, 6), Tank, range(100, 115))
     twin = PlantTwin.fit(mpc, log.pairs, residuals=["linear"])
-    learnt = improve(mpc, twin, rounds=2, n_starts=20, updates=1500)
+    learnt = improve(mpc, twin, n_starts=10, rounds=2, updates=1500)
     assert found.accepted and learnt.accepted
     acting = mpc.law(), oracle.law(), found.model, learnt.model
     base, least, *costs = (evaluate(each, Tank, range(40)).costs.sum() for each in acting)
     assert least < 0.8 * base
     assert base - max(costs) > 0.5 * (base - least)
-    room = headroom(mpc, Tank, n_starts=5)
+    room = headroom(mpc, Tank, n_starts=3)
     assert room.total > 0.2
     guard = ImprovementGuard(Tank, n_eval_episodes=10, n_new_starts=0, n_final_starts=10)
     model.learn(25, callback=[NoActionNoise(), guard])

@@ -100,7 +100,7 @@ def whole(tmp_path_factory) -> tuple[Path, DDPG]:
     model.learn(60, callback=[NoActionNoise(), guard])
     mpc = model.policy.problem
     log = evaluate(mpc.explicit(), "ClippedPendulum-v0", range(5))
-    twin = PlantTwin.fit(mpc, log.pairs, n_members=1)
+    twin = PlantTwin.fit(mpc, log.pairs, n_members=1, residuals=twin_samples.POLYNOMIALS)
     costs = np.array([10.0, 20.0])
     room = Headroom(costs, costs, costs, costs - 0.5, 0.0, 0.0, 1 / 30, "learn", "a simulator")
     path = tmp_path_factory.mktemp("report") / "new folder" / "whole.html"
