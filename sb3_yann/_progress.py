@@ -60,18 +60,23 @@ _Bar.set_lock(threading.RLock())
 
 
 class _Lines:
-    """A file in which a line is left where there was none for so many seconds."""
+    """A file in which a line is left where there was none for so many seconds.
+
+    The ``first`` one may be left in any case.
+    """
 
     latest = -math.inf  # of all of them
 
-    def __init__(self, interval: float) -> None:
+    def __init__(self, interval: float, first: bool = False) -> None:
         self.interval = interval
+        self.first = first
 
     def write(self, text: str) -> None:
         """Write a line, without what moves the cursor."""
         now = time.monotonic()
-        if text.strip() and now >= _Lines.latest + self.interval:
+        if text.strip() and (self.first or now >= _Lines.latest + self.interval):
             _Lines.latest = now
+            self.first = False
             print(text.strip(), file=sys.stderr)
 
     def flush(self) -> None:
@@ -88,8 +93,6 @@ def bar(
     """
     watched = is_watched()
     of_parts = _parts.get() and not timed
-    if timed:
-        _Lines.latest = -math.inf
     counted = total is not None or isinstance(items, Sized)
     words = "  {desc}: {n_fmt}" + " of {total_fmt}" * counted
     if not of_parts:
@@ -102,7 +105,7 @@ def bar(
         leave=False,
         miniters=1,
         position=0,
-        file=sys.stderr if watched else _Lines(FILE_INTERVAL * (10 if of_parts else 1)),
+        file=sys.stderr if watched else _Lines(FILE_INTERVAL * (10 if of_parts else 1), timed),
         disable=_silent.get(),
         bar_format=words if of_parts or not watched else None,
     )

@@ -284,15 +284,15 @@ def as_csv(decisions: list[Decision]) -> str:
 
 
 REFUSAL_ADVICE = {
-    "too little a gain": "see by headroom(mpc, env) what can be gained",
+    "too little a gain": "see by headroom(mpc, env) what can be gained, and take improve(mpc, env)",
     "new starts": "raise n_eval_episodes: the known starts do not show what the new ones do",
     "violation": "bound the policy (max_correction), or tighten the MPC's own limits",
     "the env ends": "bound the policy (max_correction), or tighten the MPC's own limits",
     "finite": "lower the learning rate; CostAudit shows what the critic learns from",
     "too far": "take networks='shared', whose policy is continuous",
     "costs": "bound the policy (max_correction), or allow the worst starts more (rule.margin)",
-    "mean cost": "see by headroom(mpc, env) what can be gained, and by CostAudit whether the "
-    "reward is the MPC's cost",
+    "mean cost": "see by headroom(mpc, env) what can be gained, which improve(mpc, env) takes, and "
+    "by CostAudit whether the reward is the MPC's cost",
 }
 """What helps against a reason for a refusal that holds such words: the first one that does."""
 

@@ -213,7 +213,7 @@ class Improvement:
         if "max_steps" in self.note:
             return "give more max_steps, or keep the MPC"
         if self.where == "the twin":
-            return "keep the MPC; log more, with held steps of the inputs that twin.report() names"
+            return "keep the MPC; log more episodes, of other starts and set-points, and fit anew"
         more = [f"{k}={2 * v}" for k, v in self.settings.items() if k in ("n_starts", "updates")]
         return f"keep the MPC, or learn from more: improve(..., {', '.join(more)})"
 
@@ -548,8 +548,7 @@ class _Work:
             confirmed = new.check(number, played)
             self.hard = new.hard(played)
             if not confirmed.accepted:
-                reason = f"on new starts, {confirmed.reason}"
-                found = replace(found, accepted=False, reason=reason)
+                found = replace(confirmed, reason=f"on new starts, {confirmed.reason}")
             else:
                 found = self._forecast(trial.twin, found)
         how = f"{share:.0%} of the correction, {trial.n_known} starts like the log's in each member"

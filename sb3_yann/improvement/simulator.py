@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._progress import shown
-from sb3_yann._validation import Array, Mask
+from sb3_yann._validation import Array, Mask, NonFiniteWarning, warn
 from sb3_yann.audit.meaning import (
     below_set_points,
     in_deviations,
@@ -80,9 +80,14 @@ class _Counted(gym.Wrapper[Any, Any, Any, Any]):
         self.count.add()
         try:
             return self.env.step(action)
-        except Exception:  # whatever a simulator raises in a state that it cannot be in
+        except Exception as error:  # whatever it raises in a state that it cannot be in
             if self.count.strict:
                 raise
+            warn(
+                f"The simulator raised {error!r}: what leads there ends there, and counts as lost. "
+                "The MPC's own episodes do not.",
+                NonFiniteWarning,
+            )
             space: Any = self.env.observation_space
             return np.full(space.shape, np.nan), np.nan, True, False, {}
 

@@ -24,6 +24,7 @@ from sb3_yann.compare import (
     no_worse,
     relative_costs,
 )
+from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.evaluation import change_in_percent
 from sb3_yann.evaluation.plots import (
@@ -56,6 +57,7 @@ from sb3_yann.reporting.subject import (
     table,
     tag,
 )
+from sb3_yann.rollout import Trajectories
 from sb3_yann.twin.env import TwinEnv
 from sb3_yann.units import FLOAT32_ROUNDING
 
@@ -76,6 +78,9 @@ def loops_part(subject: Subject) -> Part:
         old = float(of(mpc.costs))
         new = float(of(policy.costs))
         rows.append([f"{name} cost", f"{old:.6g}", f"{new:.6g}", _change(old, new)])
+    for k, name in enumerate(("states, by Q", "inputs, by R")):
+        old, new = (_stage_costs(subject.problem, each)[k] for each in (mpc, policy))
+        rows.append([f"mean stage cost of {name}", f"{old:.6g}", f"{new:.6g}", _change(old, new)])
     for name, before, after in (
         ("steps that violate a limit", mpc.violations.sum(), policy.violations.sum()),
         ("episodes that the env terminates", mpc.terminated.sum(), policy.terminated.sum()),
@@ -137,6 +142,16 @@ def loops_part(subject: Subject) -> Part:
     if words := misread_states(subject.problem, *mpc.steps()):
         return Part(title, content, (finding, make_finding(False, words)))
     return Part(title, content, (finding,))
+
+
+def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float]:
+    """Return what an episode costs with inputs at u_s of theta, and what inputs off u_s add."""
+    theta, u, _ = loops.steps()
+    rest = problem.units.to_deviations(theta) @ problem.error_system.to_input.T
+    of_states = problem.stage_cost(theta, problem.units.input_to_plant(rest))
+    of_inputs = problem.stage_cost(theta, u) - of_states
+    count = len(loops.costs)
+    return float(of_states.sum()) / count, float(of_inputs.sum()) / count
 
 
 def _change(old: float, new: float) -> str:
@@ -420,6 +435,7 @@ def improve_part(subject: Subject) -> Part:
         return left_out(title)
     now = subject.improved
     state = subject.state
+    is_mpc = subject.policy.actor.mu.network.is_zero()
     if now is not None:
         text = (
             f"The policy is the one that improve accepted last, in {now.where} ({now.episodes} "
@@ -427,8 +443,9 @@ def improve_part(subject: Subject) -> Part:
         )
         finding = make_finding(True, text)
     elif not any(each.accepted for each in found):
-        finding = Finding("note", f"improve was at work. {found[-1].reason}")
-    elif subject.policy.actor.mu.network.is_zero():
+        whose = "The policy is the MPC: " * is_mpc
+        finding = Finding("note", f"{whose}improve was at work. {found[-1].reason}")
+    elif is_mpc:
         text = "The policy is the MPC again: what improve accepted is gone."
         finding = Finding("note", text)
     elif state is not None and state.accepted.is_actor_of(subject.policy):
