@@ -675,18 +675,22 @@ def _warn_of_misread_bounds(
                 f"{high + point:g}, or leave x_ss and u_ss out of the model.",
             )
             return
-    if has_constants:
-        return
     has_point = bool(np.any(model.x_ss) or np.any(model.u_ss))
+    if has_constants and not has_point:
+        return
     cure = "If these are what the plant takes, give the model its x_ss and u_ss."
     if has_point:
         cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
+    if has_constants:
+        cure = "Have they the same units?"
     for i in np.flatnonzero(left_out["u"]):
         low, high, point = (each[i] for each in ranges["u"])
         warn(
             f"u_min = {low:g} and u_max = {high:g} leave out {labels_of(model)[1][i]} = {point:g}, "
             f"the operating point: the law cannot rest there. {cure}",
         )
+    if has_constants:
+        return
     for i in np.flatnonzero(has_point & (left_out["x"] | left_out["theta"])):
         low, high, point = (each[i] for each in ranges["x" if left_out["x"][i] else "theta"])
         warn(

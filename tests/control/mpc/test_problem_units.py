@@ -169,6 +169,8 @@ def test_a_warning_names_the_line_that_led_to_it_and_comes_once() -> None:
     message = str(told[0].message)
     assert message.startswith("u_min = 4 and u_max = 10 leave out inflow = 3, the operating point")
     assert "Line" in message
+    with pytest.warns(UserWarning, match="leave out inflow = 3.* Have they the same units"):
+        dataclasses.replace(mpc, u_max=1, tracking=Tracking([0], 1, 20))
 
 
 def test_a_box_that_leaves_out_the_operating_point_is_reported() -> None:
