@@ -344,6 +344,16 @@ def model_of(
     return LearntModel(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
 
 
+def missed_of(model: LearntModel, episode: Episode) -> Array:
+    """Return what a model misses of the states after each step of an episode, (T, n)."""
+    dynamics = model.dynamics
+    part = dynamics.row.state
+    rows = episode.thetas[:-1]
+    after = episode.thetas[1:, part]
+    predicted = TwinPlant(dynamics).advance(rows, episode.actions, np.arange(len(rows)))[:, part]
+    return np.asarray(after - dynamics.coordinates.nearest(predicted, after))
+
+
 def lacks(model: LearntModel) -> tuple[bool, bool]:
     """Return whether a model errs in most steps, and whether that is more than noise.
 
@@ -357,9 +367,8 @@ def lacks(model: LearntModel) -> tuple[bool, bool]:
     row = dynamics.row
     rows = np.concatenate([each.thetas[:-1] for each in model.episodes])
     inputs = np.concatenate([each.actions for each in model.episodes])
-    after = np.concatenate([each.thetas[1:, row.state] for each in model.episodes])
-    predicted = TwinPlant(dynamics).advance(rows, inputs, np.arange(len(rows)))
-    errors = (after - coordinates.nearest(predicted[:, row.state], after)) / coordinates.units
+    errors = np.concatenate([missed_of(model, each) for each in model.episodes])
+    errors /= coordinates.units
     points = row.features(rows, inputs)
     points = points / np.maximum(points.std(axis=0), 1e-9)
     other = cKDTree(points).query(points, k=2)[1][:, 1]
@@ -449,13 +458,15 @@ class Imagined:
 class Scenarios:
     """Starts (k, size), and references and measured disturbances ``given`` (T, k, p) after them.
 
-    ``members`` (k,) act in them, by default their mean.
+    ``members`` (k,) act in them, by default their mean. What they ``missed`` (T, k, n) of an
+    episode, loads and noise that nothing measures, comes again.
     """
 
     model: LearntModel
     members: NDArray[np.intp] | None
     starts: Array
     given: Array
+    missed: Array | None = None
 
     @classmethod
     def like(
@@ -484,7 +495,13 @@ class Scenarios:
             e.thetas[np.minimum(t + np.arange(steps), len(e)), row.given]
             for e, t in zip(episodes, first, strict=True)
         ]
-        return cls(model, None, row.begin(thetas), np.stack(given, axis=1))
+        missed = None
+        if row.estimator is not None:
+            of_each = {id(e): missed_of(model, e) for e in episodes}
+            missed = np.zeros((steps, len(episodes), n))
+            for i, (e, t) in enumerate(zip(episodes, first, strict=True)):
+                missed[: len(e) - t, i] = of_each[id(e)][t:]
+        return cls(model, None, row.begin(thetas), np.stack(given, axis=1), missed)
 
     @cached_property
     def plant(self) -> TwinPlant:
@@ -494,13 +511,20 @@ class Scenarios:
     def of(self, chosen: NDArray[np.intp]) -> Scenarios:
         """Return some of them."""
         members = None if self.members is None else self.members[chosen]
-        return Scenarios(self.model, members, self.starts[chosen], self.given[:, chosen])
+        missed = None if self.missed is None else self.missed[:, chosen]
+        return Scenarios(self.model, members, self.starts[chosen], self.given[:, chosen], missed)
 
     def later(self, rows: Array, steps: NDArray[np.int64]) -> Scenarios:
         """Return scenarios that begin at some steps (k,) of episodes of rows (T + 1, k, size)."""
         every = np.arange(len(self))
-        at = np.minimum(np.arange(len(self.given))[:, None] + steps, len(self.given) - 1)
-        return replace(self, starts=rows[steps, every], given=self.given[at, every])
+        at = np.arange(len(self.given))[:, None] + steps
+        over = at >= len(at)
+        at[over] = len(at) - 1
+        given = self.given[at, every]
+        missed = self.missed
+        if missed is not None:
+            missed = np.where(over[..., None], 0.0, missed[at, every])
+        return replace(self, starts=rows[steps, every], given=given, missed=missed)
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -517,7 +541,11 @@ class Scenarios:
             return np.clip(np.nan_to_num(controller(t, row.shown(rows), numbers)), *limits)
 
         def step(t: int, rows: Array, inputs: Array) -> Array:
-            return self.plant.advance(rows[t], inputs[t], numbers)
+            after = self.plant.advance(rows[t], inputs[t], numbers)
+            if self.missed is not None:
+                after += self.missed[t] @ row.spread.T
+                row.clip(after)
+            return after
 
         with np.errstate(all="ignore"):
             size = len(self.given), problem.model.n_inputs

@@ -237,8 +237,9 @@ def _beyond(subject: Subject) -> Finding:
     reason = no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
     text += (
         f" From {count} states beyond, anywhere in the box of parameters, the cost changes by "
-        f"{change_in_percent(float(np.median(change)))} in the median; from {more} it is more, by "
-        f"{change_in_percent(change.max())} at most{'; ' * bool(reason)}{reason}."
+        f"{change_in_percent(float(np.median(change)))} in the median; from {more or 'none'} it is "
+        f"more{f', by {change_in_percent(change.max())} at most' * bool(more)}"
+        f"{'; ' * bool(reason)}{reason}."
     )
     return Finding("look" if reason else "note", text)
 
@@ -303,9 +304,11 @@ def distance_part(subject: Subject) -> Part:
     if inside:
         text = f"Inputs keep their bounds at {len(theta)} random points of the box of parameters."
     name, where, *_, share = max(rows, key=lambda row: float(row[-1]))
-    largest = f"The policy is at most {share} % of the range of {name} from the MPC, at"
+    largest = f"The policy is at most {share} % of the range of {name} from the MPC, at {where}."
+    if policy.actor.mu.network.is_zero():
+        largest = "The policy is the MPC: its networks add nothing."
     kind = "look" if float(share) > FAR else "note"
-    findings = make_finding(inside, text), Finding(kind, f"{largest} {where}.")
+    findings = make_finding(inside, text), Finding(kind, largest)
     return Part("Where and how far the policy leaves the MPC", join(content), findings)
 
 

@@ -62,13 +62,16 @@ def by_hand(found: Scenarios) -> tuple[np.ndarray, np.ndarray]:
         at = start.copy()
         one = []
         us = []
-        for given in found.given[:, i]:
+        for t, given in enumerate(found.given[:, i]):
             at[row.given] = given
             us.append(np.clip(law(row.shown(at)), *bounds))
             every = [np.tile(v, (len(dynamics.members), 1, 1)) for v in (at, us[-1])]
             after = dynamics.step(*every)[:, 0]
             one.append(at)
             at = after.mean(axis=0) if found.members is None else after[found.members[i]]
+            if found.missed is not None:
+                at = at + row.spread @ found.missed[t, i]
+                row.clip(at)
         rows.append([*one, at])
         inputs.append(us)
     return np.swapaxes(rows, 0, 1), np.swapaxes(inputs, 0, 1)
@@ -89,6 +92,16 @@ def test_an_episode_is_a_loop_of_the_members_steps(make, each) -> None:
     costs = mpc.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
     np.testing.assert_allclose(played.costs, costs)
     assert played.unsafe.shape == (len(found), 9) and not played.unsafe[:, :4].any()
+
+
+def test_loads_and_noise_of_an_episode_that_nothing_measures_come_again() -> None:
+    found = observed()
+    seen = found.episodes[:4]
+    like = Scenarios.like(found, seen, np.random.default_rng(0))
+    assert like.missed is not None and np.abs(like.missed).max() > 0
+    played = like.play(lambda t, theta, rows: np.array([each.actions[t] for each in seen]))
+    for i in (0, 2):  # the others begin elsewhere
+        np.testing.assert_allclose(played.rows[:-1, i], seen[i].thetas[:-1], atol=1e-9)
 
 
 @pytest.mark.parametrize("make", [learnt, observed])
