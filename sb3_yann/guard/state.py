@@ -170,7 +170,7 @@ class Decision:
         names = ("candidate", "accepted policy", "MPC")
         costs = zip(names, self.costs_in_words(), strict=True)
         shown = ", ".join(f"{who} {cost}" for who, cost in costs)
-        return f"Episode {self.episode}: {self.verdict}{reason}; mean costs: {shown}"
+        return f"Episode {self.episode}: {self.verdict}{reason}; means of all starts: {shown}"
 
     def costs_in_words(self) -> list[str]:
         """Return the three costs; of how many starts where that is not all."""
