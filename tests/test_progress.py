@@ -105,6 +105,9 @@ def test_bars_of_parts_count_foretell_nothing_and_leave_little_in_a_file_but_the
         Progress()("what is counted next")
         counted(clock, each=1.0, n=20, timed=True)  # what nothing else foretells
         assert capsys.readouterr().err == "plans: 3 of 20, 00:03 so far, 00:17 left\n"
+        counted(clock, each=1.0, n=2, timed=True)  # too short to say a word, it lets no part by
+        counted(clock, each=1.0, n=20)
+        assert capsys.readouterr().err == ""
         screen = Terminal()
         monkeypatch.setattr(sys, "stderr", screen)
         monkeypatch.setattr(sys, "__stderr__", screen)

@@ -78,9 +78,10 @@ def loops_part(subject: Subject) -> Part:
         old = float(of(mpc.costs))
         new = float(of(policy.costs))
         rows.append([f"{name} cost", f"{old:.6g}", f"{new:.6g}", _change(old, new)])
-    for k, name in enumerate(("states, by Q", "inputs, by R")):
-        old, new = (_stage_costs(subject.problem, each)[k] for each in (mpc, policy))
-        rows.append([f"mean stage cost of {name}", f"{old:.6g}", f"{new:.6g}", _change(old, new)])
+    shares = (_stage_costs(subject.problem, each) for each in (mpc, policy))
+    names = "mean stage cost of states", "mean stage cost of inputs off their rest"
+    for name, old, new in zip(names, *shares, strict=True):
+        rows.append([name, f"{old:.6g}", f"{new:.6g}", _change(old, new)])
     for name, before, after in (
         ("steps that violate a limit", mpc.violations.sum(), policy.violations.sum()),
         ("episodes that the env terminates", mpc.terminated.sum(), policy.terminated.sum()),

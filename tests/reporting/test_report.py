@@ -436,6 +436,12 @@ def test_of_a_twin_alone_its_episodes_are_played_and_said_to_be_no_plant_s(tmp_p
     text = report(model, tmp_path / "r.html", twin=twin, seeds=range(2)).read_text()
     assert "The env is a twin, fitted to the plant&#x27;s log: the plant has played none" in text
     assert "Closed loops against the MPC" in text and "samples for which a move" not in text
+    assert "The policy is the MPC: its networks add nothing." in text
+    cost, states, inputs = (
+        float(re.findall(f"{row}</td><td[^>]*>([^<]+)", text)[0])
+        for row in ("mean cost", "cost of states", "inputs off their rest")
+    )
+    assert states > 0 < inputs and states + inputs == pytest.approx(cost, rel=1e-4)
 
 
 def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
