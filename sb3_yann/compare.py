@@ -206,7 +206,7 @@ class Tolerance:
                 return ""
         return self.bounds.in_words(row[WORST], row[LARGEST_EXCESS] or row[ANY_BOUND])
 
-    def allowed(self, mpc_costs: Array) -> Array:
+    def allowed(self, mpc_costs: ArrayLike) -> Array:
         """Return what each start may cost more, rounding at least."""
         margin: Any = self.margin
         if self.cvar_alpha:
@@ -246,10 +246,15 @@ class Tolerance:
         if not self.cvar_alpha or excess[worst] > self.worst_start:
             return f"start {worst}"
         average, error = tail_average(excess, self.cvar_alpha)
-        if average + standard_errors * error <= 1.0:
+        average += standard_errors * error
+        if average <= 1.0:
             return ""
-        share = 100 * self.cvar_alpha
-        return f"the worst {share:g} % of the starts cost too much, start {worst}"
+        limit = 100 * float(self.allowed(self.typical)) / self.typical
+        most = "up to " if standard_errors else ""
+        return (
+            f"the worst {100 * self.cvar_alpha:g} % of the starts cost {most}{limit * average:.3g} "
+            f"% of the median cost more on average, {limit:.3g} % is allowed: start {worst}"
+        )
 
 
 class Difference(NamedTuple):

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from sb3_yann._validation import Array, Mask, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
-from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.control.wrapper_stack import require_state_shown, require_theta_order
 from sb3_yann.rollout import Trajectories
 from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers import SetPoint
@@ -337,6 +337,7 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
             "the env so that it shows theta: see PastInputs and ObserveDisturbance in "
             "sb3_yann.wrappers."
         )
+    require_theta_order(env, problem.layout)
 
 
 def require_theta_shown(problem: LinearMPC, theta: Array) -> None:

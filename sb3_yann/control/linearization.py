@@ -505,7 +505,8 @@ def linearize_dynamics(
     ends = np.cumsum(sizes)[: len(labels) - 1]
 
     def rate(point: Array) -> Array:
-        return _vector(f(*np.split(point, ends)), x.size)
+        parts = np.split(point, ends)
+        return _vector(slope_of(f, *parts), *parts)
 
     given = np.concatenate([x, u, d])
     size = _size(given, x.size, scale)
@@ -513,6 +514,7 @@ def linearize_dynamics(
     point, notes = _rest_of(rate, given, size, dt, sizes) if np.any(free) else (given, [])
     size = _size(point, x.size, scale)
     check_array(f"f({', '.join(f'{name}_ss' for name in labels)})", rate(point), (x.size,))
+    require_order(f, dt, *np.split(point, ends))
     _require_steady(rate, np.split(point, ends), size[: x.size], dt, scale is not None)
     rounding = np.finfo(float).eps * np.maximum(np.abs(point), size)[: x.size] / dt
     found = jacobian(rate, point, LONGEST_STEP * size, rounding, names(sizes))
@@ -523,16 +525,46 @@ def linearize_dynamics(
     return LinearSystem(A, B, dt, x, u, E, d, tuple(notes))
 
 
-def _vector(value: Any, size: int) -> Array:
+def slope_of(f: Callable[..., ArrayLike], *parts: Array) -> ArrayLike:
+    """Return f(x, u[, d]); a TypeError says how f is called where it seems to take others."""
+    try:
+        return f(*parts)
+    except (IndexError, TypeError, ValueError) as error:
+        of_shapes = any(word in str(error) for word in ("unpack", "dimension", "shapes"))
+        if isinstance(error, ValueError) and not of_shapes:
+            raise
+        fault = f"f ended in {type(error).__name__} ({error})."
+        raise TypeError(f"{fault} {called_as(*parts)}") from error
+
+
+def called_as(*parts: Array) -> str:
+    """Return how f is called, for an error."""
+    shapes = [f"{name} {part.shape}" for name, part in zip("xud", parts, strict=False)]
+    order = f"f({', '.join('xud'[: len(parts)])}), in this order"
+    return f"It is called as {order}, with {', '.join(shapes)}, and returns dx/dt {parts[0].shape}."
+
+
+def require_order(f: Callable[..., ArrayLike], dt: float, *parts: Array) -> None:
+    """Raise TypeError where f(u, x) rests at the operating point, and f(x, u) does not."""
+    if len(parts) != 2 or parts[0].shape != parts[1].shape:
+        return
+    try:
+        with np.errstate(all="ignore"):
+            moved, other = (dt * np.abs(_vector(f(*at), *at)) for at in (parts, parts[::-1]))
+    except Exception:  # whatever f raises where it was not meant to be called
+        return
+    if np.max(moved) > STEADY * np.max(np.abs(parts)) and np.all(other < STEADY * np.max(moved)):
+        raise TypeError(f"f(u, x) rests at the operating point. {called_as(*parts)}")
+
+
+def _vector(value: Any, *parts: Array) -> Array:
     """Return what f returned as a vector (n,): of shape (n,), (n, 1) or (1, n), or a list."""
+    size = parts[0].size
     if isinstance(value, (list, tuple)):  # of numbers, and of arrays with one entry
         value = np.concatenate([np.ravel(to_float("f(x, u)", each)) for each in value])
     array = to_float("f(x, u)", value)
     if array.shape not in ((size,), (size, 1), (1, size)):
-        raise ValueError(
-            f"f returned the shape {array.shape}, expected ({size},) or ({size}, 1): dx/dt of each "
-            "state."
-        )
+        raise ValueError(f"f returned the shape {array.shape}. {called_as(*parts)}")
     return array.reshape(size)
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sb3_yann._validation import warn
+
+if TYPE_CHECKING:
+    from sb3_yann.control.mpc.coordinates import ThetaLayout
 
 WRAPPER_LIBRARIES = {"gymnasium", "stable_baselines3"}
 LEAVE_OUT = (
@@ -17,14 +20,36 @@ LEAVE_OUT = (
 
 
 def layers_of(env: Any) -> Iterator[Any]:
-    """Yield an env and all that it wraps, outermost first; of a vector env each of its envs."""
-    waiting = [env]
-    while waiting:
-        layer = waiting.pop(0)
-        yield layer
-        held = getattr(layer, "__dict__", {})
-        waiting += [held[name] for name in ("venv", "env") if held.get(name) is not None]
-        waiting += [*(held.get("envs") or [])]
+    """Yield an env and all that it wraps, outermost first; of a vector env its envs in turn."""
+    yield env
+    held = getattr(env, "__dict__", {})
+    inner = [held[name] for name in ("venv", "env") if held.get(name) is not None]
+    for each in [*inner, *(held.get("envs") or [])]:
+        yield from layers_of(each)
+
+
+def require_theta_order(env: Any, layout: ThetaLayout) -> None:
+    """Raise ValueError where one of our wrappers appends what has another place in theta.
+
+    Of a vector env the first env counts; below a wrapper that shows another size, nothing does.
+    """
+    end = layout.size
+    for layer in layers_of(env):
+        if parts := getattr(type(layer), "appends", ()):
+            start = end - len(layer.low)
+            slots = [getattr(layout, part) for part in parts]
+            if not any(slot.start <= start and end <= slot.stop for slot in slots):
+                raise ValueError(
+                    f"{type(layer).__name__} appends its values at another place than theta = "
+                    f"[{', '.join(layout.names)}] has them. From the inside outward it is "
+                    "PastInputs, SetPoint, MeasuredDisturbance, ObserveDisturbance, SetPoint of "
+                    "bounds that change, PreviousInput."
+                )
+            end = start
+        elif "envs" not in vars(layer) and "venv" not in vars(layer):
+            inner = vars(layer).get("env")
+            if inner is None or inner.observation_space.shape != layer.observation_space.shape:
+                return
 
 
 def require_state_shown(env: Any, observation_given: bool) -> None:

@@ -29,7 +29,7 @@ from sb3_yann._validation import (
 )
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.online import LAWS
-from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.control.wrapper_stack import require_state_shown, require_theta_order
 from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import checks, sb3_hooks
@@ -180,6 +180,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         checks.require_inverse_normalization(self.problem, algorithm, self.observation)
         if algorithm is not None and algorithm.get_env() is not None:
             require_state_shown(algorithm.get_env(), self.observation_given)
+            if not self.observation_given:
+                require_theta_order(algorithm.get_env(), self.problem.layout)
 
     def _meets_another_env(self) -> None:
         """Do the same where `set_env` has given the algorithm another env since.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,7 +25,9 @@ from sb3_yann._validation import (
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.control.linear_system import with_units
+from sb3_yann.control.linearization import called_as, require_order, slope_of
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
+from sb3_yann.control.wrapper_stack import require_theta_order
 from sb3_yann.env_pool import name_of
 from sb3_yann.units import ActionUnits
 from sb3_yann.wrappers.theta import (
@@ -95,6 +98,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order, or "
                 "pass observation=AffineObservation(matrix, offset)."
             )
+        if observation is None:
+            require_theta_order(env, problem.layout)
         self.problem = problem
         self.violation_cost = check_number("violation_cost", violation_cost)
         self.bounds = Bounds.of(problem)
@@ -152,7 +157,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     ``info["state"]`` is exact. The inputs are held for a sample, ``mpc.model.dt``, in which the
     classical Runge-Kutta method takes ``substeps`` equal steps. ``reset(options={"state": x})``
     begins in a state. Where it is no longer finite an episode terminates, in the last one that was,
-    with ``info["violation"]``; a warning says where f was not.
+    with ``info["violation"]``; a warning says where f was not, and how often.
 
     Parameters
     ----------
@@ -228,6 +233,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
             plant.slope(x_ss, mpc.model.u_ss)
         if plant.fault:
             raise ValueError(f"{plant.fault}, the operating point.")
+        require_order(f, mpc.model.dt, x_ss, mpc.model.u_ss)
         env: Any = plant
         if ratio := ratio_of_time_units(plant.slope, mpc):
             faster = ratio < 1
@@ -288,7 +294,12 @@ def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) 
 
 
 class Equations(gym.Env[Array, Array]):
-    """A plant that shows its state and takes its inputs."""
+    """A plant that shows its state and takes its inputs.
+
+    The 1st, 10th, 100th step in which a function was not finite is warned of, over all envs of it.
+    """
+
+    lost = Counter[Any]()
 
     def __init__(self, f: Slope, mpc: LinearMPC, start: tuple[Array, Array], substeps: int) -> None:
         self.f = f
@@ -302,7 +313,6 @@ class Equations(gym.Env[Array, Array]):
         self.model = mpc.model
         self.time = 0.0
         self.fault = ""  # of a step: where f was not finite first
-        self.warned = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -327,10 +337,14 @@ class Equations(gym.Env[Array, Array]):
         with np.errstate(all="ignore"):
             reached = self._advance(u)
         lost = not np.all(np.isfinite(reached))
-        if self.fault and not self.warned:
-            self.warned = True
-            when = f"t = {self.time:g} {self.model.time_unit}".rstrip()
-            warn(f"{self.fault}, {when}: the episode ends there, as a violation.", NonFiniteWarning)
+        if self.fault:
+            key = getattr(self.f, "__code__", self.plant_name)
+            self.lost[key] += 1
+            if str(self.lost[key]).strip("0") == "1":
+                when = f"t = {self.time:g} {self.model.time_unit}".rstrip()
+                often = f" So did {self.lost[key]} episodes." if self.lost[key] > 1 else ""
+                ends = "the episode ends there, as a violation."
+                warn(f"{self.fault}, {when}: {ends}{often}", NonFiniteWarning)
         if not lost:
             self.state = reached
         self.time += self.dt
@@ -350,10 +364,10 @@ class Equations(gym.Env[Array, Array]):
 
     def slope(self, x: Array, u: Array) -> Array:
         """Return dx/dt; `fault` says where it was not finite first."""
-        slope = np.asarray(self.f(x, u), np.float64)
+        slope = np.asarray(slope_of(self.f, x, u), np.float64)
         if slope.shape != x.shape:
-            wanted = f"{x.shape}, one entry for each of {', '.join(with_units(self.model)[0])}"
-            raise ValueError(f"f(x, u) has shape {slope.shape}, expected dx/dt, {wanted}.")
+            of_x = ", ".join(with_units(self.model)[0])
+            raise ValueError(f"f returned the shape {slope.shape}. {called_as(x, u)} x is {of_x}.")
         wrong = np.flatnonzero(~np.isfinite(slope))
         if wrong.size and not self.fault and np.all(np.isfinite(x)):
             states, inputs = with_units(self.model)

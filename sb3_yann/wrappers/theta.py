@@ -38,7 +38,10 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
     What lies on a bound is shown inside it, where float32 would round it beyond: some laws are zero
     outside their box. ``low`` and ``high`` are (p,), the spaces of the env boxes of one dimension.
+    ``appends`` are parts of `ThetaLayout` that it may hold.
     """
+
+    appends: tuple[str, ...] = ()
 
     def __init__(
         self, env: Env, low: ArrayLike, high: ArrayLike, n_replaced: int = 0, n_new: int = 0
@@ -128,6 +131,8 @@ class PastInputs(Appending):
     >>> env.step(np.float32([-1]))[0][-2:].tolist()
     [-1.0, 1.0]
     """
+
+    appends = "state", "previous"
 
     def __init__(self, env: Env, delays: Sequence[int], initial: ArrayLike | None = None) -> None:
         bounds = require_vector(env, "action_space")
@@ -219,6 +224,8 @@ class SetPoint(Appending):
     >>> float(env.reset(seed=0)[0][-1]), float(env.step(np.float32([0]))[0][-1])
     (0.0, 1.0)
     """
+
+    appends = "reference", "limits"
 
     def __init__(
         self,
@@ -339,6 +346,8 @@ class MeasuredDisturbance(Appending):
     0.25
     """
 
+    appends = ("disturbance",)
+
     def __init__(
         self,
         env: Env,
@@ -450,6 +459,8 @@ class EstimateState(Appending):
     >>> env.reset(seed=0)[0].shape
     (5,)
     """
+
+    appends = ("disturbance",)
 
     def __init__(
         self,

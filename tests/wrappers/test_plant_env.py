@@ -11,6 +11,7 @@ from numpy.random.mtrand import get_bit_generator
 from stable_baselines3 import DDPG
 
 from improvement_samples import quick
+from sample_problems import small_mpc
 from sb3_yann import (
     CostAudit,
     DisturbanceBounds,
@@ -134,9 +135,15 @@ def test_equations_that_fail_are_named_with_state_input_and_time() -> None:
     with pytest.warns(NonFiniteWarning, match=said):
         reached, _, terminated, _, info = env.step(np.array([0.0]))
     assert reached.tolist() == x.tolist() and terminated and info["violation"]
+    with pytest.warns(NonFiniteWarning) as caught:
+        for k in range(9):  # other envs, other states, the same function
+            other = PlantEnv(env.unwrapped.f, mpc)
+            other.reset(options={"state": [349.1 + k / 100]})
+            other.step(np.array([0.0]))
+    assert len(caught) == 1 and "So did 10 episodes." in str(caught[0].message)
     with pytest.raises(ValueError, match=r"slope of level .* = 350, flow = 2, the operating point"):
         PlantEnv(lambda x, u: x * np.inf, mpc)
-    with pytest.raises(ValueError, match=r"shape \(1, 2\), expected dx/dt, \(1,\).* level \(cm\)"):
+    with pytest.raises(ValueError, match=r"shape \(1, 2\).* dx/dt \(1,\). x is level \(cm\)"):
         PlantEnv(lambda x, u: np.ones((1, 2)), mpc)
 
 
@@ -144,7 +151,20 @@ def test_what_is_of_no_use_is_named() -> None:
     plain = LinearMPC(TANK, **WEIGHTS, **BOX)
     with pytest.raises(TypeError, match="f = 3 must be a function"):
         PlantEnv(3, plain)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"f\(x, u\) has shape \(2,\), expected dx/dt, \(1,\)"):
+    called = r"f\(x, u\), in this order, with x \(2,\), u \(1,\), and returns dx/dt \(2,\)"
+    for swapped in (
+        lambda u, x: [x[1], u[0] - x[0]],
+        lambda u, x: np.eye(2) @ x + np.ones((2, 1)) @ u,
+    ):
+        with pytest.raises(TypeError, match=f"f ended in .*Error .* It is called as {called}"):
+            PlantEnv(swapped, small_mpc())
+        with pytest.raises(TypeError, match=f"f ended in .*Error .* It is called as {called}"):
+            LinearModel.from_dynamics(swapped, [0, np.nan], [0], dt=1)
+    as_many = lambda u, x: slope(x, u)  # noqa: E731
+    for use in (PlantEnv, lambda f, _: LinearModel.from_dynamics(f, [350], [2], dt=1)):
+        with pytest.raises(TypeError, match=r"rests at the operating point. It is called as f"):
+            use(as_many, plain)
+    with pytest.raises(ValueError, match=r"f returned the shape \(2,\). It is called as f\(x, u\)"):
         env = PlantEnv(lambda x, u: [1, 2], plain)
         env.reset()
         env.step(np.array([2.0]))

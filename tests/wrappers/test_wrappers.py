@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import DDPG
 
 from general_problems import servo
 from sample_plants import LinearPlant, Sampled, two_input_mpc
@@ -20,6 +21,7 @@ from sb3_yann import (
     Tracking,
     offset_free,
 )
+from sb3_yann.audit.meaning import in_deviations
 from sb3_yann.wrappers import (
     MeasuredDisturbance,
     ObserveDisturbance,
@@ -329,6 +331,24 @@ def test_with_a_measured_load_and_an_observer_the_plant_rests_at_its_set_point(h
     np.testing.assert_allclose([seen[58], seen[-1]], theta[1], atol=1e-4)
     # The load alone moves it little: the observer knows what it does, but for the model's error.
     assert np.abs(np.array(seen[60:]) - theta[1]).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        StageCost,
+        lambda env, mpc: DDPG("YannPolicy", env, policy_kwargs={"problem": mpc}),
+        lambda env, mpc: in_deviations(lambda: env, mpc),  # of improve and headroom
+    ],
+)
+def test_wrappers_in_another_order_than_theta_are_refused(use) -> None:
+    mpc, observer = offset_free(loaded([[0.07]]), [3.0])
+    box = mpc.disturbances.d_min, mpc.disturbances.d_max
+    late = MeasuredDisturbance(Loaded(), [-5], [5])
+    with pytest.raises(ValueError, match=r"SetPoint appends .* From the inside outward it is Past"):
+        use(SetPoint(ObserveDisturbance(late, observer, *box), [-4], [4]), mpc)
+    right = MeasuredDisturbance(SetPoint(Loaded(), [-4], [4]), [-5], [5])
+    use(ObserveDisturbance(right, observer, *box), mpc)
 
 
 def test_an_observer_without_a_measured_load_is_refused_in_any_order() -> None:
