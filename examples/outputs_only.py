@@ -57,7 +57,7 @@ def main() -> None:
     log = yann.Log.from_csv(LOG, ["temperature", "pressure"], ["valve"], DT, time="time")
     model = yann.identify_outputs(log).model
     print(model.report())
-    half = np.array([10, 0.5, *[50] * (model.n_states - 2)])
+    half = np.array([10, 0.5, *[70] * (model.n_states - 2)])  # a valve on its way: 0 to 100
     box = {"theta_min": model.x_ss - half, "theta_max": model.x_ss + half, "u_min": 0, "u_max": 100}
     cost = {"Q": model.C.T @ np.diag([1, 0]) @ model.C, "R": [[1e-3]], "horizon": 4}
     cost["tracking"] = yann.Tracking(model.C[:1], 75, 85)
