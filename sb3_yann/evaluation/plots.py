@@ -325,7 +325,8 @@ def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figur
     below.bar(places, mean, color=COLORS[0], label="mean")
     below.plot(places, largest, "v", color=COLORS[1], markersize=5, label="largest")
     below.set(ylabel="distance from the MPC\n(% of half the range)")
-    below.set_ylim(0, max(below.get_ylim()[1], 0.01))  # rounding is not drawn large
+    _hide_rounding(below, 0.01)
+    below.set_ylim(bottom=0)
     below.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
     below.set_xticks(places, [str(each) for each in regions[order]])
     below.tick_params(axis="x", rotation=90 if len(places) > 15 else 0)
@@ -336,6 +337,13 @@ def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figur
         panel.grid(axis="y", alpha=0.3)
         panel.set_axisbelow(True)
     return figure
+
+
+def _hide_rounding(axes: Axes, size: float) -> None:
+    """Let an axis of differences reach so far from zero at least: rounding is not drawn large."""
+    low, high = axes.get_ylim()
+    if max(-low, high) < size:
+        axes.set_ylim(-size, size)
 
 
 # ---- Closed loops ----
@@ -467,6 +475,7 @@ def _draw_differences(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) ->
     for number, rows in enumerate(others, start=1):
         steps = min(first.shape[1], rows.shape[1])
         _draw_rows(axes, rows[:, :steps] - first[:, :steps], problem.model.dt, number, held)
+    _hide_rounding(axes, 1e-4 * float(np.nanmax(first) - np.nanmin(first)))
     axes.axhline(0, color="black", linewidth=0.8)
     plain = [*problem.labels(), *labels_of(problem.model)[1]][entry]
     whole = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
@@ -543,6 +552,7 @@ def plot_gains(runs: Runs, axes: Axes | None = None) -> Axes:
     colors = [COLORS[2] if each <= 0 else COLORS[1] for each in share]
     axes.bar(np.arange(1, len(share) + 1), share, color=colors, width=0.8)
     axes.axhline(0, color="black", linewidth=0.8)
+    _hide_rounding(axes, 0.01)
     axes.axhline(float(share.mean()), color="black", linestyle="--", linewidth=0.8, label="mean")
     axes.set(xlabel="start, sorted", ylabel=f"{second} minus {first}\n(% of {first}'s mean cost)")
     axes.locator_params(axis="x", integer=True)
@@ -615,7 +625,7 @@ def _range_of_costs(costs: Array, accepted: Array) -> tuple[float, float]:
     known = np.append(accepted[np.isfinite(accepted)], 0.0)
     low = float(known.min())
     high = float(known.max())
-    width = max(high - low, 0.02 * max(abs(low), abs(high)), 1e-12)
+    width = max(high - low, 0.02 * max(abs(low), abs(high)), 0.01)
     near = costs[(costs >= low - 2 * width) & (costs <= high + 2 * width)]
     low = min([low, *near])
     high = max([high, *near])

@@ -262,7 +262,8 @@ def improve(
         play at once. Within ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, episodes
         are spread over its workers; nothing else changes.
     max_steps : int, optional
-        Of a simulator, for everything. Where they do not suffice nothing is accepted.
+        Of a simulator, for everything. Where they do not suffice nothing is accepted; where they
+        cannot, it ends after one episode. The result names how many are needed.
     n_starts : int, default 40
         Episodes that are planned in the model; in a twin, also starts of a check for each member,
         so many as the log begins, and as many around.
@@ -583,9 +584,10 @@ class _Work:
         before: Check | None = None
         note = ""
         accepted = False
+        least = 2 * (FIRST_LOOK + ENOUGH)  # episodes beside the first: a round, and the pairs
         try:
             value_at_end(self.problem)  # raises where the law cannot rest: no plan could be made
-            simulator.begin()
+            simulator.begin(least)
             self.keep_margin(simulator.row, simulator.episodes)
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
             trial = SimulatorTrial(simulator)
@@ -603,8 +605,9 @@ class _Work:
                 accepted = self._confirm(simulator, model, best)
         except OutOfStepsError:
             note = f"max_steps = {max_steps:,} are too few to go on, {simulator.steps:,} are taken"
-            needed = simulator.needed((self.rounds + 2) * FIRST_LOOK + 2 * ENOUGH)
-            note += f"; about {needed:,} are needed" if needed else ": an episode takes more"
+            needed = simulator.needed(least + self.rounds * FIRST_LOOK)
+            counts = f"; at least {simulator.needed(least):,}, for all rounds about {needed:,}"
+            note += f"{counts} are needed" if needed else ": an episode takes more"
         finally:
             simulator.close()
         change = self.checks[-1].change if accepted else 0.0

@@ -138,9 +138,14 @@ class Simulator:
         self.longest = 0
         self.episodes: list[Episode] = []
 
-    def begin(self) -> None:
-        """Play the first episodes, of the MPC with and without random inputs; check the env."""
+    def begin(self, later: int = 0) -> None:
+        """Play the first episodes, of the MPC with and without random inputs; check the env.
+
+        OutOfStepsError after one, where so many ``later`` ones of its length are too many steps.
+        """
         played = self.play(of_law(self.problem), self.new_seeds(1))
+        if self.needed(later) > self.counted.most:
+            raise OutOfStepsError
         each = self.usual // 2
         logged = self.watch(self.new_seeds(each - 1))
         for some in (played, logged, self.excite(each)):

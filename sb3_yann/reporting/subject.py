@@ -80,6 +80,7 @@ img { display: block; height: auto; max-width: 100%; }
   a { color: inherit; text-decoration: none; }
   .wide, pre { overflow: visible; }
   table { font-size: 8.5pt; }
+  td.number { white-space: normal; }
   h2, h3 { break-after: avoid; }
   figure, tr, .sign { break-inside: avoid; }
 }

@@ -117,6 +117,18 @@ def test_below_many_pairs_lie_their_differences() -> None:
     assert len(loops_figure(tank(), {"before": before, "after": episodes(20)}).axes) == 2
 
 
+def test_rounding_is_not_drawn_large() -> None:
+    before = episodes(9)
+    after = episodes(9)
+    for x in after.observations:
+        x += 1e-9
+    after.costs[:] += 1e-9
+    below = loops_figure(tank(), {"before": before, "after": after}).axes[2]
+    width = 1e-4 * 8 / 9  # of the levels
+    assert below.get_ylim() == pytest.approx((-width, width))
+    assert plot_gains({"MPC": before, "policy": after}).get_ylim() == (-0.01, 0.01)
+
+
 def test_gains_are_sorted_and_in_percent_of_the_first_one_s_mean() -> None:
     before = episodes(3)
     after = episodes(3)

@@ -112,7 +112,7 @@ def test_its_steps_are_counted_and_its_envs_closed() -> None:
     assert 20 * (found.episodes + 1) + 5 == found.steps
 
 
-@pytest.mark.parametrize("share", [1.0, 0.99, 0.3, 0.004])
+@pytest.mark.parametrize("share", [1.0, 0.999, 0.3, 0.004])
 def test_it_takes_no_step_more_than_it_may(share) -> None:
     whole = pickle.loads(better())[1].steps
     most = max(int(share * whole), 1)
@@ -127,8 +127,9 @@ def test_it_takes_no_step_more_than_it_may(share) -> None:
     if not found.accepted:
         assert bits(model) == before and found.change == 0.0
         assert f"max_steps = {most:,} are too few to go on" in found.reason
-        needed = "about 3,420 are needed" if share > 0.01 else "an episode takes more"
-        assert needed in found.reason
+        needed = "at least 3,220, for all rounds about 3,420 are needed"
+        assert (needed if share > 0.01 else "an episode takes more") in found.reason
+        assert share != 0.3 or found.steps == 20  # it is known after one episode
         assert "The model is as it was" in found.report()
 
 
@@ -257,7 +258,7 @@ def test_a_reward_of_its_own_is_named_at_the_caller_s_line() -> None:
             return shown, float(self.x[0] ** 3 + self.t % 2), *rest
 
     with pytest.warns(CostMismatchWarning) as caught:
-        improve(model_of(Own), Own, max_steps=1300, **FEW)
+        improve(model_of(Own), Own, **{**FEW, "n_starts": 1, "updates": 1})
     assert caught[0].filename == __file__
 
 

@@ -114,6 +114,8 @@ def test_it_is_one_small_file_that_loads_nothing_and_has_every_part(whole) -> No
     assert not re.search(
         r"https?://|url\(|@import|<(script|link|iframe|object)|javascript:", source
     )
+    # Printed, what is not only a number may wrap: a reason beside it has its width.
+    assert "td.number { white-space: normal; }" in source.partition("@media print")[2]
     outline = Outline(path)
     targets = {attributes.get("id") for _, attributes in outline.found}
     for tag, attributes in outline.found:
