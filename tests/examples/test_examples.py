@@ -86,7 +86,14 @@ def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
     costs = re.findall(r"mean cost +(.*) \(MPC\) -> (.*)", printed)[0]
     before, after = map(float, costs)
     assert after < 0.99 * before and "violations: 0" in printed
-    assert (tmp_path / "out" / "from_a_log.zip").exists()
+    assert "of the MPC's mean cost in the twin" in printed
+    model, plain = DDPG.load(tmp_path / "out" / "from_a_log"), DDPG("YannPolicy", "CSTR-v0")
+    (found,) = model.improvements
+    assert found.accepted and found.change < -0.01 and found.where == "the twin"
+    assert found.steps == 0 and found.episodes == 5 and found.report() in printed
+    mpc = model.policy.problem  # beyond what the log shows the MPC acts
+    far = np.float32(mpc.theta_max * np.eye(4))
+    np.testing.assert_array_equal(model.predict(far)[0], plain.predict(far)[0])
     assert (tmp_path / "out" / "from_a_log.png").stat().st_size > 10_000
 
 

@@ -32,7 +32,7 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import Check, Improvement
 from sb3_yann.improvement.imitation import fit_layer
 from sb3_yann.wrappers import SetPoint
-from twin_samples import POLYNOMIALS, Calm, observed_env, offset_free_problem, problem
+from twin_samples import Calm, observed_env, offset_free_problem, problem
 from weights import is_mpc
 
 UNSEEN = range(900, 930)
@@ -397,36 +397,6 @@ def twin_of(make=Spring, episodes: int = 10) -> PlantTwin:
     mpc = make().observation_space.problem
     played = evaluate(mpc.explicit(), make, range(episodes))
     return PlantTwin.fit(mpc, played.pairs, updates=1500)
-
-
-def reactor(seeds: range) -> PlantTwin:
-    """Return the reactor's twin from episodes of its MPC."""
-    mpc = DDPG("YannPolicy", "CSTR-v0", device="cpu").policy.problem
-    played = evaluate(mpc.explicit(), "CSTR-v0", seeds)
-    return PlantTwin.fit(mpc, played.pairs, residuals=POLYNOMIALS)
-
-
-@pytest.mark.slow
-def test_on_the_reactor_a_log_of_five_episodes_is_enough(tmp_path) -> None:
-    model = DDPG("YannPolicy", "CSTR-v0", device="cpu", seed=0, learning_starts=0)
-    twin = reactor(range(5))
-    found = improve(model, twin, n_starts=20, updates=1000)
-    assert found.accepted and found.change < -0.01 and found.where == "the twin"
-    assert found.steps == 0 and found.episodes == 5
-    assert "of the MPC's mean cost in the twin" in str(found)
-    plain = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    ours, mpc = (evaluate(each, "CSTR-v0", range(500, 530)) for each in (model, plain))
-    assert np.mean(ours.costs) < 0.99 * np.mean(mpc.costs)
-    assert ours.violations.sum() == 0
-    low, high = twin.starts.shown  # beyond what the log shows the MPC acts
-    far = np.float32((low + high) / 2 + 0.8 * (high - low) * np.eye(4))
-    np.testing.assert_array_equal(model.predict(far)[0], plain.predict(far)[0])
-    model.save(tmp_path / "model")
-    again = DDPG.load(tmp_path / "model", env=gym.make("CSTR-v0"))
-    theta = np.float32([0.01, 0.1, -0.1, 1.0])
-    np.testing.assert_array_equal(again.predict(theta)[0], model.predict(theta)[0])
-    assert again.improvements[-1].report() == found.report()
-    again.learn(20, callback=NoActionNoise())
 
 
 def test_a_policy_of_a_twin_gains_on_the_plant(capsys, monkeypatch) -> None:
