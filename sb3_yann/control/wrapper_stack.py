@@ -38,7 +38,8 @@ def require_theta_order(env: Any, layout: ThetaLayout) -> None:
         if parts := getattr(type(layer), "appends", ()):
             start = end - len(layer.low)
             slots = [getattr(layout, part) for part in parts]
-            if not any(slot.start <= start and end <= slot.stop for slot in slots):
+            fits = any(slot.start <= start and end <= slot.stop for slot in slots)
+            if start < end and not fits:
                 raise ValueError(
                     f"{type(layer).__name__} appends its values at another place than theta = "
                     f"[{', '.join(layout.names)}] has them. From the inside outward it is "

@@ -22,7 +22,9 @@ from sb3_yann import (
     offset_free,
 )
 from sb3_yann.audit.meaning import in_deviations
+from sb3_yann.control import StateEstimator
 from sb3_yann.wrappers import (
+    EstimateState,
     MeasuredDisturbance,
     ObserveDisturbance,
     PastInputs,
@@ -349,6 +351,10 @@ def test_wrappers_in_another_order_than_theta_are_refused(use) -> None:
         use(SetPoint(ObserveDisturbance(late, observer, *box), [-4], [4]), mpc)
     right = MeasuredDisturbance(SetPoint(Loaded(), [-4], [4]), [-5], [5])
     use(ObserveDisturbance(right, observer, *box), mpc)
+    model = LinearModel([[0.8]], [[0.2]], 1, C=[[1.0]])
+    plain = LinearMPC(model, Q=[[1]], R=[[1]], horizon=2, tracking=Tracking([0], -4, 4), u_min=-30,
+                      u_max=30, x_min=-50, x_max=50)  # fmt: skip
+    use(SetPoint(EstimateState(Loaded(), StateEstimator(model)), [-4], [4]), plain)
 
 
 def test_an_observer_without_a_measured_load_is_refused_in_any_order() -> None:
