@@ -282,13 +282,14 @@ ENOUGH = 40  # pairs that an acceptance takes: the worst 5 % of the starts are t
 class SimulatorTrial(PairedTrial):
     """Pairs of episodes in a simulator, one of the MPC and one of a policy, of which it learns.
 
-    ``episodes`` are the policy's, None where one is of no use; ``played`` is what was played last.
+    ``episodes`` are the policy's, None where one is of no use; ``played`` is what was played last,
+    and from which seeds.
     """
 
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         self.episodes = list[Episode | None]()
-        self.played: Trajectories | None = None
+        self.played: tuple[Trajectories, Sequence[int]] | None = None
         none = Scores(np.empty(0), np.empty((0, 9)))
         super().__init__(
             self._play, None, Starts((), none, Tolerance(0.0)), simulator.new_seeds, self._tolerated
@@ -296,11 +297,12 @@ class SimulatorTrial(PairedTrial):
 
     def _play(self, act: Feedback | None, seeds: Sequence[int]) -> Scores:
         controller = of_law(self.simulator.problem) if act is None else controller_of(act)
-        self.played = self.simulator.play(controller, seeds)
+        played = self.simulator.play(controller, seeds)
+        self.played = played, seeds
         if act is not None:
-            self.episodes += self.simulator.learn(self.played)
-        no_regions = np.zeros((len(self.played.costs), 0), dtype=bool)
-        return Scores(self.played.costs, self.played.unsafe(), no_regions)
+            self.episodes += self.simulator.learn(*self.played)
+        no_regions = np.zeros((len(played.costs), 0), dtype=bool)
+        return Scores(played.costs, played.unsafe(), no_regions)
 
     def _tolerated(self, mpc_costs: Array) -> Tolerance:
         names = BoundNames.of(self.simulator.problem)

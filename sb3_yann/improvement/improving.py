@@ -598,7 +598,7 @@ class _Work:
             else:
                 trial.extend(FIRST_LOOK)
                 assert trial.played is not None
-                simulator.learn(trial.played)
+                simulator.learn(*trial.played)
             best = before.change if before is not None and before.accepted else 0.0
             model, note = self._rounds(simulator, trial, best)
             if not note:
@@ -647,10 +647,10 @@ class _Work:
         self.say.end_of_round()
         for number in range(self.rounds):
             model, teacher = self._taught(simulator, lost, number)
-            if teacher.gain < RULE.least_gain:
+            promised = imitate(self.layer, teacher, self.updates, self.say.detail)
+            if max(promised, teacher.gain) < RULE.least_gain:
                 note = f"plans {change_in_percent(-teacher.gain)}, too little to teach"
                 break
-            promised = imitate(self.layer, teacher, self.updates, self.say.detail)
             next(trial.stages(self.act(), [len(trial.starts.seeds)]))
             found, _ = trial.check(number + 1, RULE.significance, final=False)
             self.say.end_of_round()

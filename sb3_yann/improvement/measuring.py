@@ -378,7 +378,7 @@ class _Search:
         """Take what was played from all starts into account."""
         self.played[name] = loops.costs
         self.fair[name] = np.where(loops.no_worse(self.base), loops.costs, self.base.costs)
-        self.simulator.learn(loops)
+        self.simulator.learn(loops, self.seeds)
 
     def play_mpc(self) -> None:
         """Play the MPC, and see that the env repeats an episode."""
@@ -390,7 +390,7 @@ class _Search:
                 "the env shows must be finite numbers."
             )
         self.base = played
-        self.simulator.learn(played)
+        self.simulator.learn(played, self.seeds)
         self.say(f"{len(self.seeds)} episodes of the MPC")
 
     def observe(self) -> None:
@@ -444,7 +444,7 @@ class _Search:
             self.say("plans in the twin")
             return
         some = max(simulator.usual // 2, simulator.usual - len(base.costs))
-        simulator.learn(simulator.excite(some))
+        simulator.excite(some)
         self.say(f"{some} episodes with random inputs")
         todo: NDArray[np.intp] = np.arange(len(base.costs))
         latest = base.costs.copy()
@@ -456,13 +456,14 @@ class _Search:
             model = model_of(self.mpc, simulator.episodes, simulator.row.estimator, number)
             self.random, self.poor = lacks(model)
             planning = self._planning(model, TwinPlant(model.dynamics), unit)
-            loops = simulator.play(planning, [self.seeds[i] for i in now], strict=False)
+            seeds = [self.seeds[i] for i in now]
+            loops = simulator.play(planning, seeds, strict=False)
             if number == 0 and len(now) == len(todo):
                 self.played["plan"] = loops.costs
             safe = ~less_safe(loops.unsafe(), base.unsafe()[now]).any(axis=1)
             latest[now] = np.where(safe, loops.costs, base.costs[now])
             self.fair[f"plan {number}"] = latest.copy()
-            simulator.learn(loops)
+            simulator.learn(loops, seeds)
             costlier = loops.costs - planning.promised(len(now))
             kept = safe & (costlier <= KEPT * np.abs(base.costs).mean())
             todo = np.setdiff1d(todo, now[kept])

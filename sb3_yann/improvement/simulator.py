@@ -143,13 +143,15 @@ class Simulator:
 
         OutOfStepsError after one, where so many ``later`` ones of its length are too many steps.
         """
-        played = self.play(of_law(self.problem), self.new_seeds(1))
+        seeds = self.new_seeds(1)
+        played = self.play(of_law(self.problem), seeds)
         if self.needed(later) > self.counted.most:
             raise OutOfStepsError
+        self.learn(played, seeds)
         each = self.usual // 2
-        logged = self.watch(self.new_seeds(each - 1))
-        for some in (played, logged, self.excite(each)):
-            self.learn(some)
+        seeds = self.new_seeds(each - 1)
+        self.learn(self.watch(seeds), seeds)
+        self.excite(each)
         if not self.episodes:
             raise ValueError(
                 f"None of {2 * each} episodes of the MPC in the simulator begins with {SHORTEST} "
@@ -197,10 +199,15 @@ class Simulator:
             warn_of_own_reward(problem, played)
         return played
 
-    def excite(self, count: int) -> Trajectories:
-        """Return so many episodes of the MPC with random inputs on top, from new starts."""
-        seeds = self.new_seeds(count)
-        return self.play(Excited(self.problem, self.seed), seeds, strict=False)
+    def excite(self, count: int) -> None:
+        """Learn from so many episodes of the MPC with random inputs on top, from new starts.
+
+        Where only an estimator's memory stands for the plant's state they are from known starts:
+        episodes of one seed differ by their inputs alone, whatever loads it brings.
+        """
+        known = [each.seed for each in self.episodes if each.seed is not None]
+        seeds = known[:count] if self.row.is_estimate else self.new_seeds(count)
+        self.learn(self.play(Excited(self.problem, self.seed), seeds, strict=False), seeds)
 
     def affordable(self) -> int:
         """Return how many episodes the steps that are left surely suffice for."""
@@ -248,15 +255,15 @@ class Simulator:
         self.longest = max(self.longest, int(played.lengths.max(initial=0)))
         return played
 
-    def learn(self, played: Trajectories) -> list[Episode | None]:
+    def learn(self, played: Trajectories, seeds: Sequence[int]) -> list[Episode | None]:
         """Take the first parts of episodes that are of use, and return them; None for none."""
         found: list[Episode | None] = []
-        for thetas, inputs in played.pairs:
+        for (thetas, inputs), seed in zip(played.pairs, seeds, strict=True):
             kept = int(np.argmin(np.append(self._near(thetas), False)))
             thetas = thetas[:kept]
             inputs = inputs[: max(kept - 1, 0)]
             usable = len(inputs) >= SHORTEST and bool(np.isfinite(inputs).all())
-            found.append(Episode(*self.row.recovered(thetas, inputs)) if usable else None)
+            found.append(Episode(*self.row.recovered(thetas, inputs), seed) if usable else None)
         self.episodes += [each for each in found if each is not None]
         return found
 

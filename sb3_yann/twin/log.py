@@ -33,10 +33,13 @@ class Episode:
         are rows (T + 1, size): see :class:`RowLayout`.
     actions : ndarray, shape (T, m)
         The inputs, in the units of the problem.
+    seed : int, optional
+        Of a simulator. What is random is the same in episodes of the same seed.
     """
 
     thetas: Array
     actions: Array
+    seed: int | None = None
 
     def __len__(self) -> int:
         """Return the number of steps."""

@@ -74,11 +74,16 @@ class RowLayout:
     def _n_disturbances(self) -> int:
         return self.problem.layout.n_disturbances
 
+    @property
+    def is_estimate(self) -> bool:
+        """Whether the plant's own state is in no entry: the estimator's memory stands for it."""
+        return self.estimator is not None and self.observer is None
+
     @cached_property
     def _estimated(self) -> slice:
         """The entries of disturbances that the estimator moves, where it is the plant's memory."""
         part = self.problem.layout.disturbance
-        if self.estimator is None or self.observer is not None:
+        if self.estimator is None or not self.is_estimate:
             return slice(part.stop, part.stop)
         known = self._n_disturbances - self.estimator.n_estimated
         return slice(part.start + known, part.stop)
@@ -165,7 +170,7 @@ class RowLayout:
         parts = self.problem.layout
         found = np.zeros((self.size, parts.n_states))
         found[self.state] = np.eye(parts.n_states)
-        if self.observer is None and self.estimator is not None:
+        if self.estimator is not None and self.is_estimate:
             gain = self.estimator.gain
             n = parts.n_states
             found[self._estimated] = gain[n:] @ np.linalg.pinv(gain[:n])

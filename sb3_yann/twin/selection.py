@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._progress import bar
@@ -50,13 +51,18 @@ def fit_ensemble(
     goes on from its own predictions: a fit to single steps takes noise of the sensors for dynamics.
     ``updates`` are steps of Adam for single steps; before windows half as many, and for them a
     fifth.
+
+    Where an estimator's memory stands for the plant's state, what a step leaves is of loads as
+    well, which theta tells and the MPC answers: a fit would take their answer for their cause. So
+    networks are fitted to what episodes of one seed, whose loads are the same, leave differently.
     """
     generator = th.Generator().manual_seed(seed)
     rows = [[coordinates.regression(each) for each in log] for log in logs]
     pairs = [[np.concatenate(part) for part in zip(*each, strict=True)] for each in rows]
     # Single steps of a simulator are known to many digits, those of a log are not.
     dtype = th.float64 if ahead == 1 else th.float32
-    networks = _Networks(pairs, FLOAT32_ROUNDING * coordinates.units, generator, dtype)
+    alike = _of_one_seed(logs[0]) if coordinates.row.is_estimate else None
+    networks = _Networks(pairs, alike, FLOAT32_ROUNDING * coordinates.units, generator, dtype)
     networks.fit_steps(pairs, updates if ahead == 1 else updates // 2)
     if ahead > 1:
         networks.fit_windows(coordinates, logs, ahead, updates // 5)
@@ -66,13 +72,19 @@ def fit_ensemble(
 class _Networks:
     """The networks while they are fitted, in standardized coordinates.
 
-    Each member is fitted to a pair z (rows, k), y (rows, n); what is smaller in y than ``least``
-    (n,) is rounding.
+    Each member is fitted to a pair z (rows, k), y (rows, n), or to the differences of rows that are
+    ``alike`` (pairs, 2); what is smaller in y than ``least`` (n,) is rounding.
     """
 
     def __init__(
-        self, pairs: list[list[Array]], least: Array, generator: th.Generator, dtype: th.dtype
+        self,
+        pairs: list[list[Array]],
+        alike: NDArray[np.intp] | None,
+        least: Array,
+        generator: th.Generator,
+        dtype: th.dtype,
     ) -> None:
+        self.alike = alike
         self.generator = generator
         self.dtype = dtype
         count = len(pairs)
@@ -80,7 +92,10 @@ class _Networks:
         n = pairs[0][1].shape[1]
         self.center = self.tensor([z.mean(0, keepdims=True) for z, _ in pairs])
         self.width = self.tensor([np.maximum(z.std(0, keepdims=True), 1e-9) for z, _ in pairs])
-        linear, units = zip(*(_least_squares(*each) for each in pairs), strict=True)
+        compared = pairs
+        if alike is not None:
+            compared = [[a[alike[:, 0]] - a[alike[:, 1]] for a in each] for each in pairs]
+        linear, units = zip(*(_least_squares(*each) for each in compared), strict=True)
         self.unit = self.tensor(np.maximum(units, least))
 
         def drawn(rows: int, columns: int) -> th.Tensor:
@@ -114,9 +129,15 @@ class _Networks:
     def fit_steps(self, pairs: list[list[Array]], updates: int) -> None:
         """Fit them to single steps."""
         z, y = (self.tensor(_same_length([each[i] for each in pairs])) for i in (0, 1))
+        count = z.shape[1] if self.alike is None else len(self.alike)
         for _ in self._steps(FIT_RATE, updates):
-            chosen = th.randint(z.shape[1], (ROWS_OF_STEP,), generator=self.generator)
-            (((self(z[:, chosen]) - y[:, chosen]) / self.unit) ** 2).mean().backward()  # type: ignore[no-untyped-call]
+            chosen = th.randint(count, (ROWS_OF_STEP,), generator=self.generator)
+            if self.alike is None:
+                errors = self(z[:, chosen]) - y[:, chosen]
+            else:
+                first, other = (self(z[:, rows]) - y[:, rows] for rows in self.alike[chosen].T)
+                errors = first - other
+            ((errors / self.unit) ** 2).mean().backward()  # type: ignore[no-untyped-call]
 
     def fit_windows(
         self, coordinates: Coordinates, logs: Sequence[Sequence[Episode]], ahead: int, updates: int
@@ -187,6 +208,17 @@ def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
     left = y - about @ linear
     size = np.sqrt(np.mean(left**2, axis=0, keepdims=True))
     return linear, size
+
+
+def _of_one_seed(log: Sequence[Episode]) -> NDArray[np.intp] | None:
+    """Return pairs (pairs, 2) of rows of one seed and time, None where there are none."""
+    starts = np.cumsum([0, *map(len, log)])
+    found = [
+        np.array([[start], [other]]) + np.arange(min(len(e), len(f)))
+        for (e, start), (f, other) in combinations(zip(log, starts, strict=False), 2)
+        if e.seed == f.seed is not None
+    ]
+    return np.concatenate(found, axis=1).T if found else None
 
 
 def _same_length(parts: list[Array]) -> Array:

@@ -60,7 +60,7 @@ class Fake:
         unsafe = unsafe_columns(0, 0, ~np.isfinite(costs), excess)
         return SimpleNamespace(costs=costs, unsafe=lambda: unsafe, seeds=seeds)
 
-    def learn(self, played: Any) -> list[Any]:
+    def learn(self, played: Any, seeds: Any) -> list[Any]:
         return [*played.seeds]
 
 

@@ -4,17 +4,25 @@ import dataclasses
 from dataclasses import replace
 from functools import cache, partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG
 
-from sb3_yann import PlantTwin, YannPolicy
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, YannPolicy, offset_free
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.improvement import simulator as module
-from sb3_yann.improvement.imitation import Teacher, controller_of, policy_of, refine
+from sb3_yann.improvement.imitation import (
+    Teacher,
+    controller_of,
+    policy_of,
+    refine,
+)
 from sb3_yann.improvement.improving import _Progress, _Work
 from sb3_yann.improvement.simulator import (
     Disagreement,
+    Excited,
     Scenarios,
     Simulator,
     lacks,
@@ -30,6 +38,7 @@ from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import fit_ensemble
+from sb3_yann.wrappers import EstimateState
 from twin_samples import POLYNOMIALS, Cart, log, observed, problem, rated
 
 
@@ -102,6 +111,48 @@ def test_loads_and_noise_of_an_episode_that_nothing_measures_come_again() -> Non
     played = like.play(lambda t, theta, rows: np.array([each.actions[t] for each in seen]))
     for i in (0, 2):  # the others begin elsewhere
         np.testing.assert_allclose(played.rows[:-1, i], seen[i].thetas[:-1], atol=1e-9)
+
+
+class Pushed(gym.Env):
+    """A cart whose position alone is shown, pushed by another load in each episode."""
+
+    model = LinearModel([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], dt=0.1, C=[[1.0, 0.0]])
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.array([self.np_random.uniform(-0.5, 0.5), 0.0])
+        self.load = self.np_random.uniform(-0.5, 0.5)
+        return self.x[:1].astype(np.float32), {}
+
+    def step(self, action):
+        self.x = self.model.A @ self.x + self.model.B @ (action + self.load)
+        return self.x[:1].astype(np.float32), 0.0, False, False, {}
+
+
+def test_what_a_load_does_is_not_taken_for_what_answers_it(monkeypatch) -> None:
+    monkeypatch.setattr(module, "fit_ensemble", partial(fit_ensemble, updates=300))
+    box = {"theta_min": [-2.0, -2.0], "theta_max": [2.0, 2.0], "u_min": [-1.0], "u_max": [1.0]}
+    mpc = LinearMPC(Pushed.model, Q=np.diag([1.0, 0.1]), R=[[0.1]], horizon=5, **box)
+    mpc, observer = offset_free(mpc, [1.0])
+    simulator = Simulator(mpc, lambda: EstimateState(TimeLimit(Pushed(), 60), observer), 0)
+    simulator.begin()
+    row = simulator.row
+    episodes = tuple(simulator.episodes)
+    usual, other = (
+        simulator.learn(simulator.play(act, range(20)), range(20))
+        for act in (of_law(mpc), Excited(mpc, 5))
+    )
+    states = np.stack([each.thetas[:, row.state] for each in other], axis=1)
+    errors = []
+    for known in (episodes, [replace(each, seed=None) for each in episodes]):
+        like = Scenarios.like(model_of(mpc, known, observer, 0), usual, np.random.default_rng(0))
+        like = replace(like, starts=row.begin(np.array([each.thetas[0] for each in usual])))
+        played = like.play(lambda t, theta, rows: np.array([each.actions[t] for each in other]))
+        errors.append(np.abs(played.rows[..., row.state] - states).max() / np.std(states))
+    assert errors[0] < 1e-3
+    assert errors[1] > 0.3  # what it would be if they had no seeds
 
 
 @pytest.mark.parametrize("make", [learnt, observed])
@@ -185,7 +236,7 @@ def test_an_episode_counts_until_it_is_a_width_beyond_the_box_or_not_finite() ->
     for far, kept in ((0.9, len(inputs)), (1.1, 29), (np.nan, 29)):
         moved = thetas.copy()
         moved[30, 0] = problem().theta_max[0] + far * width[0]
-        (episode,) = simulator.learn(Trajectories(None, None, (moved,), (inputs,), None))
+        (episode,) = simulator.learn(Trajectories(None, None, (moved,), (inputs,), None), [0])
         assert len(episode) == kept
     simulator.close()
 
