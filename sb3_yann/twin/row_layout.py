@@ -83,7 +83,7 @@ class RowLayout:
     def _estimated(self) -> slice:
         """The entries of disturbances that the estimator moves, where it is the plant's memory."""
         part = self.problem.layout.disturbance
-        if self.estimator is None or not self.is_estimate:
+        if self.estimator is None or self.observer is not None:
             return slice(part.stop, part.stop)
         known = self._n_disturbances - self.estimator.n_estimated
         return slice(part.start + known, part.stop)
@@ -170,7 +170,7 @@ class RowLayout:
         parts = self.problem.layout
         found = np.zeros((self.size, parts.n_states))
         found[self.state] = np.eye(parts.n_states)
-        if self.estimator is not None and self.is_estimate:
+        if self.observer is None and self.estimator is not None:
             gain = self.estimator.gain
             n = parts.n_states
             found[self._estimated] = gain[n:] @ np.linalg.pinv(gain[:n])

@@ -54,7 +54,8 @@ def fit_ensemble(
 
     Where an estimator's memory stands for the plant's state, what a step leaves is of loads as
     well, which theta tells and the MPC answers: a fit would take their answer for their cause. So
-    networks are fitted to what episodes of one seed, whose loads are the same, leave differently.
+    networks are fitted to what episodes of one seed, whose loads are the same, leave differently;
+    the logs of all members are the same then.
     """
     generator = th.Generator().manual_seed(seed)
     rows = [[coordinates.regression(each) for each in log] for log in logs]

@@ -13,12 +13,7 @@ from stable_baselines3 import DDPG
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, YannPolicy, offset_free
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.improvement import simulator as module
-from sb3_yann.improvement.imitation import (
-    Teacher,
-    controller_of,
-    policy_of,
-    refine,
-)
+from sb3_yann.improvement.imitation import Teacher, controller_of, policy_of, refine
 from sb3_yann.improvement.improving import _Progress, _Work
 from sb3_yann.improvement.simulator import (
     Disagreement,
