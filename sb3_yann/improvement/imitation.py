@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
+from torch import nn
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback, Mask
@@ -35,12 +37,12 @@ it, so that the slope does not vanish on the way."""
 FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
 HARDEST = 40  # scenarios that are planned anew after a fit or a check, at most
 HEAVIEST = 8  # times that a start counts which a policy loses: twice as often after each fit
-DESCENTS = 100  # steps of Adam down the costs of a model's episodes, after the fits
-DESCENT_RATE = 5e-4  # of Adam at first; it falls to zero
-DESCENT_ROWS = 12_000  # steps of episodes whose slopes each of these follows, about
+DESCENTS = 10  # steps down the costs of a model's episodes, after the fits
+DESCENT_ROWS = 48_000  # steps of episodes whose slopes each of these follows, about
+MOVE = 0.1  # of an action in the first of these, root mean square
+LONGER = 1.5  # times the last one's is the next, where the policy got better; else half of it
+FARTHEST = 3.0  # moves of an action, in times their root mean square
 STEEPEST = 10.0  # slopes of an episode, in times the median's, at most
-LOOK = 10  # steps of Adam after which all scenarios are played
-VAIN_LOOKS = 3  # looks in a row that may bring no better policy
 NEARLY = 0.5
 PRICE = 40.0
 """How often a start counts, at first, that costs so much of what it may cost more than with the
@@ -261,77 +263,77 @@ def imitate(
         teacher.show(policy_of(layer, teacher.problem), played)
     layer.load_state_dict(best)
     if descends:
-        promised = refine(layer, teacher)
+        promised = refine(layer, teacher, updates // 2)
         say(f"descent, in the model: policy {change_in_percent(-promised)}")
     return promised
 
 
-def refine(layer: LawLayer, teacher: Teacher) -> float:
+def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     """Let a layer descend the costs of a model's episodes; return what it saves, as `imitate`.
 
-    Adam takes steps down the mean cost of the scenarios, whose slopes run back through the model:
-    plans know no set-point before it comes, a policy learns what usually follows. Starts that cost
-    more than they may have a price, which rises while the rule of acceptance objects: a method of
-    multipliers. The layer ends with what that rule lets through, and of that with what costs the
-    least.
+    The steps are of the function, not of its weights: a layer is fitted to its actions of now, less
+    the slopes of the costs by them, which run back through the model. Least squares make of slopes
+    what is expected at theta: plans know no set-point before it comes, a policy learns what usually
+    follows. Starts that cost more than they may have a price, which rises while the rule of
+    acceptance objects: a method of multipliers. The layer ends with what that rule lets through,
+    and of that with what costs the least.
     """
     scenarios = teacher.scenarios
     problem = teacher.problem
     mpc = teacher.mpc.costs
-    known = np.isfinite(mpc)
-    saved = 0.0
-    if not known.any():
-        return saved
-    allowed = RULE.tolerance(mpc[known])
-    unit = float(np.abs(mpc[known]).mean())
-    kind = RowAdam if layer.row_gradients else th.optim.Adam
-    optimizer: Any = kind(layer.network.weights(), lr=DESCENT_RATE)
-    room = NEARLY * allowed.allowed(mpc)
+    known = np.flatnonzero(np.isfinite(mpc))
+    if not len(known):
+        return 0.0
+    room = NEARLY * RULE.tolerance(mpc[known]).allowed(mpc)
     price = PRICE
+    size = MOVE
     most = (False, -np.inf)
-    since = 0
-    best = copy.deepcopy(layer.state_dict())
-    what = "the policy descends in the model: steps of Adam, at most"
+    score = -np.inf
+    what = "the policy descends in the model: steps, at most"
     for k in bar(what, range(DESCENTS + 1), timed=True):
-        if k % LOOK == 0:
-            played = teacher.play(layer)
-            passes = not teacher.objection(played)
-            rank = passes, teacher.score(played.costs)
-            if rank > most:
-                most = rank
-                saved = teacher.saved(played.costs, teacher.usual)
-                best = copy.deepcopy(layer.state_dict())
-                since = k
-            if k == DESCENTS or k - since == VAIN_LOOKS * LOOK:
-                break
-            if not passes:
-                price *= 2
-        chosen = teacher.rng.permutation(np.flatnonzero(known))
-        some = scenarios.of(chosen[: DESCENT_ROWS // teacher.steps + 1])
-        chosen = chosen[: len(some)]
-        act = policy_of(layer, problem)
-        played = some.play(controller_of(act))
-        finite = np.flatnonzero(np.isfinite(played.costs))
-        if not len(finite):
+        played = teacher.play(layer)
+        passes = not teacher.objection(played)
+        rank = passes, teacher.score(played.costs)
+        if rank > most:
+            most = rank
+            saved = teacher.saved(played.costs, teacher.usual)
+            best = copy.deepcopy(layer.state_dict())
+        if rank[1] > score:
+            score = rank[1]
+            objects = not passes
+            present = copy.deepcopy(layer.state_dict())
+            last = played
+            size *= LONGER if k else 1.0
+        else:
+            layer.load_state_dict(present)
+            size /= 2
+        if k == DESCENTS:
             break
-        played = played.of(finite)
+        if objects:
+            price *= 2
+        count = DESCENT_ROWS // teacher.steps + 1
+        chosen = teacher.rng.permutation(known[np.isfinite(last.costs[known])])[:count]
+        if not len(chosen):
+            break
+        some = last.of(chosen)
         slopes = slopes_of_inputs(
-            some.of(finite).plant, teacher.task, act, played.rows, played.inputs
+            scenarios.of(chosen).plant,
+            teacher.task,
+            policy_of(layer, problem),
+            some.rows,
+            some.inputs,
         )
-        slopes *= problem.u_half / unit
+        slopes *= problem.u_half
         sizes = np.linalg.norm(slopes, axis=(0, 2))
-        steep = np.maximum(1.0, sizes / (STEEPEST * np.median(sizes)))
-        slopes *= ((1 + price * (played.costs > (mpc + room)[chosen[finite]])) / steep)[:, None]
-        at, down = (
-            th.as_tensor(each.reshape(-1, each.shape[-1]))
-            for each in (played.thetas[:-1], slopes / len(chosen))
-        )
-        optimizer.param_groups[0]["lr"] = DESCENT_RATE * (1 - k / DESCENTS)
-        optimizer.zero_grad()
-        loss = th.sum(layer(at) * down.float())
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-    optimizer.zero_grad()
+        limit = STEEPEST * np.median(sizes)
+        shares = np.minimum(1.0, limit / np.maximum(sizes, np.finfo(float).tiny))
+        slopes *= ((1 + price * (some.costs > (mpc + room)[chosen])) * shares)[:, None]
+        moves = -slopes / (np.sqrt(np.mean(slopes**2)) or 1.0)
+        moves = size * np.clip(moves, -FARTHEST, FARTHEST).reshape(-1, moves.shape[-1])
+        at = th.as_tensor(some.thetas[:-1].reshape(len(moves), -1))
+        with th.no_grad():
+            to = layer(at) + th.as_tensor(moves, dtype=th.float32)
+        _fit(layer, at, to, nn.functional.mse_loss, teacher.rng, updates)
     layer.load_state_dict(best)
     return saved
 
@@ -355,14 +357,26 @@ def fit_layer(
     wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
     to = th.as_tensor(wanted[finite], dtype=th.float32)
+    _fit(layer, at, to, partial(nn.functional.smooth_l1_loss, beta=HUBER), rng, updates)
+
+
+def _fit(
+    layer: LawLayer,
+    at: th.Tensor,
+    to: th.Tensor,
+    loss_of: Callable[[th.Tensor, th.Tensor], th.Tensor],
+    rng: np.random.Generator,
+    updates: int,
+) -> None:
+    """Take steps of Adam on the loss of actions (rows, m) at theta (rows, n_theta)."""
     kind = RowAdam if layer.row_gradients else th.optim.Adam
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
-    what = "the policy learns from plans: steps of Adam"
+    what = "the policy learns: steps of Adam"
     for k in bar(what, range(updates if len(at) else 0), timed=True):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()
-        loss = th.nn.functional.smooth_l1_loss(layer(at[chosen]), to[chosen], beta=HUBER)
+        loss = loss_of(layer(at[chosen]), to[chosen])
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     optimizer.zero_grad()
