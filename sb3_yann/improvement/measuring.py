@@ -79,7 +79,7 @@ class Headroom:
     verdict : str
         What to do: one of "keep the MPC", "add ObserveDisturbance first", "re-identify", "learn";
         "not known" where what was found is worth it but may be chance, and where nothing was found
-        with plans that were made in a poor model.
+        with plans that were made in a poor model, or not played from every start.
     source : str
         Where it was found.
     d_max : ndarray, shape (n,), optional
@@ -98,6 +98,8 @@ class Headroom:
         The same MPC with a model that these episodes, or a twin's log, tell.
     budget : int
         Steps of the env that `improve` is likely not to exceed; 0 in a twin.
+    unplanned : int
+        Starts from which no plan was played: steps were too few, or Ctrl-C came.
 
     Examples
     --------
@@ -124,6 +126,7 @@ class Headroom:
     note: str = ""
     reidentified: LinearMPC | None = None
     budget: int = 0
+    unplanned: int = 0
 
     @property
     def total(self) -> float:
@@ -180,6 +183,11 @@ class Headroom:
         parts = self.offset, self.model_error, self.nonlinearity
         if self.verdict != verdict_of(*parts) != "keep the MPC":
             return "what was found may be chance on so few starts. Take more: n_starts=."
+        if self.verdict == UNKNOWN and self.unplanned:
+            return (
+                f"nothing was found, but from {self.unplanned} of {len(self.mpc_costs)} starts no "
+                "plan was played: let it end, with more max_steps= or fewer n_starts=."
+            )
         poor = ""
         if self.lost is not None:
             more = (
@@ -337,6 +345,7 @@ class _Search:
         self.played: dict[str, Array] = {}  # costs of each controller, losses included
         self.fair: dict[str, Array] = {}  # the MPC's where a bound is broken by more
         self.reidentified: LinearMPC | None = None
+        self.planned = np.zeros(len(seeds), dtype=bool)  # starts from which a plan was played
 
     def found(self) -> Headroom:
         """Play all of it, and return the figures."""
@@ -441,6 +450,7 @@ class _Search:
             count = len(self.twin.dynamics.members)
             acting = TwinPlant(twin.dynamics, [seed % count for seed in self.seeds])
             self.add("plan", simulator.play(self._planning(twin, acting, unit), self.seeds))
+            self.planned[:] = True
             self.say("plans in the twin")
             return
         some = max(simulator.usual // 2, simulator.usual - len(base.costs))
@@ -458,6 +468,7 @@ class _Search:
             planning = self._planning(model, TwinPlant(model.dynamics), unit)
             seeds = [self.seeds[i] for i in now]
             loops = simulator.play(planning, seeds, strict=False)
+            self.planned[now] = True
             if number == 0 and len(now) == len(todo):
                 self.played["plan"] = loops.costs
             safe = ~less_safe(loops.unsafe(), base.unsafe()[now]).any(axis=1)
@@ -505,7 +516,8 @@ class _Search:
             if not offset > SURE * by_observer.standard_error:
                 verdict = UNKNOWN
         lost = -gain(base, self.played.get("plan", base)) if self.poor else 0.0
-        if lost > 0 and verdict_of(*parts) == "keep the MPC":
+        unplanned = int(np.count_nonzero(~self.planned))
+        if (lost > 0 or unplanned) and verdict_of(*parts) == "keep the MPC":
             verdict = UNKNOWN
         return dataclasses.replace(
             whole,
@@ -517,6 +529,7 @@ class _Search:
             note=note,
             reidentified=self.reidentified,
             budget=EPISODES_OF_IMPROVE * int(self.base.lengths.max()) if self.twin is None else 0,
+            unplanned=unplanned,
         )
 
 
