@@ -13,25 +13,10 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from event_files import scalars
 from guard_samples import MPC, STEPS, Slide, build
-from sample_plants import Recorder
+from sample_plants import Ending, Recorder
 from sb3_yann import ControlDiagnostics, NoActionNoise, SimulatedEpisodes, YannPolicy
 from sb3_yann.callbacks import _Exploration
 from weights import last_layer, unpin
-
-
-class FixedRewards(gym.Wrapper):
-    """Every step costs 1 and the third ends the episode, with a violation."""
-
-    steps = 0
-
-    def reset(self, **kwargs):
-        self.steps = 0
-        return self.env.reset(**kwargs)
-
-    def step(self, action):
-        observation, _, _, _, info = self.env.step(action)
-        self.steps += 1
-        return observation, -1.0, self.steps == 3, False, {**info, "violation": self.steps == 3}
 
 
 def noisy(algorithm=DDPG, env: gym.Env | None = None, **kwargs):
@@ -84,30 +69,28 @@ def test_diagnostics_need_a_yann_policy() -> None:
         DDPG("MlpPolicy", "Pendulum-v1").learn(8, callback=ControlDiagnostics())
 
 
-def test_tensorboard_shows_distance_regions_violations_and_critic_error(tmp_path) -> None:
+@pytest.mark.parametrize("pushed", [False, True])
+def test_tensorboard_shows_distances_regions_and_violations(pushed, tmp_path) -> None:
     model, _ = noisy(tensorboard_log=str(tmp_path))
+    if pushed:
+        with th.no_grad():  # every output to its upper bound
+            last_layer(model)[..., -1] = 100.0
+            unpin(model)
     model.learn(800, callback=[NoActionNoise(), ControlDiagnostics()])  # four episodes: one dump
     shown = scalars(tmp_path)
-    assert shown["yann/distance_from_mpc_max"][-1] < 1e-6  # nothing was learnt, nothing differs
+    mean, largest = (shown[f"yann/distance_from_mpc_{name}"][-1] for name in ("mean", "max"))
+    if pushed:  # fractions of the input range
+        assert 0.4 < largest <= 1 and 0 < mean <= largest
+        return
+    assert largest < 1e-6  # nothing was learnt, nothing differs
     assert 0 <= shown["yann/region"][-1] < 7
     assert 1 <= shown["yann/regions_visited"][-1] <= 7
     assert shown["yann/violations"] == [0]
     assert shown["yann/critic_error"][-1] > 0
 
 
-def test_the_distance_is_a_fraction_of_the_input_range(tmp_path) -> None:
-    model, _ = noisy(tensorboard_log=str(tmp_path))
-    with th.no_grad():  # push every output to its upper bound
-        last_layer(model)[..., -1] = 100.0
-        unpin(model)
-    model.learn(800, callback=[NoActionNoise(), ControlDiagnostics()])
-    shown = scalars(tmp_path)
-    assert 0.4 < shown["yann/distance_from_mpc_max"][-1] <= 1
-    assert 0 < shown["yann/distance_from_mpc_mean"][-1] <= shown["yann/distance_from_mpc_max"][-1]
-
-
 def test_violations_count_and_the_critic_error_compares_q_with_the_return_that_followed() -> None:
-    model, _ = noisy(env=FixedRewards(gym.make("ClippedPendulum-v0")), gamma=0.5)
+    model, _ = noisy(env=Ending(gym.make("ClippedPendulum-v0"), 3, reward=-1.0), gamma=0.5)
     states: list[np.ndarray] = []
     diagnostics = ControlDiagnostics()
     record = diagnostics._record_critic_error

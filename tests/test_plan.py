@@ -61,20 +61,10 @@ def test_a_plan_costs_what_a_long_horizon_costs_and_keeps_bounds(rate) -> None:
 
 
 def costs(mpc: LinearMPC, starts: np.ndarray, found) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the plans cost, and what the online law costs from the same starts."""
-    played = [simulated(mpc, start) for start in starts]
+    """Return what the plans cost, and what the law costs from the same starts."""
+    played = [mpc.simulate(start, STEPS) for start in starts]
     expected = [mpc.stage_cost(thetas[:-1], inputs).sum() for thetas, inputs in played]
     return mpc.stage_cost(found.thetas[:-1], found.inputs).sum(axis=0), np.array(expected)
-
-
-def simulated(mpc: LinearMPC, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    law = mpc.online()
-    thetas = [start]
-    inputs = []
-    for _ in range(STEPS):
-        inputs.append(law(thetas[-1]))
-        thetas.append(mpc.predict(thetas[-1], inputs[-1]))
-    return np.array(thetas), np.array(inputs)
 
 
 def test_two_inputs_of_which_one_is_on_its_bound() -> None:
@@ -120,7 +110,7 @@ def test_a_price_is_planned_with() -> None:
         moved = 1e-3 * np.eye(STEPS)[:, [k]]
         slope = (cost(best + moved) - cost(best - moved)) / 2e-3
         assert abs(slope) < 1e-4
-    assert cost(best) < cost(simulated(mpc, start)[1])
+    assert cost(best) < cost(mpc.simulate(start, STEPS)[1])
 
 
 def test_a_reference_is_reached() -> None:

@@ -12,6 +12,7 @@ from gymnasium import wrappers
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+import errors
 from sample_plants import LinearPlant, Sampled, asymmetric_pendulum_mpc, two_input_mpc
 from sb3_yann import (
     ActionRepeat,
@@ -260,9 +261,7 @@ def test_a_vec_normalize_that_is_switched_on_later_is_named(switch, cause) -> No
     ("kwargs", "error", "message"),
     [
         ({"steps": 9}, ValueError, "steps = 9"),
-        ({"steps": 1.5}, ValueError, r"steps = 1\.5"),
         ({"tolerance": 0}, ValueError, "tolerance = 0"),
-        ({"tolerance": -1}, ValueError, "tolerance = -1"),
         ({"strict": 1}, TypeError, "strict = 1"),
     ],
 )
@@ -328,10 +327,7 @@ SAME = {
 
 def told(env, problem: LinearMPC, seeds: int = 4) -> list[str]:
     played = rollout(of_law(problem), env, range(seeds), problem=problem)
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        warn_of_own_reward(problem, played)
-    return [str(each.message) for each in found]
+    return errors.told(lambda: warn_of_own_reward(problem, played))
 
 
 @pytest.mark.parametrize("kind", OTHER)
@@ -370,7 +366,7 @@ def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
         assert "By its own stage cost" in str(headroom(problem, env, n_starts=2))
     assert [each.filename for each in found] == [__file__]
-    model = DDPG("YannPolicy", env, policy_kwargs={"problem": problem}, device="cpu")
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": problem})
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
         improve(model, env, updates=1, n_starts=2, rounds=1)
     assert [each.filename for each in found] == [__file__]

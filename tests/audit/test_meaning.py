@@ -1,6 +1,5 @@
 """Other orders, units and signs of an env than the model's are told, and nothing else is."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
+from errors import told as warnings_of
 from sample_plants import Sampled
 from sb3_yann import (
     CostAudit,
@@ -56,10 +56,7 @@ class Shuffled(Sampled):
 
 
 def said(run: Callable[[], object], words: str = "") -> list[str]:
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        run()
-    return [str(each.message) for each in found if words in str(each.message)]
+    return [each for each in warnings_of(run) if words in each]
 
 
 def told(env: gym.Env, mpc: LinearMPC = MPC, episodes: int = 3) -> list[str]:

@@ -1,7 +1,11 @@
 """On a plant only accepted policies act; a kill loses nothing; faults give the plant to the MPC."""
 
 import json
+import shutil
+import tempfile
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,6 +38,27 @@ def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioni
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
     options = {"batch": 5, "updates": 400, "max_correction": 0.2} | options
     return Commissioning(model, env, log_path=path, **options)
+
+
+@cache
+def recorded(batches: int, bound: float) -> Path:
+    """Return the folder of a record of so many batches; in the first of them the MPC acts."""
+    folder = Path(tempfile.mkdtemp())
+    commission(folder, max_correction=bound).run(batches)
+    return folder
+
+
+@pytest.fixture
+def begun(tmp_path: Path) -> Any:
+    """Return a function of options to a commissioning that goes on after some batches."""
+
+    def begin(batches: int = 1, bound: float = 0.2, **options: Any) -> Commissioning:
+        folder = tmp_path / "plant"
+        if not folder.exists():
+            shutil.copytree(recorded(batches, bound), folder)
+        return commission(folder, max_correction=bound, **options)
+
+    return begin
 
 
 def policys_turn(run: Commissioning) -> int:
@@ -69,8 +94,8 @@ class Faulty(gym.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, over, info
 
 
-def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound() -> None:
-    run = commission()
+def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound(begun) -> None:
+    run = begun()
     first, second = run.run(2)
     assert (first.acted, first.verdict) == ("MPC", "accepted")
     assert second.acted == "batch 1" and second.max_correction == 0.2
@@ -89,10 +114,9 @@ def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound
     assert second.predicted == pytest.approx(second.cost, rel=0.1)
 
 
-def test_only_accepted_policies_act(tmp_path) -> None:
-    path = tmp_path / "plant.jsonl"
-    run = commission(path)
-    run.run(2)
+def test_only_accepted_policies_act(begun, tmp_path) -> None:
+    begun().run(2)
+    path = tmp_path / "plant" / "commissioning.jsonl"
     events = [json.loads(line) for line in path.read_text().splitlines()]
     accepted = {"MPC": None}
     holds = "MPC"
@@ -106,7 +130,7 @@ def test_only_accepted_policies_act(tmp_path) -> None:
         assert event["acts"] in ("MPC", holds)
         if accepted[event["acts"]] is None:
             continue
-        model = DDPG.load(tmp_path / accepted[event["acts"]])
+        model = DDPG.load(path.with_name(accepted[event["acts"]]))
         theta = np.array(event["thetas"], np.float32)[:-1]
         acted = model.predict(theta, deterministic=True)[0]
         np.testing.assert_allclose(event["actions"], acted, atol=1e-6)
@@ -151,9 +175,8 @@ def test_a_kill_at_any_moment_changes_nothing(tmp_path, monkeypatch) -> None:
     assert again.run(2) == again.batches and len(again.episodes) == 15
 
 
-def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(monkeypatch) -> None:
-    run = commission()
-    run.run(1)
+def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(begun, monkeypatch) -> None:
+    run = begun()
     before = [each.clone() for each in run.policy.actor.parameters()]
     bound = run.policy.max_correction
 
@@ -171,9 +194,9 @@ def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(monkeypatch) -> N
     assert run.policy.max_correction == bound
 
 
-def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once() -> None:
+def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once(begun) -> None:
     turn = policys_turn(commission())
-    run = commission(env=Faulty(Cart(), turn, "nan", step=1))
+    run = begun(env=Faulty(Cart(), turn - 5, "nan", step=1))
     run.run(2)
     episode = run.episodes[turn]
     law = problem().explicit()
@@ -186,10 +209,9 @@ def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once() -> Non
     assert turn not in run.journal.log
 
 
-def test_a_violation_takes_the_policy_back() -> None:
+def test_a_violation_takes_the_policy_back(begun) -> None:
     turn = policys_turn(commission())
-    run = commission(env=Faulty(Cart(), turn, "violation"))
-    run.run(1)
+    run = begun(env=Faulty(Cart(), turn - 5, "violation"))
     assert run.journal.accepted
     run.run(2)
     assert [k for k, each in enumerate(run.journal.by_policy) if each] == [turn]
@@ -212,9 +234,8 @@ def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> Non
     assert last.verdict == "the MPC acts" and is_mpc(run.model)
 
 
-def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatch) -> None:
-    run = commission()
-    run.run(1)
+def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(begun, monkeypatch) -> None:
+    run = begun()
     assert is_mpc(run.model)  # until the plant has confirmed it
     run._become(run._acting, bound := run.policy.max_correction)
     before = [each.clone() for each in run.policy.actor.parameters()]
@@ -232,9 +253,8 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     assert rest.endswith("\n  next         run(batches=4) plays 40 episodes more")
 
 
-def test_weights_that_nobody_accepted_never_act() -> None:
-    run = commission()
-    run.run(1)
+def test_weights_that_nobody_accepted_never_act(begun) -> None:
+    run = begun()
     run._become(run._acting, 0.2)
     accepted = [each.clone() for each in run.policy.actor.parameters()]
     with th.no_grad():
@@ -247,24 +267,22 @@ def test_weights_that_nobody_accepted_never_act() -> None:
     assert run.policy.max_correction == 0.2 and run.episodes[-1].apart <= 0.2 + 1e-6
 
 
-def test_a_plant_that_trips_under_the_policy_gets_the_mpc(tmp_path) -> None:
+def test_a_plant_that_trips_under_the_policy_gets_the_mpc(begun) -> None:
     class Trips(Cart):
         def step(self, action):
             if abs(action[0] - problem().explicit()(self.x)[0]) > 1e-4:
                 raise RuntimeError("emergency stop")
             return super().step(action)
 
-    commission(tmp_path).run(1)
     for _ in range(2):
         with pytest.raises(RuntimeError, match="emergency stop"):
-            commission(tmp_path, env=Trips).run(2)
-    last = commission(tmp_path, env=Trips).run(2)[-1]
+            begun(env=Trips).run(2)
+    last = begun(env=Trips).run(2)[-1]
     assert "never ended" in last.reason and last.verdict == "the MPC acts"
 
 
-def test_a_policy_with_alarms_is_taken_back(monkeypatch) -> None:
-    run = commission()
-    run.run(1)
+def test_a_policy_with_alarms_is_taken_back(begun, monkeypatch) -> None:
+    run = begun()
     alarm = Alarm("drift", "as a test has it")
     monkeypatch.setattr(run.watchdog, "watch", lambda *_, **__: alarm if run_is_policys() else None)
 
@@ -273,14 +291,6 @@ def test_a_policy_with_alarms_is_taken_back(monkeypatch) -> None:
 
     last = run.run(2)[-1]
     assert last.alarms >= 2 and "had an alarm" in last.reason and is_mpc(run.model)
-
-
-def test_a_strangers_file_is_left_alone(tmp_path) -> None:
-    path = tmp_path / "settings.json"
-    path.write_text('{"my": "settings"}')
-    with pytest.raises(ValueError, match="no record"):
-        commission(path)
-    assert path.read_text() == '{"my": "settings"}'
 
 
 def costs(more: float, error: float, pairs: int, look: int = 1) -> Costs:
@@ -311,9 +321,8 @@ def test_a_policy_is_kept_where_it_surely_costs_less_at_the_level_of_the_look() 
     assert not is_kept(costs(-0.3, np.inf, 1)) and not is_kept(costs(np.nan, 0.1, 8))
 
 
-def test_pairs_of_all_batches_of_a_trial_decide_together() -> None:
-    run = commission(max_correction=0.1)
-    run.run(3)
+def test_pairs_of_all_batches_of_a_trial_decide_together(begun) -> None:
+    run = begun(3, bound=0.1)
     journal = run.journal
     second, third = run.batches[1:]
     assert second.acted == third.acted == "batch 1"
@@ -323,9 +332,8 @@ def test_pairs_of_all_batches_of_a_trial_decide_together() -> None:
     assert third.max_correction == 0.1 < run.journal.state.max_correction == 0.2
 
 
-def test_a_policy_that_is_taken_back_gives_way_to_the_one_that_was_kept(monkeypatch) -> None:
-    run = commission(max_correction=0.1)
-    run.run(3)
+def test_a_policy_that_is_taken_back_gives_way_to_the_one_that_was_kept(begun, monkeypatch) -> None:
+    run = begun(3, bound=0.1)
     kept = [each.clone() for each in run.policy.actor.parameters()]
     monkeypatch.setattr(commissioning, "why_taken_back", lambda *_: "a test")
     last = run.run(4)[-1]
@@ -380,9 +388,13 @@ def test_another_commissionings_record_is_refused(tmp_path) -> None:
     assert (tmp_path / "commissioning.jsonl").exists()
     with pytest.raises(ValueError, match="begun with batch = 5"):
         commission(tmp_path, batch=4)
-    (tmp_path / "other.csv").write_text("episode,cost\n1,2\n")
-    with pytest.raises(ValueError, match="line 1"):
-        commission(tmp_path / "other.csv")
+    path = tmp_path / "other.csv"
+    strangers = {"episode,cost\n1,2\n": "line 1", '{"my": "settings"}': "no record"}
+    for stranger, said in strangers.items():
+        path.write_text(stranger)
+        with pytest.raises(ValueError, match=said):
+            commission(path)
+        assert path.read_text() == stranger
 
 
 def test_another_plant_and_what_is_no_model_are_refused() -> None:

@@ -57,13 +57,14 @@ def test_it_reads_what_it_wrote(path: Path) -> None:
         lambda lines: [*lines[:2], lines[4], lines[3], lines[2]],
         lambda lines: [*lines, 100_000 * "["],
         lambda lines: [*lines, "\ufeff"],
+        lambda lines: [*lines, "[1, 2]"],
     ],
-    ids=["left out", "swapped", "brackets", "a mark"],
+    ids=["left out", "swapped", "brackets", "a mark", "a list"],
 )
 def test_a_record_that_was_edited_is_refused(change, path: Path) -> None:
     lines = change(path.read_text("utf-8").splitlines())
     path.write_text("\n".join(lines) + "\n", "utf-8")
-    with pytest.raises(ValueError, match=r"plant\.jsonl, line \d: no event"):
+    with pytest.raises(ValueError, match=r"plant\.jsonl, line \d: no event .*Name anot"):
         journal(path)
 
 

@@ -5,11 +5,9 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import DDPG
@@ -21,6 +19,7 @@ from deployed import CASES, disturbed, in_float64, observations, policy_of
 from fresh_process import run_python
 from random_problems import examples, problems
 from sample_laws import reactor_in_plant_units, solved
+from sample_plants import LinearPlant
 from sb3_yann import (
     Checks,
     Controller,
@@ -388,9 +387,8 @@ def test_an_export_without_its_observer_is_refused_or_says_so(suffix, kind, tmp_
     if kind == "law":
         given = given.explicit()
     if kind == "model":
-        space = spaces.Box(-100, 100, (3,)), spaces.Box(0, 30, (1,))
         policy = {"policy_kwargs": {"problem": given}}
-        given = DDPG("YannPolicy", Silent(*space), **policy, device="cpu")
+        given = DDPG("YannPolicy", LinearPlant(given), **policy)
     with pytest.raises(ValueError, match='estimator="caller"'):
         export(given, tmp_path / f"tank.{suffix}")
     assert not [*tmp_path.iterdir()]
@@ -402,12 +400,6 @@ def test_an_export_without_its_observer_is_refused_or_says_so(suffix, kind, tmp_
         assert "runs the observer" in repr(read) and "runs the observer" in read.note
         if kind != "law":
             assert read.obs_names[2] == "d[0] (estimated by the caller's observer)"
-
-
-class Silent(gym.Env):
-    def __init__(self, observation_space: Any, action_space: Any) -> None:
-        self.observation_space = observation_space
-        self.action_space = action_space
 
 
 def test_a_disturbance_that_may_be_measured_or_not_comes_from_the_caller(tmp_path) -> None:

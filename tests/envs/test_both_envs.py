@@ -1,8 +1,6 @@
 """What the reactor and the pendulum have in common: starts, seeds, the problem they stand for."""
 
 import random
-import warnings
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -11,6 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from numpy.typing import NDArray
 
+from errors import told
 from sb3_yann_envs import clipped_pendulum, cstr
 from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
 from sb3_yann_envs.cstr import CSTREnv
@@ -92,14 +91,11 @@ def test_random_starts_fill_their_box(name: str, low: Any, high: Any) -> None:
     ("name", "options", "message"),
     [
         ("cstr", {"state": [0.0, 0.0, 0.0]}, r"must have shape \(4,\)"),
-        ("cstr", {"state": [[0.0, 0.0, 0.0, 0.0]]}, r"must have shape \(4,\)"),
         ("cstr", {"state": [0.0, np.nan, 0.0, 0.0]}, "C_B deviation must be in .* got nan"),
-        ("cstr", {"state": [0.0, 0.0, 0.0, np.inf]}, "T deviation must be in"),
         ("cstr", {"state": [0.0, 0.0, 0.0, 5.1]}, r"T deviation must be in \[-70, 5\], got 5.1"),
         ("cstr", {"state": [-0.09, 0.0, 0.0, 0.0]}, "C_A deviation must be in"),
         ("cstr", {"start": [0.0, 0.0, 0.0, 0.0]}, r"unknown keys \['start'\]"),
         ("clipped_pendulum", {"state": 0.0}, r"must have shape \(2,\)"),
-        ("clipped_pendulum", {"state": [0.0, 0.0, 0.0]}, r"must have shape \(2,\)"),
         ("clipped_pendulum", {"state": [np.nan, 0.0]}, "theta must be in .* got nan"),
         ("clipped_pendulum", {"state": [3.2, 0.0]}, "theta must be in"),
         ("clipped_pendulum", {"state": [0.0, -8.1]}, r"theta_dot must be in \[-8, 8\], got -8.1"),
@@ -117,7 +113,6 @@ def test_a_bad_start_is_refused_with_its_reason(name: str, options: Any, message
         (act(np.nan), "got array.*nan"),
         (np.zeros(2), r"shape \(1,\)"),
         (np.zeros((1, 1)), r"shape \(1,\)"),
-        (0.0, r"shape \(1,\)"),
         ([], r"shape \(1,\)"),
     ],
 )
@@ -143,18 +138,10 @@ ENV_IDS = ["CSTR-v0", "ClippedPendulum-v0"]
 NORMALIZE = "symmetric and normalized"
 
 
-def messages(check: Callable[[], None]) -> list[str]:
-    """Return the warnings that a check gives (Gymnasium's logger warns through `warnings`)."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check()
-    return [str(warning.message) for warning in caught]
-
-
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_gymnasium_only_recommends_normalized_actions(env_id: str) -> None:
     env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, render_mode="rgb_array").unwrapped
-    (message,) = messages(lambda: gymnasium_check(env))
+    (message,) = told(lambda: gymnasium_check(env))
     assert "For Box action spaces, we recommend" in message
     assert NORMALIZE in message
 
@@ -165,14 +152,9 @@ def test_stable_baselines3_only_recommends_normalized_actions(env_id: str, wrapp
     sb3 = pytest.importorskip("stable_baselines3.common.env_checker")  # needs torch
     env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, render_mode="rgb_array")
     checked = env if wrapped else env.unwrapped
-    (message,) = messages(lambda: sb3.check_env(checked, warn=True, skip_render_check=False))
+    (message,) = told(lambda: sb3.check_env(checked, warn=True, skip_render_check=False))
     assert "We recommend you to use a" in message
     assert NORMALIZE in message
-
-
-@pytest.mark.parametrize(("env_id", "steps"), [("CSTR-v0", 400), ("ClippedPendulum-v0", 200)])
-def test_an_episode_is_truncated_at_its_length(env_id: str, steps: int) -> None:
-    assert gymnasium.spec(env_id).max_episode_steps == steps
 
 
 # ---- Frames of both environments are pictures, and rendering says where it cannot be ----

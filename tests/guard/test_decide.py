@@ -60,9 +60,9 @@ class OftenRight(Slide):
         return observation, -1.0 if self.indifferent else reward, *rest
 
 
-def spoil_left(policy) -> None:
+def spoil_left(policy, right: float = 0.5) -> None:
     """Make the right better than the MPC, and the left, where no known start shows it, worse."""
-    correct(policy, RIGHT, 0.5)
+    correct(policy, RIGHT, right)
     correct(policy, LEFT, -2.0)
 
 
@@ -92,12 +92,8 @@ def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> No
 
 def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
     # The first five new starts show the right only: all of it is accepted.
-    def spoiled(policy) -> None:
-        correct(policy, RIGHT, 0.4)
-        correct(policy, LEFT, -2.0)
-
-    simulator = partial(OftenRight, after=FIRST + 15)
-    model, guard = tried(spoiled, good, env=simulator, n_new_starts=20, rule=WHOLE)
+    options = {"env": partial(OftenRight, after=FIRST + 15), "n_new_starts": 20, "rule": WHOLE}
+    model, guard = tried(partial(spoil_left, right=0.4), good, **options)
     assert verdicts(guard) == ["accepted", "accepted", "rejected"]  # the last one at the end
     assert actor_bits(model.policy) == accepted_bits(guard)
     assert is_mpc(model)
@@ -138,7 +134,7 @@ def test_the_guard_counts_the_steps_of_its_simulator() -> None:
             Counted.steps += 1
             return super().step(action)
 
-    _, guard = tried(half_good, half_good, env=Counted)
+    _, guard = tried(spoil_left, spoil_left, env=Counted)
     assert guard.steps == Counted.steps - 5  # a push of the input from five starts
 
 
@@ -154,11 +150,6 @@ def test_what_gains_little_is_refused_at_no_cost_of_patience_but_where_any_gain_
     assert is_mpc(model) is not bool(rule)
     if not rule:
         assert first.reason == "too little a gain over the accepted policy" and not first.restored
-
-
-def half_good(policy: YannPolicy) -> None:
-    correct(policy, LEFT, -2.0)
-    correct(policy, RIGHT, 0.5)
 
 
 def rows(checkpoint: ActorCheckpoint, region: int) -> list[object]:
@@ -181,7 +172,7 @@ def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorit
 
     def change(policy) -> None:
         checkpoints["accepted"] = guard.state.accepted
-        half_good(policy)
+        spoil_left(policy)
         checkpoints["candidate"] = ActorCheckpoint.of(policy)
 
     step = 3 * STEPS  # the first candidate, from the first episode, is accepted with its moments
@@ -204,7 +195,7 @@ def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorit
 
 
 def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
-    model, guard = tried(half_good)
+    model, guard = tried(spoil_left)
     assert guard.decisions[0].regions == (REGION[RIGHT],)
     played = evaluate(model, Slide, guard.settings.seeds)
     evidence = guard.state.evidence
@@ -223,7 +214,7 @@ def test_a_candidate_in_another_box_is_accepted_with_it_or_leaves_the_old() -> N
         change(policy)
         policy.confine_correction(-box, box)
 
-    for change, verdict, kept in ((half_good, "rejected", False), (good, "accepted", True)):
+    for change, verdict, kept in ((spoil_left, "rejected", False), (good, "accepted", True)):
         model = build(gradient_steps=0)
         guard = make_guard()
         before = ActorCheckpoint.of(model.policy)
@@ -286,22 +277,18 @@ def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path
             self.touchy = False
             return observation
 
-    def spoiled(policy) -> None:
-        correct(policy, RIGHT, 0.5)
-        correct(policy, LEFT, -2.0)
-
     good = partial(correct, region=RIGHT, value=0.4)
     model = build(gradient_steps=0)
     options = {"n_new_starts": 20, "rule": {"by_region": False}}
     if how == "one learn":
-        moves = At([1], good), At([STEPS + 1], spoiled)
+        moves = At([1], good), At([STEPS + 1], spoil_left)
         train(model, 2 * STEPS, *moves, guard := make_guard(LaterLeft, **options))
     else:
         train(model, STEPS, At([1], good), make_guard(LaterLeft, **options))
         if how == "a load in between":
             model.save(tmp_path / "model")
             model = DDPG.load(tmp_path / "model", env=Slide(), device="cpu")
-        train(model, STEPS, At([1], spoiled), guard := make_guard(LaterLeft, **options))
+        train(model, STEPS, At([1], spoil_left), guard := make_guard(LaterLeft, **options))
     assert guard.decisions[-1].reason.endswith("; an earlier policy is restored")
     assert weights(model)[REGION[RIGHT]] == np.float32(0.4)
     assert weights(model)[REGION[LEFT]] == 0

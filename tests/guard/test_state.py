@@ -189,13 +189,6 @@ def test_a_disk_that_is_full_stops_no_training(tmp_path, monkeypatch) -> None:
     assert not is_mpc(model) and [*tmp_path.iterdir()] == []
 
 
-def decision(verdict: str, accepted: float, reason: str = "", mpc: float = 40.0) -> Decision:
-    return Decision(
-        timestep=9, episode=7, verdict=verdict, reason=reason, candidate_cost=1.0,
-        accepted_cost=accepted, mpc_cost=mpc,
-    )  # fmt: skip
-
-
 def test_a_changed_policy_is_never_called_the_mpc() -> None:
     """What a policy learnt before training is not the MPC, nor is what changed it since."""
     model = build(gradient_steps=0, actor={"critic_warmup": 99})

@@ -187,10 +187,8 @@ def test_a_gradient_leads_back_from_a_bound_and_not_beyond_it():
 
 def confined_layer(kind: str):
     mpc = solved("servo with rates")
-    rate = mpc.rate.du_min, mpc.rate.du_max
-    if kind == "per_region":
-        return mpc, scrambled(YannLayer(mpc.explicit(), (8, 8), rate=rate))
-    return mpc, scrambled(SharedYannLayer(mpc.online(), (8, 8), rate=rate))
+    layer = YannLayer if kind == "per_region" else SharedYannLayer
+    return mpc, scrambled(layer_of(mpc, layer, kept=None, pinned=True))
 
 
 def drawn_in(mpc, reach: float, count: int = 300) -> th.Tensor:
@@ -236,13 +234,13 @@ def test_where_the_law_acts_alone_nothing_is_learnt() -> None:
 
 
 def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:
-    model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    model = DDPG("YannPolicy", "CSTR-v0")
     scrambled(model.actor.mu)
     half = model.policy.problem.theta_half
     model.policy.confine_correction(-0.1 * half, 0.1 * half)
     assert th.equal(model.actor_target.mu.confines, model.actor.mu.confines)
     model.save(tmp_path / "model")
-    again = DDPG.load(tmp_path / "model", device="cpu")
+    again = DDPG.load(tmp_path / "model")
     theta = np.float32(0.13 * half * np.eye(4))
     np.testing.assert_array_equal(again.predict(theta)[0], model.predict(theta)[0])
     model.policy.confine_correction(None, None)

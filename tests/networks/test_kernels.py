@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch as th
 
-from sample_laws import box_points, law_of
-from sb3_yann.networks import AfterstateValue, LinearPrediction, Ranges, YannLayer
+from sample_laws import box_points, critic_of, law_of
+from sb3_yann.networks import AfterstateValue, YannLayer
 from sb3_yann.networks._kernels.stack import tanh
-from sb3_yann_envs import problems
 from weights import later_layers, network_of, shake
 
 NAMES = ["pendulum", "reactor", "two inputs", "asymmetric bounds"]
@@ -99,12 +98,8 @@ def test_tanh_is_exact_to_two_units_in_the_last_place_odd_and_bounded() -> None:
     assert np.isnan(tanh(np.float32(np.nan)))
 
 
-def value(pinned: bool, hidden=(64, 64), gamma: float = 0.99) -> AfterstateValue:
-    mpc = problems.cstr()
-    ranges = Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
-    matrices = (mpc.stage_matrix, mpc.value_matrix(gamma))
-    model = LinearPrediction(*mpc.prediction)
-    return AfterstateValue(*matrices, model, gamma, ranges, hidden, pinned=pinned)
+def value(pinned: bool, hidden=(64, 64)) -> AfterstateValue:
+    return critic_of("reactor", hidden=hidden, pinned=pinned)
 
 
 @pytest.mark.parametrize("pinned", [True, False])

@@ -11,11 +11,11 @@ from random_problems import as_range, edges, examples, mixture, problems, steepe
 from sb3_yann import LinearMPC
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from sb3_yann.networks.yann import LawLayer
+from weights import LARGEST, redrawn
 
 SEEDS = st.integers(0, 2**32 - 1)
 KINDS = st.sampled_from(["per region", "shared", "shared, online"])
 HIDDEN = st.sampled_from([(4, 3), (5,)])  # compiled loops, operations of torch
-LARGEST = float(np.finfo(np.float32).max)
 
 
 def layer_of(mpc: LinearMPC, kind: str, hidden: tuple[int, ...], **options: Any) -> LawLayer:
@@ -23,18 +23,6 @@ def layer_of(mpc: LinearMPC, kind: str, hidden: tuple[int, ...], **options: Any)
     law = mpc.online() if kind == "shared, online" else mpc.explicit()
     layer = YannLayer if kind == "per region" else SharedYannLayer
     return layer(law, hidden, rate=rate, **options)  # type: ignore[arg-type]
-
-
-def shaken(layer: LawLayer, size: float, seed: int, poison: float | None = None) -> LawLayer:
-    """Give the networks weights of this size, and some that are ``poison``."""
-    rng = np.random.default_rng(seed)
-    with th.no_grad():
-        for weight in layer.network.parameters():
-            drawn = np.clip(size * rng.normal(size=weight.shape), -LARGEST, LARGEST)
-            if poison is not None:
-                drawn[rng.random(weight.shape) < 0.1] = poison
-            weight.copy_(th.as_tensor(drawn, dtype=th.float32))
-    return layer
 
 
 def far_and_near(mpc: LinearMPC, seed: int) -> th.Tensor:
@@ -70,7 +58,7 @@ def test_shared_network_leaves_no_jump_whatever_its_weights(
 ) -> None:
     at, ways = edges(mpc.explicit(), seed, each=2)
     for kind in ("shared", "shared, online"):
-        layer = shaken(layer_of(mpc, kind, (4, 3)), size, seed)
+        layer = redrawn(layer_of(mpc, kind, (4, 3)), size, seed)
         law: Any = layer.base_law  # type: ignore[attr-defined]
         one = at - step * ways
         other = at + step * ways
@@ -117,7 +105,7 @@ def test_bounds_hold_for_any_weights(
     poison: float | None,
 ) -> None:
     layer = layer_of(mpc, kind, hidden, max_correction=bound)
-    bounds_hold(shaken(layer, size, seed, poison), far_and_near(mpc, seed), bound)
+    bounds_hold(redrawn(layer, size, seed, poison), far_and_near(mpc, seed), bound)
 
 
 @examples(15)
@@ -127,7 +115,7 @@ def test_what_is_not_finite_is_not_passed_off_as_an_input(
 ) -> None:
     rows = st.lists(st.floats(width=32), min_size=mpc.n_theta, max_size=mpc.n_theta)
     theta = th.as_tensor(np.float32(data.draw(st.lists(rows, min_size=1, max_size=6))))
-    layer = shaken(layer_of(mpc, kind, hidden, max_correction=bound), 0.3, 0)
+    layer = redrawn(layer_of(mpc, kind, hidden, max_correction=bound), 0.3, 0)
     with th.no_grad():
         actions = layer(theta)
     finite = theta.isfinite().all(1)

@@ -5,54 +5,33 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from scipy import linalg
 
 from sample_laws import (
     PROBLEMS,
     box_points,
+    critic_of,
     in_physical_units,
     law_of,
     random_rows,
+    ranges_of,
     solved,
     to_action,
 )
 from sb3_yann.networks import (
-    AfterstateValue,
-    LinearPrediction,
     QuadraticStateActionValue,
     Ranges,
     YannLayer,
 )
-from sb3_yann.networks.value import PredictionModel
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
 
 
-def ranges(name: str) -> Ranges:
-    mpc = solved(name)
-    return Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
-
-
 def papers(name: str, gamma: float = 0.99) -> QuadraticStateActionValue:
-    return QuadraticStateActionValue(solved(name).state_action_matrix(gamma), ranges(name))
+    return QuadraticStateActionValue(solved(name).state_action_matrix(gamma), ranges_of(name))
 
 
-def critic(
-    name: str, gamma: float = 0.99, model: PredictionModel | None = None, **changes: Any
-) -> AfterstateValue:
-    mpc = solved(name)
-    return AfterstateValue(
-        linalg.block_diag(mpc.Q, mpc.R),
-        mpc.value_matrix(gamma),
-        model or LinearPrediction(mpc.model.A, mpc.model.B),
-        gamma,
-        ranges(name),
-        **changes,
-    )
-
-
-BOTH = pytest.mark.parametrize("kind", [critic, papers])
+BOTH = pytest.mark.parametrize("kind", [critic_of, papers])
 
 
 def train(value: Any, rows: th.Tensor, target: th.Tensor, steps: int) -> float:
@@ -119,7 +98,7 @@ def test_bellmans_equation_holds_along_the_law(name: str, gamma: float, kind: An
 def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str, gamma: float) -> None:
     law = law_of(name)
     rows = random_rows(name, 256).requires_grad_()
-    critic(name, gamma)(rows).sum().backward()
+    critic_of(name, gamma)(rows).sum().backward()
     assert rows.grad is not None
     z = np.hstack(in_physical_units(name, rows.detach()))
     slope = -2 * z @ solved(name).state_action_matrix(gamma)
@@ -154,7 +133,7 @@ def test_value_at_rest_is_zero_and_stays_so(name: str, kind: Any) -> None:
 
 
 def test_training_fits_a_cost_to_go_that_is_not_quadratic() -> None:
-    value = critic("pendulum")
+    value = critic_of("pendulum")
     rows = random_rows("pendulum", 512)
     law = law_of("pendulum")
     theta = box_points(law, 256).double() / 2
@@ -208,7 +187,7 @@ def test_model_that_is_given_says_where_the_value_is_taken() -> None:
     mpc = solved("pendulum")
     expected = mpc.stage_cost(theta, u) + 0.99 * np.einsum("bi,ij,bj->b", theta, P, theta) / 4
     for model in (Halving(), lambda theta, u: theta / 2 + 0 * u):
-        q = critic("pendulum", model=model)(rows).detach().numpy()[:, 0]
+        q = critic_of("pendulum", model=model)(rows).detach().numpy()[:, 0]
         np.testing.assert_allclose(q, -expected, rtol=1e-6)
 
 
@@ -226,7 +205,7 @@ def test_model_that_is_given_says_where_the_value_is_taken() -> None:
 )
 def test_a_prediction_model_is_tried_when_it_is_given(model, message) -> None:
     with pytest.raises(ValueError, match=message):
-        critic("pendulum", model=model)
+        critic_of("pendulum", model=model)
 
 
 @pytest.mark.parametrize(

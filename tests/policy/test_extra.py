@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
 from improvement_samples import quick
@@ -166,21 +167,14 @@ def test_signals_come_last_whatever_else_theta_holds(monkeypatch: pytest.MonkeyP
     quick(monkeypatch)
     slow = tank(rate=RateLimits(-1, 1))
 
-    class Last(gym.ObservationWrapper[Array, Array, Array]):
+    def make() -> gym.Env[Array, Array]:
         """The feed behind the previous input."""
+        env = PreviousInput(Tank(), [3.0])
+        box: Any = env.observation_space
+        turned = spaces.Box(box.low[[0, 2, 1]], box.high[[0, 2, 1]])
+        return TransformObservation(env, lambda shown: shown[[0, 2, 1]], turned)
 
-        def __init__(self, env: gym.Env[Array, Array]) -> None:
-            super().__init__(env)
-            box: Any = env.observation_space
-            self.observation_space = spaces.Box(
-                self.observation(box.low), self.observation(box.high), dtype=np.float32
-            )
-
-        def observation(self, shown: Array) -> Array:
-            return shown[[0, 2, 1]]
-
-    env = Last(PreviousInput(Tank(), [3.0]))
-    model = build(env=env, problem=slow)
+    model = build(env=make(), problem=slow)
     seen = np.column_stack([observations()[:, 0], np.full(200, 2.5), observations()[:, 1]])
     expected = slow.explicit().plant_input(seen[:, :2])
     np.testing.assert_allclose(model.predict(seen)[0], expected, atol=6e-5)
@@ -189,7 +183,7 @@ def test_signals_come_last_whatever_else_theta_holds(monkeypatch: pytest.MonkeyP
     expected = tank().explicit().plant_input(observations()[:, :1])
     np.testing.assert_allclose(mapped.predict(halved)[0], expected, atol=6e-5)
     quicker = {"n_starts": 10, "rounds": 2, "updates": 1000}
-    found = improve(model, lambda: Last(PreviousInput(Tank(), [3.0])), **quicker)
+    found = improve(model, make, **quicker)
     assert found.accepted and found.change < -0.05
 
 
@@ -273,15 +267,9 @@ def test_an_observer_is_told_what_its_model_ignores() -> None:
     assert [*mpc.extra] == [1] and mpc.model.estimated == (1,)
     observer = DisturbanceObserver(mpc.model, state_noise=10, measurement_noise=10)
 
-    class Hidden(gym.ObservationWrapper[Array, Array, Array]):
-        def __init__(self) -> None:
-            super().__init__(Tank(effect=0.0))
-            self.observation_space = spaces.Box(0.0, 20.0, (1,), np.float64)
-
-        def observation(self, shown: Array) -> Array:
-            return shown[:1]
-
-    env = EstimateState(MeasuredDisturbance(Hidden(), *FEED), observer, -1, 1)
+    level = spaces.Box(0.0, 20.0, (1,), np.float64)
+    hidden = TransformObservation(Tank(effect=0.0), lambda shown: shown[:1], level)
+    env = EstimateState(MeasuredDisturbance(hidden, *FEED), observer, -1, 1)
     model = build(env=env, problem=mpc, extra=0)
     seen = env.reset(seed=0)[0]
     assert seen.shape == (3,)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import DDPG, PPO, TD3
@@ -16,6 +17,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import general_problems
+from errors import told
 from policy_samples import make_policy
 from random_problems import examples
 from random_problems import problems as random_problems
@@ -23,7 +25,7 @@ from sample_plants import LinearPlant, Recorder, two_input_mpc
 from sb3_yann import AffineObservation, LinearMPC, NoActionNoise, NonFiniteWarning, YannPolicy
 from sb3_yann.policy.sb3_hooks import FiniteRows
 from sb3_yann_envs import problems
-from weights import network_of
+from weights import redrawn, shake
 
 OPTIONS = {"seed": 0, "device": "cpu", "buffer_size": 1000, "batch_size": 32}
 POLICY = {"critic_warmup": 10, "net_arch": {"pi": [3, 3], "qf": [4, 4]}}
@@ -65,22 +67,13 @@ def build(env, algorithm=DDPG, policy=None, **kwargs):
     return algorithm(YannPolicy, env, policy_kwargs=POLICY | (policy or {}), **(OPTIONS | kwargs))
 
 
-def shaken(model, size: float = 1.0):
-    with th.no_grad():
-        for parameter in model.actor.parameters():
-            parameter.add_(size * th.randn(parameter.shape))
+def shaken(model):
+    shake(model.actor, 1.0)
     return model
 
 
 def is_finite(model) -> bool:
     return all(bool(each.isfinite().all()) for each in model.policy.parameters())
-
-
-def told(learn, *args, **kwargs) -> list[str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        learn(*args, **kwargs)
-    return [str(each.message) for each in caught if each.category is NonFiniteWarning]
 
 
 def stored(model) -> np.ndarray:
@@ -98,7 +91,7 @@ def stored(model) -> np.ndarray:
 def test_one_value_that_is_not_finite_is_named_and_spoils_nothing(what, value, algorithm) -> None:
     env = Recorder(pendulum([100], what, value))
     model = build(env, algorithm)
-    said = told(model.learn, 350, callback=NoActionNoise())
+    said = told(lambda: model.learn(350, callback=NoActionNoise()), NonFiniteWarning)
     assert said[-1 if what == "reward" else 0].startswith(f"Step 100: {what}[")
     assert np.all(np.isfinite(env.recorded()[1]))
     assert is_finite(model)
@@ -112,9 +105,9 @@ def test_what_is_not_finite_from_the_first_step_on_is_not_learnt_from(what) -> N
     model = build(pendulum(range(4), what), policy={"critic_warmup": 0})
     networks = th.nn.ModuleList([model.actor, model.critic])
     before = copy.deepcopy(dict(networks.named_parameters()))
-    assert told(model.learn, 3, callback=NoActionNoise())
+    assert told(lambda: model.learn(3, callback=NoActionNoise()), NonFiniteWarning)
     assert all(th.equal(value, before[name]) for name, value in networks.named_parameters())
-    told(model.learn, 20, callback=NoActionNoise(), reset_num_timesteps=False)
+    told(lambda: model.learn(20, callback=NoActionNoise(), reset_num_timesteps=False))
     assert is_finite(model) and np.all(np.isfinite(stored(model)))
     assert int(model.policy.critic_updates) > 10
 
@@ -238,14 +231,9 @@ def test_an_entry_that_theta_does_not_depend_on_leaves_theta_as_it_is() -> None:
     mpc = two_input_mpc()
     seen = AffineObservation(np.eye(3, 4))
     space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
-
-    class More(gym.ObservationWrapper):
-        observation_space = space
-
-        def observation(self, observation):
-            return np.append(observation, np.float32(0))
-
-    model = build(More(LinearPlant(mpc)), policy={"problem": mpc, "observation": seen})
+    plant = LinearPlant(mpc)
+    more = TransformObservation(plant, lambda x: np.append(x, np.float32(0)), space)
+    model = build(more, policy={"problem": mpc, "observation": seen})
     with pytest.warns(NonFiniteWarning, match=r"entries \[3\]"):
         action, _ = model.predict(np.float32([0.1, 0.2, 0.3, np.nan]))
     np.testing.assert_allclose(action, mpc.explicit()([0.1, 0.2, 0.3]), atol=1e-5)
@@ -253,7 +241,6 @@ def test_an_entry_that_theta_does_not_depend_on_leaves_theta_as_it_is() -> None:
 
 KINDS = st.sampled_from([{"networks": "per_region"}, {"networks": "shared"}, {"law": "online"}])
 ARCHITECTURES = st.sampled_from([{"pi": [4, 3], "qf": [4, 3]}, {"pi": [4], "qf": [4]}])
-LARGEST = float(np.finfo(np.float32).max)
 
 
 def policy_of(mpc: LinearMPC, dtype: Any = np.float32, **kwargs: Any) -> YannPolicy:
@@ -261,20 +248,6 @@ def policy_of(mpc: LinearMPC, dtype: Any = np.float32, **kwargs: Any) -> YannPol
     low = mpc.u_min.astype(dtype)
     high = mpc.u_max.astype(dtype)
     return make_policy(seen, spaces.Box(low, high, dtype=dtype), problem=mpc, **kwargs)
-
-
-def shaken_policy(
-    policy: YannPolicy, size: float, seed: int, poison: float | None = None
-) -> YannPolicy:
-    """Give the actor weights of this size, and some that are ``poison``."""
-    rng = np.random.default_rng(seed)
-    with th.no_grad():
-        for weight in network_of(policy).parameters():
-            drawn = np.clip(size * rng.normal(size=weight.shape), -LARGEST, LARGEST)
-            if poison is not None:
-                drawn[rng.random(weight.shape) < 0.1] = poison
-            weight.copy_(th.as_tensor(drawn, dtype=th.float32))
-    return policy
 
 
 def predicted(policy: YannPolicy, observations: np.ndarray) -> np.ndarray:
@@ -294,7 +267,7 @@ def predicted(policy: YannPolicy, observations: np.ndarray) -> np.ndarray:
 def test_every_observation_of_float32_has_an_action_of_the_space(
     mpc: LinearMPC, data: Any, kind: dict, net_arch: dict, poison: float | None
 ) -> None:
-    policy = shaken_policy(policy_of(mpc, net_arch=net_arch, **kind), 0.3, 0, poison)
+    policy = redrawn(policy_of(mpc, net_arch=net_arch, **kind), 0.3, 0, poison)
     rows = st.lists(st.floats(width=32), min_size=mpc.n_theta, max_size=mpc.n_theta)
     seen = np.float32(data.draw(st.lists(rows, min_size=1, max_size=5)))
     with warnings.catch_warnings(record=True) as caught:
@@ -311,6 +284,3 @@ def test_every_observation_of_float32_has_an_action_of_the_space(
             u = policy.problem.law(kind.get("law", "explicit"))(known)
             if not mpc.has_rate_bounds:
                 assert np.all(np.abs(action - u) <= 1e-6 * (mpc.u_max - mpc.u_min))
-
-
-# --- the critic, and targets --------------------------------------------------------------------

@@ -2,11 +2,9 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import DDPG, TD3
 
 from deployed import Compiled, disturbed, needs_compiler
@@ -31,23 +29,6 @@ from sparse_qp import FEATURES, draw
 from structured_text import FunctionBlock
 from weights import is_mpc
 
-
-class Shown(gym.Env[Any, Any]):
-    """An env that shows theta of a problem at random, in plant units."""
-
-    def __init__(self, mpc: LinearMPC) -> None:
-        self.mpc = mpc
-        self.observation_space = spaces.Box(-np.inf, np.inf, (mpc.n_theta,), np.float64)
-        self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        return self.np_random.uniform(self.mpc.theta_min, self.mpc.theta_max), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        return self.reset()[0], 0.0, False, False, {}
-
-
 CASES = [*((name,) for name in FEATURES), FEATURES]
 
 
@@ -57,8 +38,8 @@ def test_a_policy_starts_as_the_law_and_its_critic_keeps_bellmans_equation(
 ) -> None:
     mpc = draw(np.random.default_rng(11), features)
     options = {"problem": mpc, "law": "online"}
-    env = Shown(mpc)
-    model = DDPG(YannPolicy, env, gamma=0.95, policy_kwargs=options, device="cpu")
+    env = LinearPlant(mpc)
+    model = DDPG(YannPolicy, env, gamma=0.95, policy_kwargs=options)
     law = mpc.online()
     rng = np.random.default_rng(0)
     theta = rng.uniform(mpc.theta_min, mpc.theta_max, (60, mpc.n_theta)).astype(np.float32)
@@ -92,7 +73,7 @@ def test_a_critic_with_prices_learns_compiled_and_not() -> None:
     mpc = draw(np.random.default_rng(11), ("price",))
     for critic in ({}, {"kind": "state_action"}):
         options = {"problem": mpc, "law": "online", "critic": critic}
-        env = Shown(mpc)
+        env = LinearPlant(mpc)
         model = DDPG(
             YannPolicy, env, learning_starts=20, policy_kwargs=options, device="cpu", seed=0
         )
@@ -231,11 +212,11 @@ def test_it_is_saved_with_its_law_and_loaded_without_a_search(options, tmp_path,
     theta = starts(mpc)
     if "law" in options:
         monkeypatch.setattr(LinearMPC, "explicit", None)
-    again = TD3.load(tmp_path / "model.zip", device="cpu")
+    again = TD3.load(tmp_path / "model.zip")
     assert np.array_equal(again.predict(theta)[0], model.predict(theta)[0])
     assert isinstance(again.actor.mu.base_law, OnlineLaw) == ("law" in options)
     model.policy.save(tmp_path / "policy")
-    policy = YannPolicy.load(tmp_path / "policy", device="cpu")
+    policy = YannPolicy.load(tmp_path / "policy")
     assert np.array_equal(policy.predict(theta)[0], model.predict(theta)[0])
 
 
@@ -247,7 +228,7 @@ def test_the_search_that_found_no_law_is_not_repeated_when_a_model_is_loaded(
         model = build(DDPG, scalar_mpc())
     assert isinstance(model.actor.mu, SharedYannLayer)
     model.save(tmp_path / "model.zip")
-    again = DDPG.load(tmp_path / "model.zip", device="cpu")
+    again = DDPG.load(tmp_path / "model.zip")
     assert isinstance(again.actor.mu, SharedYannLayer)
 
 

@@ -154,10 +154,7 @@ def test_both_of_td3_s_critics_are_in_units_of_the_reward() -> None:
     ("kwargs", "error", "message"),
     [
         ({"critic": {"reward_scale": 0}}, ValueError, "reward_scale = 0"),
-        ({"critic": {"reward_scale": -1.0}}, ValueError, r"reward_scale = -1\.0"),
-        ({"critic": {"reward_scale": None}}, TypeError, "reward_scale = None"),
         ({"critic": {"reward_offset": "a"}}, TypeError, "reward_offset = 'a'"),
-        ({"critic": {"reward_offset": np.inf}}, ValueError, "reward_offset = inf"),
         ({"critic": {"reward_offset": 1.0}, "gamma": 1.0}, ValueError, "a discount below 1"),
     ],
 )

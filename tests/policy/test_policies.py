@@ -8,7 +8,6 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG
 
-from fresh_process import run_python
 from policy_samples import (
     CRITICS,
     POLICIES,
@@ -22,7 +21,7 @@ from policy_samples import (
 from sample_plants import LinearPlant, feasible_states
 from sb3_yann import LinearMPC, NoActionNoise, SoftBounds, YannPolicy
 from sb3_yann.policy.checkpoint import ActorCheckpoint
-from weights import last_layer, unpin
+from weights import last_layer, redrawn, unpin
 
 
 @pytest.mark.slow
@@ -72,25 +71,6 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, 
         assert th.equal(value, loaded.policy.state_dict()[name]), name
 
 
-@pytest.mark.slow
-def test_a_fresh_process_predicts_without_any_solver(tmp_path) -> None:
-    model = DDPG(YannPolicy, "CSTR-v0", policy_kwargs={"critic_warmup": 0})
-    model.learn(20, callback=NoActionNoise())
-    model.save(tmp_path / "model")
-    state = np.array([0.01, 0.1, -0.1, -2], dtype=np.float32)
-    script = """
-import sys
-for solver in ("ppopt", "cvxopt", "daqp", "gurobipy", "quadprog", "control"):
-    sys.modules[solver] = None  # an import of it now fails
-import numpy as np
-from stable_baselines3 import DDPG
-model = DDPG.load(sys.argv[1])
-print(repr(float(model.predict(np.array([0.01, 0.1, -0.1, -2], dtype=np.float32))[0][0])))
-"""
-    printed, _ = run_python(script, tmp_path / "model")
-    assert float(printed) == float(model.predict(state)[0][0])
-
-
 # --- max_correction ----------------------------------------------------------------------------
 
 
@@ -100,13 +80,6 @@ def distances(model, mpc: LinearMPC, states: np.ndarray) -> np.ndarray:
     start, _ = build(mpc=mpc).predict(states)
     laws = np.array([mpc.explicit()(states), start], dtype=np.float64)
     return np.abs(actions.astype(np.float64) - laws)
-
-
-def scramble(model) -> None:
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        for parameter in model.actor.parameters():
-            th.nn.init.normal_(parameter, std=1e3)
 
 
 @POLICIES
@@ -129,7 +102,7 @@ def test_a_bound_that_is_set_later_survives_saving_as_well(
     given = {"max_correction": first, "pin_equilibrium": False}
     model = build(algorithm, mpc, given)
     states = starts(mpc)
-    scramble(model)
+    redrawn(model, 1e3, 0)
     model.policy.limit_correction(then)
     for _ in range(2):  # saved again, it is still there
         model.save(tmp_path / "model")

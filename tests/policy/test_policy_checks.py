@@ -15,8 +15,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_yann
 from policy_samples import actions, build, make_policy, scalar_mpc, unbounded
-from sample_plants import LinearPlant, Sampled
-from sb3_yann import AffineObservation, LinearModel, LinearMPC, YannPolicy
+from sample_plants import LinearPlant
+from sb3_yann import AffineObservation, LinearMPC, YannPolicy
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann_envs import problems
 from weights import shake
@@ -42,32 +42,6 @@ def test_spaces_that_do_not_fit_are_named(observation_space, action_space, error
         make_policy(observation_space, action_space, problem=scalar_mpc())
 
 
-class Heater(Sampled):
-    """A temperature about its steady state, heated with 0 to 10 V, of which 3 hold it."""
-
-    observation_space = unbounded()
-    action_space = spaces.Box(0, 10, (1,), np.float32)
-
-    def moved(self, u):
-        return 0.9 * self.x + 0.2 * (u - 3)
-
-
-def heater_mpc(u_min: float, u_max: float) -> LinearMPC:
-    model = LinearModel([[0.9]], [[0.2]], 1.0, u_ss=[3])
-    weights = {"Q": [[1]], "R": [[0.1]], "horizon": 1, "theta_min": -5, "theta_max": 5}
-    return LinearMPC(model, u_min=u_min, u_max=u_max, **weights)
-
-
-def test_an_env_in_plant_units_is_driven_as_the_problem_says() -> None:
-    mpc = heater_mpc(0, 10)
-    env = Heater()
-    model = DDPG(YannPolicy, env, policy_kwargs={"problem": mpc})
-    theta, _ = env.reset(seed=0)
-    reached = env.step(model.predict(theta)[0])[0]
-    own = mpc.deviations.model.step(theta, mpc.explicit()(theta))
-    assert reached == pytest.approx(own, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
@@ -75,8 +49,6 @@ def test_an_env_in_plant_units_is_driven_as_the_problem_says() -> None:
         ({"critic_lr_mult": float("nan")}, ValueError, "critic_lr_mult"),
         ({"gamma": 1.5}, ValueError, "gamma"),
         ({"hidden": 3}, TypeError, "'hidden'"),
-        ({"actor_lr_mult": "a"}, TypeError, "actor_lr_mult = 'a'"),
-        ({"actor_lr_mult": None}, TypeError, "actor_lr_mult = None"),
         ({"n_critics": 0}, ValueError, "n_critics = 0"),
         ({"net_arch": {"pi": [4, 4, 4], "qf": [8, 8]}}, ValueError, r"net_arch\['pi'\]"),
         ({"net_arch": {"pi": ["a"]}}, ValueError, r"net_arch\['pi'\]"),
@@ -84,16 +56,10 @@ def test_an_env_in_plant_units_is_driven_as_the_problem_says() -> None:
         ({"activation_fn": th.tanh}, TypeError, "activation_fn"),
         ({"activation_fn": th.nn.Sigmoid}, ValueError, "activation"),
         ({"critic": "quadratic"}, ValueError, "critic = 'quadratic'"),
-        ({"critic": None}, ValueError, "critic = None"),
         ({"prediction_model": None}, TypeError, "'prediction_model'.*CriticOptions"),
         ({"pin_equilibrium": 1}, TypeError, "pin_equilibrium = 1"),
         ({"critic_warmup": -1}, ValueError, "critic_warmup = -1"),
-        ({"critic_warmup": 1.5}, ValueError, r"critic_warmup = 1\.5"),
-        ({"critic_warmup": True}, ValueError, "critic_warmup = True"),
-        ({"max_correction": -0.1}, ValueError, r"max_correction = -0\.1"),
         ({"max_correction": 1.5}, ValueError, r"max_correction = 1\.5"),
-        ({"max_correction": float("nan")}, ValueError, "max_correction = nan"),
-        ({"max_correction": "x"}, TypeError, "max_correction = 'x'"),
     ],
 )
 def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:
@@ -114,9 +80,6 @@ def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> No
             "prediction_model is for kind='afterstate'",
         ),
         ({"value_scale": 0}, ValueError, "value_scale = 0"),
-        ({"value_scale": -30.0}, ValueError, "value_scale = -30.0"),
-        ({"value_scale": float("nan")}, ValueError, "value_scale = nan"),
-        ({"value_scale": "big"}, TypeError, "value_scale = 'big'"),
     ],
 )
 def test_options_of_a_critic_that_mean_nothing_are_named(options, error, message) -> None:
@@ -151,7 +114,7 @@ def test_a_policy_that_finds_no_algorithm_says_so_and_takes_a_discount() -> None
             return pool.submit(YannPolicy, *args, **kwargs).result()
 
     with pytest.raises(ValueError, match="in the same thread"):
-        DDPG(in_a_thread, "CSTR-v0", gamma=0.9, device="cpu")
+        DDPG(in_a_thread, "CSTR-v0", gamma=0.9)
 
 
 def test_a_discount_that_is_set_after_the_policy_was_built_is_refused(tmp_path) -> None:
@@ -167,7 +130,7 @@ def test_a_discount_that_is_set_after_the_policy_was_built_is_refused(tmp_path) 
             loaded = DDPG.load(tmp_path / "model", **given)
         assert loaded.policy.gamma == 0.8
         loaded.predict(observation)
-    own = DDPG("YannPolicy", "CSTR-v0", policy_kwargs={"gamma": 0.9}, device="cpu")
+    own = DDPG("YannPolicy", "CSTR-v0", policy_kwargs={"gamma": 0.9})
     own.gamma = 0.8  # the policy's own was chosen
     own.predict(observation)
 

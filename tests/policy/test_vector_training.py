@@ -10,7 +10,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sample_plants import LinearPlant, two_input_mpc
+from sample_plants import Ending, LinearPlant, two_input_mpc
 from sb3_yann import (
     AffineObservation,
     ControlDiagnostics,
@@ -132,19 +132,7 @@ def test_a_time_limit_is_no_end_to_the_critic(algorithm, kind, n_envs) -> None:
 
 
 def test_an_end_by_the_env_is_one_to_the_critic() -> None:
-    class Ends(gym.Wrapper):
-        steps = 0
-
-        def reset(self, **kwargs):
-            self.steps = 0
-            return self.env.reset(**kwargs)
-
-        def step(self, action):
-            observation, reward, _, truncated, info = self.env.step(action)
-            self.steps += 1
-            return observation, reward, self.steps == STEPS, truncated, info
-
-    model = build(DummyVecEnv([lambda: Ends(plant())] * 2), gradient_steps=0)
+    model = build(DummyVecEnv([lambda: Ending(plant(), STEPS)] * 2), gradient_steps=0)
     model.learn(4 * STEPS, callback=NoActionNoise())
     assert transitions(model, "timeouts").sum() == 0  # also where the limit comes at the same step
     assert transitions(model, "dones").sum() == 4

@@ -13,14 +13,18 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import Wrapper
-from stable_baselines3 import DDPG, PPO
+from gymnasium.wrappers import TimeLimit
+from scipy import stats
+from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import guard_samples
 import twin_samples
 import unit_samples
 from guard_samples import Slide, make_guard
+from sample_plants import LinearPlant
 from sb3_yann import (
+    AffineObservation,
     Headroom,
     LinearModel,
     LinearMPC,
@@ -170,7 +174,7 @@ def test_a_policy_that_the_guard_has_not_accepted_is_named() -> None:
 
 
 def test_what_is_not_given_is_left_out(tmp_path) -> None:
-    model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    model = DDPG("YannPolicy", "CSTR-v0")
     outline = Outline(report(model, tmp_path / "bare.html"))
     for note in ("No env was given: closed loops are left out.", "No guard was at work"):
         assert outline.text.count(note) == 1
@@ -192,23 +196,14 @@ def test_hostile_names_stay_text(tmp_path) -> None:
         input_names=["<b>u"], units=["<i>", "°C%", "\N{SNOWMAN}\N{PILE OF POO}"],
     )  # fmt: skip
     mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=2, x_min=-5, x_max=5, u_min=-1, u_max=1)
-    env = partial(twin_like, mpc)
-    policy = DDPG("YannPolicy", env(), policy_kwargs={"problem": mpc}, device="cpu")
+    env = lambda: TimeLimit(LinearPlant(mpc), 10)  # noqa: E731
+    policy = DDPG("YannPolicy", env(), policy_kwargs={"problem": mpc})
     title = HOSTILE + "a\x1b[31m\x00\ud800b"
     path = report(policy, tmp_path / "hostile.html", env=env, seeds=range(2), title=title)
     outline = Outline(path)
     assert {tag for tag, _ in outline.found}.isdisjoint({"script", "b", "i"})
     assert HOSTILE in outline.text and FORMULA in outline.text
     assert not set(path.read_text(encoding="utf-8")) & set("\x1b\x00")
-
-
-def twin_like(mpc: LinearMPC):
-    """Return the model of a problem as its plant, for a few steps."""
-    from gymnasium.wrappers import TimeLimit
-
-    from sample_plants import LinearPlant
-
-    return TimeLimit(LinearPlant(mpc), 10)
 
 
 def test_how_far_the_policy_leaves_the_mpc_is_in_the_inputs_units(tmp_path) -> None:
@@ -263,8 +258,6 @@ def test_inputs_beyond_a_bound_at_run_time_fail() -> None:
 
 
 def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
-    from scipy import stats
-
     model = moved(0.1)
     text = Outline(report(model, tmp_path / "r.html", env=Slide, seeds=SEEDS)).text
     before = evaluate(guard_samples.LAW, Slide, SEEDS)
@@ -315,7 +308,7 @@ def test_the_mpc_is_played_through_the_policy_s_own_maps(shows, tmp_path) -> Non
     mpc = unit_samples.plant_mpc()
     env = partial(unit_samples.plant, shows, "normalized")
     kwargs = {"problem": mpc, "observation": unit_samples.SAYS[shows]}
-    model = DDPG("YannPolicy", env(), policy_kwargs=kwargs, device="cpu")
+    model = DDPG("YannPolicy", env(), policy_kwargs=kwargs)
     text = Outline(report(model, tmp_path / "r.html", env=env, seeds=range(3))).text
     law = mpc.explicit()
     same = evaluate(law, partial(unit_samples.plant, "plant", "plant"), range(3))
@@ -403,11 +396,8 @@ def test_improve_after_a_guard_is_no_failure_and_one_that_found_nothing_is_a_not
 
 def test_the_page_says_that_an_observer_is_no_part_of_the_policy(tmp_path) -> None:
     mpc, _ = offset_free(twin_samples.problem())
-    env = gym.Env()
-    env.observation_space = gym.spaces.Box(-9, 9, (mpc.n_theta,), np.float64)
-    env.action_space = gym.spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
-    policy = {"policy_kwargs": {"problem": mpc}, "device": "cpu"}
-    text = Outline(report(DDPG("YannPolicy", env, **policy), tmp_path / "p.html")).text
+    model = DDPG("YannPolicy", LinearPlant(mpc), policy_kwargs={"problem": mpc})
+    text = Outline(report(model, tmp_path / "p.html")).text
     assert "estimated disturbance" in text and "runs the observer" in text
     assert "measured disturbance" not in text
 
@@ -434,7 +424,7 @@ def test_a_report_that_fails_leaves_the_last_one_as_it_was(tmp_path) -> None:
 
 def test_of_a_twin_alone_its_episodes_are_played_and_said_to_be_no_plant_s(tmp_path) -> None:
     twin = twin_samples.twin()
-    model = DDPG("YannPolicy", twin.env(), device="cpu")
+    model = DDPG("YannPolicy", twin.env())
     text = report(model, tmp_path / "r.html", twin=twin, seeds=range(2)).read_text()
     assert "The env is a twin, fitted to the plant&#x27;s log: the plant has played none" in text
     assert "Closed loops against the MPC" in text and "samples for which a move" not in text
@@ -450,9 +440,7 @@ def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
     model = guard_samples.build()
     path = tmp_path / "r.html"
     with pytest.raises(TypeError, match="needs a YannPolicy"):
-        report(PPO("MlpPolicy", Slide(), device="cpu"), path)
-    with pytest.raises(TypeError, match="needs a YannPolicy"):
-        report(DDPG("MlpPolicy", Slide(), device="cpu"), path)
+        report(DDPG("MlpPolicy", Slide()), path)
     with pytest.raises(TypeError, match="twin = 3 must be a PlantTwin, or None"):
         report(model, path, twin=3)
     with pytest.raises(ValueError, match="has not watched this model"):
@@ -469,14 +457,12 @@ def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
 
 
 def test_observations_are_normalized_as_in_training(tmp_path) -> None:
-    from sb3_yann import AffineObservation
-
     mpc = guard_samples.MPC
     venv = VecNormalize(DummyVecEnv([Slide]), norm_reward=False, training=False)
     venv.obs_rms.mean[:] = 0.5
     venv.obs_rms.var[:] = 4.0
     kwargs = {"problem": mpc, "observation": AffineObservation.from_vec_normalize(venv)}
-    model = DDPG("YannPolicy", venv, policy_kwargs=kwargs, device="cpu")
+    model = DDPG("YannPolicy", venv, policy_kwargs=kwargs)
     text = Outline(report(model, tmp_path / "r.html", env=Slide, seeds=range(3))).text
     assert "From these starts the policy costs what the MPC costs." in text
     mean = evaluate(guard_samples.LAW, Slide, range(3)).costs.mean()
@@ -486,7 +472,7 @@ def test_observations_are_normalized_as_in_training(tmp_path) -> None:
 def test_a_law_that_is_solved_online_has_no_regions_to_show(tmp_path) -> None:
     mpc = problems.clipped_pendulum()
     kwargs = {"problem": mpc, "law": "online"}
-    model = DDPG("YannPolicy", "ClippedPendulum-v0", policy_kwargs=kwargs, device="cpu")
+    model = DDPG("YannPolicy", "ClippedPendulum-v0", policy_kwargs=kwargs)
     text = Outline(report(model, tmp_path / "r.html", env="ClippedPendulum-v0", seeds=[0])).text
     assert "The MPC's law is solved at each point" in text
     assert "A picture of regions needs an explicit law" in text
@@ -505,7 +491,7 @@ def test_starts_that_the_guard_knows_are_named() -> None:
 
 def test_starts_of_the_mpc_itself_need_no_rows_and_those_of_a_policy_are_counted() -> None:
     kwargs = {"problem": guard_samples.MPC}
-    subject = subject_of(DDPG("YannPolicy", Slide(), policy_kwargs=kwargs, device="cpu"), env=Slide)
+    subject = subject_of(DDPG("YannPolicy", Slide(), policy_kwargs=kwargs), env=Slide)
     assert "Each costs what it costs with the MPC" in evidence_parts.loops_part(subject).content
     content = evidence_parts.statistics_part(subject).content
     assert "It costs less from 0 starts and more from 0 of" in content

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann import LinearModel, LinearMPC
+from sample_problems import small_mpc
+from sb3_yann import LinearModel
 from sb3_yann._archive import read_arrays, write_arrays
 from sb3_yann.commissioning.journal import CommissioningState, Journal, Record
 from sb3_yann.commissioning.plant import PlantEpisode
@@ -81,15 +82,10 @@ def damaged(content: bytes, rng: np.random.Generator) -> bytes:
     return bytes(broken)
 
 
-def _plant() -> LinearMPC:
-    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, state_names=["x", "v"])
-    bounds = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 2}
-    return LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=2, **bounds)
-
-
 def _law_file(kind: str, folder: Path) -> tuple[Callable[[Path], Any], Path]:
     path = folder / "law.npz"
-    mpc = _plant()
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, state_names=["x", "v"])
+    mpc = small_mpc(model, R=[[0.1]], u_max=2)
     law = mpc.explicit() if kind == "law" else mpc.online()
     law.save(path)
     return type(law).load, path

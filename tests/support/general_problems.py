@@ -1,11 +1,11 @@
 """Problems with references, disturbances, rates, soft bounds and invariant terminal sets."""
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
 
+from sample_problems import kept
 from sb3_yann import (
     DisturbanceBounds,
     LinearModel,
@@ -88,11 +88,4 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     ),
     "level": level,
 }
-
-
-@cache
-def solved(name: str) -> LinearMPC:
-    """One of the problems, with its law; the same object for all tests."""
-    mpc = PROBLEMS[name]()
-    mpc.explicit()
-    return mpc
+solved = kept(PROBLEMS)

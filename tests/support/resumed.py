@@ -73,13 +73,11 @@ def all_bits(value: Any) -> Any:
 def model_bits(model: Any) -> dict[str, Any]:
     """Return all that a training has made, that of our callbacks included."""
     policy = model.policy
-    state = getattr(model, "twin_state", None)
     parts = {
         "policy": policy.state_dict(),
         "optimizers": [each.optimizer.state_dict() for each in (policy.actor, policy.critic)],
         "counts": [model.num_timesteps, model._n_updates, model._episode_num],
         "guard": getattr(model, "guard_state", None),
-        "twin": None if state is None else dataclasses.replace(state, run=0),
     }
     return {**all_bits(parts), "buffer": buffer_bits(model)}
 

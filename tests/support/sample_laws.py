@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 import sample_problems
 from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
-from sb3_yann.networks import YannLayer
+from sb3_yann.networks import AfterstateValue, LinearPrediction, Ranges, YannLayer
+from sb3_yann.networks.value import PredictionModel
 from sb3_yann_envs import cstr, problems
 
 Array = NDArray[np.float64]
@@ -24,6 +26,7 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "asymmetric bounds": sample_problems.PROBLEMS["asymmetric input bounds"],
     "two inputs": sample_problems.PROBLEMS["two inputs"],
 }
+solved = sample_problems.kept(PROBLEMS)
 EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
 INFEASIBLE = pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
 
@@ -44,14 +47,6 @@ def reactor_in_plant_units() -> LinearMPC:
     )
 
 
-@cache
-def solved(name: str) -> LinearMPC:
-    """One of the problems, with its law; the same object for all tests."""
-    mpc = PROBLEMS[name]()
-    mpc.explicit()
-    return mpc
-
-
 def law_of(name: str, infeasible: str = "nearest_region") -> PiecewiseAffine:
     return replace(solved(name).explicit(), infeasible=infeasible)
 
@@ -63,6 +58,20 @@ def box_points(law: PiecewiseAffine, count: int, stretch: float = 1.0, seed: int
     half = (law.theta_max - law.theta_min) / 2
     points = middle + stretch * half * rng.uniform(-1, 1, (count, law.n_theta))
     return th.as_tensor(points, dtype=th.float32)
+
+
+def ranges_of(name: str) -> Ranges:
+    mpc = solved(name)
+    return Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
+
+
+def critic_of(
+    name: str, gamma: float = 0.99, model: PredictionModel | None = None, **changes: Any
+) -> AfterstateValue:
+    mpc = solved(name)
+    costs = mpc.stage_matrix, mpc.value_matrix(gamma)
+    model = model or LinearPrediction(*mpc.prediction)
+    return AfterstateValue(*costs, model, gamma, ranges_of(name), **changes)
 
 
 def random_rows(name: str, count: int) -> th.Tensor:

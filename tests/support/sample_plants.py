@@ -144,6 +144,26 @@ def feasible_states(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarr
     return np.array(states), np.array(inputs)
 
 
+class Ending(gym.Wrapper):
+    """Ends its episodes after so many steps, with a violation."""
+
+    def __init__(self, env: gym.Env, steps: int, reward: float | None = None) -> None:
+        super().__init__(env)
+        self.last = steps
+        self.reward = reward
+
+    def reset(self, **kwargs):
+        self.t = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        observation, reward, _, truncated, info = self.env.step(action)
+        self.t += 1
+        over = self.t == self.last
+        reward = reward if self.reward is None else self.reward
+        return observation, reward, over, truncated, {**info, "violation": over}
+
+
 class Recorder(gym.Wrapper):
     """Keeps every observation and the action that met it."""
 

@@ -38,6 +38,13 @@ def input_bounds_only(model: LinearModel = DOUBLE_INTEGRATOR, **changes: Any) ->
     return small_mpc(model, **{**free, **changes})
 
 
+def braking(**changes: Any) -> LinearMPC:
+    """A cart with a speed limit: 125 regions; a part of its box has no solution."""
+    model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
+    limits = {"R": [[0.03]], "horizon": 6, "x_min": [-5, -2], "x_max": [5, 2]}
+    return small_mpc(model, **{**limits, **changes})
+
+
 def benchmark() -> LinearMPC:
     """The double integrator of Bemporad et al., The explicit linear quadratic regulator (2002)."""
     return input_bounds_only(Q=np.diag([1, 0]), R=[[0.1]], theta_min=-10, theta_max=10)
@@ -141,12 +148,19 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
 }
 
 
-@cache
-def solved(name: str) -> LinearMPC:
-    """One of the problems, with its law; the same object for all tests."""
-    mpc = PROBLEMS[name]()
-    mpc.explicit()
-    return mpc
+def kept(problems: dict[str, Callable[[], LinearMPC]]) -> Callable[[str], LinearMPC]:
+    """Return a function of a name: that problem with its law, the same object each time."""
+
+    @cache
+    def solved(name: str) -> LinearMPC:
+        mpc = problems[name]()
+        mpc.explicit()
+        return mpc
+
+    return solved
+
+
+solved = kept(PROBLEMS)
 
 
 def box_points(mpc: LinearMPC, count: int, seed: int = 0) -> Array:

@@ -2,9 +2,12 @@
 
 from typing import Any
 
+import numpy as np
 import torch as th
 
 from sb3_yann.networks import ZeroOutputNetwork
+
+LARGEST = float(np.finfo(np.float32).max)
 
 
 def network_of(owner: Any) -> ZeroOutputNetwork:
@@ -30,6 +33,18 @@ def shake(owner: Any, size: float, seed: int = 0) -> None:
     generator = th.Generator().manual_seed(seed)
     for each in owner.parameters():
         each += size * th.randn(each.shape, generator=generator, dtype=each.dtype)
+
+
+@th.no_grad()
+def redrawn(owner: Any, size: float, seed: int, poison: float | None = None) -> Any:
+    """Give the networks weights of this size, and some that are ``poison``."""
+    rng = np.random.default_rng(seed)
+    for weight in network_of(owner).parameters():
+        drawn = np.clip(size * rng.normal(size=weight.shape), -LARGEST, LARGEST)
+        if poison is not None:
+            drawn[rng.random(weight.shape) < 0.1] = poison
+        weight.copy_(th.as_tensor(drawn, dtype=th.float32))
+    return owner
 
 
 def first_layer(owner: Any) -> th.nn.Parameter:

@@ -77,10 +77,25 @@ def fitted(episodes: list) -> PlantTwin:
     return PlantTwin.fit(mpc(), episodes, residuals=SELECT, n_members=1)
 
 
+SAID = {
+    "a row early": "u[0] is what the MPC gives u[0] in the row after",
+    "a row late": "u[0] is what the MPC gives u[0] in the row before",
+    "inputs exchanged": "u[0] is what the MPC gives u[1] in the same row",
+    "a sign": "u[1] is minus what the MPC gives u[1] in the same row",
+    "a tenth": "u[0] is 0.1 times what the MPC gives",
+    "a fraction of the range": "u[1] is 0.5 times what the MPC gives, +0.5",
+    "states exchanged": "where x[0] and x[1] are exchanged",
+    "a frozen sensor": "x[0] reads exactly",
+}
+"""What the report says of a log of the MPC."""
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_log_whose_columns_are_not_what_acted_is_not_trusted(kind, fault) -> None:
-    assert not fitted([FAULTS[fault](x, u) for x, u in logged(kind)]).trusted
+    twin = fitted([FAULTS[fault](x, u) for x, u in logged(kind)])
+    assert not twin.trusted
+    assert kind != "the MPC" or SAID.get(fault, "") in twin.report()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -89,23 +104,6 @@ def test_a_sound_log_has_nothing_against_its_columns(kind, noise) -> None:
     for seed in range(2):
         twin = fitted(logged(kind, seed, noise))
         assert twin.trusted, twin.report()
-
-
-@pytest.mark.parametrize(
-    ("fault", "said"),
-    [
-        ("a row early", "u[0] is what the MPC gives u[0] in the row after"),
-        ("a row late", "u[0] is what the MPC gives u[0] in the row before"),
-        ("inputs exchanged", "u[0] is what the MPC gives u[1] in the same row"),
-        ("a sign", "u[1] is minus what the MPC gives u[1] in the same row"),
-        ("a tenth", "u[0] is 0.1 times what the MPC gives"),
-        ("a fraction of the range", "u[1] is 0.5 times what the MPC gives, +0.5"),
-        ("states exchanged", "where x[0] and x[1] are exchanged"),
-        ("a frozen sensor", "x[0] reads exactly"),
-    ],
-)
-def test_the_report_says_what_is_wrong_with_a_log_of_the_mpc(fault, said) -> None:
-    assert said in fitted([FAULTS[fault](x, u) for x, u in logged("the MPC")]).report()
 
 
 @pytest.mark.parametrize("biased", [0, 1])

@@ -16,7 +16,7 @@ from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.forecast import REMEMBERED, _cure, _Replays
 from sb3_yann.twin.trust import costs_of
 from sb3_yann_envs import ProblemBox
-from twin_samples import POLYNOMIALS, Cart, problem
+from twin_samples import POLYNOMIALS, problem
 from twin_samples import twin as cart_twin
 
 DT = 0.05
@@ -178,9 +178,3 @@ def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_ne
     costs = evaluate(model, make, TESTS).costs
     assert costs.mean() < 0.99 * before.mean() and np.all(costs < before)
     assert costs.mean() / before.mean() - 1 == pytest.approx(found.change, abs=0.02)
-
-
-def test_what_gains_on_the_plant_passes() -> None:
-    twin = cart_twin(10)
-    model = DDPG("YannPolicy", Cart(), device="cpu", seed=0)
-    assert improve(model, twin, updates=500, n_starts=12).accepted

@@ -32,11 +32,9 @@ def test_too_long_a_search_is_an_error_that_says_what_to_change(solver: str) -> 
     ("limits", "message"),
     [
         ({"time_limit": 0}, "time_limit = 0 must be .* above 0. It is in seconds"),
-        ({"time_limit": float("nan")}, "time_limit = nan must be .* above 0. It is"),
         ({"time_limit": "1 h"}, TypeError("time_limit = '1 h' must be a number. It is in seconds")),
         ({"solver": "gurobi"}, r"solver = 'gurobi' must be one of \('walk', 'ppopt'\)"),
         ({"region_limit": 0}, "region_limit = 0 must be a whole number of at least 1"),
-        ({"region_limit": 1.5}, "region_limit = 1.5 must be a whole number of at"),
     ],
 )
 def test_bad_limit_is_named(limits: dict[str, Any], message: Message) -> None:

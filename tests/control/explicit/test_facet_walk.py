@@ -77,14 +77,6 @@ def test_regions_of_random_problems_are_those_of_ppopt(mpc: LinearMPC) -> None:
     assert_same_regions(mpc)
 
 
-def carts(**changes: Any) -> LinearMPC:
-    """Two coupled carts, each with a force of its own; hundreds of regions."""
-    A = [[1, 0.5, 0.05, 0], [-0.1, 1, 0.1, 0], [0.05, 0, 1, 0.5], [0.1, 0, -0.1, 1]]
-    B = [[0.125, 0], [0.5, 0.1], [0, 0.125], [0.1, 0.5]]
-    values = {"Q": np.eye(4), "R": 0.1 * np.eye(2), "horizon": 3, "u_min": -1, "u_max": 1}
-    return LinearMPC(LinearModel(A, B, 0.5), **{**values, **changes})
-
-
 def staircase(**changes: Any) -> LinearMPC:
     """From the lowest input to the highest in three steps, all of the largest size.
 

@@ -1,12 +1,12 @@
 """Curvature is named from its definition's edges on, and is not taken for noise."""
 
 import dataclasses
-import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 
+from errors import told
 from sample_plants import played
 from sb3_yann import identify
 from sb3_yann.control.identification.least_squares import Regression, regress
@@ -55,10 +55,9 @@ def held(steps: int, inputs: int, hold: int, seed: int) -> np.ndarray:
 
 def notes(x: np.ndarray, u: np.ndarray, **options: Any) -> str:
     """Return all that identify says of a log."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        found = identify(x, u, dt=1, **options)
-    return " ".join([*found.model.notes, *(str(each.message) for each in said)])
+    found: list[Any] = []
+    warned = told(lambda: found.append(identify(x, u, dt=1, **options)))
+    return " ".join([*found[0].model.notes, *warned])
 
 
 def linear(order: int, measured: int, seed: int, hold: int, noise: float = 0.0) -> Any:

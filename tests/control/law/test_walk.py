@@ -24,6 +24,7 @@ from random_problems import (
     steepest,
     unit_half,
 )
+from sample_problems import braking
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sparse_qp import room
@@ -46,12 +47,7 @@ def chain(bounded: bool = False, infeasible: str = "nearest_region") -> Piecewis
 
 @cache
 def cart() -> PiecewiseAffine:
-    """The law of a cart with 125 regions, part of whose box has no solution."""
-    model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
-    return LinearMPC(
-        model, Q=np.eye(2), R=[[0.03]], horizon=6,
-        x_min=[-5, -2], x_max=[5, 2], u_min=-1, u_max=1,
-    ).explicit()  # fmt: skip
+    return braking().explicit()
 
 
 LAWS = pytest.mark.parametrize("make", [chain, lambda: chain(bounded=True), cart])

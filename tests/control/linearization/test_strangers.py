@@ -203,12 +203,6 @@ def test_lists_and_columns_that_are_returned_are_taken_as_vectors_are(f: Any) ->
     np.testing.assert_allclose(model.B, same.B, atol=1e-9)
 
 
-def test_the_state_of_the_reactor_is_solved_for() -> None:
-    model = LinearModel.from_dynamics(cstr.dynamics, [NAN] * 4, cstr.U_SS, cstr.DT)
-    np.testing.assert_allclose(cstr.dynamics(model.x_ss, model.u_ss), 0, atol=1e-6)
-    assert "steady state: 4 entries" in model.notes[0]
-
-
 def test_the_input_that_holds_a_level_is_solved_for() -> None:
     def tanks(x: Any, u: Any) -> Any:
         q = math.sqrt(x[0])  # raises below 0, where numpy's returns NaN

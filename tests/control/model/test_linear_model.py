@@ -87,11 +87,6 @@ def test_dynamics_are_exact_to_nine_digits_in_coordinates_of_hundreds() -> None:
     np.testing.assert_allclose(model.B, exact.B, atol=1e-9)
 
 
-def test_kink_in_the_dynamics_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"along u\[0\], its slopes to the two sides differ"):
-        LinearModel.from_dynamics(lambda x, u: -x + np.maximum(u, 0), [0], [0], 0.1)
-
-
 def test_step_takes_one_state_and_a_batch() -> None:
     x = np.array([[1.0, 2.0], [3.0, 4.0]])
     u = np.array([[1.0], [-1.0]])
@@ -171,14 +166,16 @@ A = [[0.9, 0.1], [0.0, 0.8]]
 B = [[1.0], [0.5]]
 
 
-def test_names_and_units_are_shown() -> None:
-    model = LinearModel(A, B, dt=1.0, **NAMES)
+def test_names_and_units_are_shown_and_a_gain_is_one_of_changes() -> None:
+    model = LinearModel(A, B, dt=1.0, x_ss=[12, 350], u_ss=[3], **NAMES)
     report = model.report()
     assert "States: level (cm), T.top. Inputs: pump (V)." in report
     assert "  pump (V): level +12.5 cm, T.top +2.5.\n" in report
     assert repr(model).startswith("LinearModel(states=['level (cm)', 'T.top'], inputs=['pump (V)']")
-    assert "x_ss=[0.0, 0.0]" in repr(model)
+    assert "x_ss=[12.0, 350.0]" in repr(model)
     assert model.units == ("cm", "", "V")
+    assert "Scaling: entries of B from 0.5 to 1.\n" in report  # nothing to balance
+    assert "What one unit more of an input, held, does in the end:\n" in report
 
 
 def test_names_are_kept_by_copies_and_do_not_count_in_equality() -> None:
@@ -217,13 +214,6 @@ def test_naming_a_model_keeps_its_notes_and_drift() -> None:
 def test_bad_names_are_named(changes: Any, message: Message) -> None:
     with raises(message):
         LinearModel(A, B, dt=1.0, **changes)
-
-
-def test_a_gain_in_the_report_says_that_it_is_a_change() -> None:
-    model = LinearModel(A, B, dt=1.0, x_ss=[12, 350], u_ss=[3], **NAMES)
-    assert "Scaling: entries of B from 0.5 to 1.\n" in model.report()  # nothing to balance
-    assert "What one unit more of an input, held, does in the end:\n" in model.report()
-    assert "  pump (V): level +12.5 cm, T.top +2.5.\n" in model.report()
 
 
 @pytest.mark.parametrize(

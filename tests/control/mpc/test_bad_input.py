@@ -1,13 +1,12 @@
 """Bad input is an error that names the argument; what arguments mean together is told."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from errors import Message, raises
+from errors import Message, raises, told
 from general_problems import servo
 from sample_problems import input_bounds_only, small_mpc
 from sb3_yann import (
@@ -32,8 +31,6 @@ BAD_MODELS: list[tuple[dict[str, Any], Message]] = [
     ({"B": [[1], [2], [3]]}, r"B has shape \(3, 1\), expected \(2, m\)"),
     ({"B": np.zeros((2, 0))}, r"B has shape \(2, 0\): the model needs at least one"),
     ({"dt": 0}, "dt = 0 must be a finite number above 0"),
-    ({"dt": NAN}, "dt = nan must be a finite number above 0"),
-    ({"dt": "soon"}, TypeError("dt = 'soon' must be a number")),
     ({"x_ss": [1]}, r"x_ss has shape \(1,\), expected \(2,\)"),
     ({"E": [[1]]}, r"E has shape \(1, 1\), expected \(2, d\)"),
     ({"d_ss": [1]}, r"d_ss = \[1\] is given, but there are no disturbances: pass E"),
@@ -65,10 +62,7 @@ BAD_PROBLEMS: list[tuple[dict[str, Any], Message]] = [
     ({"R": [[-1]]}, "R must be positive semi-definite, its smallest eigenvalue is -1"),
     ({"horizon": 0}, "horizon = 0 must be a whole number of at least 1"),
     ({"horizon": 2.5}, TypeError("horizon = 2.5 must be a whole number of steps")),
-    ({"horizon": True}, TypeError("horizon = True must be a whole number of steps")),
     ({"gamma": 0}, r"gamma = 0 must lie in \(0, 1\]"),
-    ({"gamma": 1.5}, r"gamma = 1.5 must lie in \(0, 1\]"),
-    ({"gamma": "high"}, TypeError("gamma = 'high' must be a number")),
     ({"u_min": 2}, "u_min must lie below u_max, but entry 0 has u_min = 2 and u_max ="),
     ({"u_min": [-1, -1]}, r"u_min has shape \(2,\), expected \(1,\) or a single"),
     ({"u_max": NAN}, "u_max holds NaN: .* Use inf for 'no bound'"),
@@ -212,12 +206,8 @@ PLANT = LinearModel([[0.9, 0.1], [0.0, 0.8]], [[0], [1]], 1)
 
 def said(**given: Any) -> list[str]:
     """Return the warnings about a problem."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        LinearMPC(
-            given.pop("model", PLANT), **(WEIGHTS | {"theta_min": -5, "theta_max": 5} | given)
-        )
-    return [str(each.message) for each in caught]
+    values = WEIGHTS | {"theta_min": -5, "theta_max": 5, "model": PLANT} | given
+    return told(lambda: LinearMPC(**values))
 
 
 def test_a_soft_bound_reaches_half_its_width_beyond_and_a_hard_one_nowhere() -> None:

@@ -1,6 +1,7 @@
 """Unstable plants over long horizons lose no digits, and where they would, an error says so."""
 
 import pickle
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from scipy import linalg
 
 from benchmarks.long_horizons import KINDS, errors, problem
+from sample_problems import small_mpc
 from sb3_yann import LinearModel, LinearMPC, SoftBounds, Terminal
 from sb3_yann.control import OnlineLaw
 
@@ -145,9 +147,7 @@ def test_a_strong_discount_over_a_long_horizon_makes_nothing_infeasible(pole) ->
 MODEL = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
 
 
-def bounded(**changes) -> LinearMPC:
-    design = {"Q": np.eye(2), "R": [[0.1]], "horizon": 3, "u_min": -1, "u_max": 1}
-    return LinearMPC(MODEL, **{**design, "x_min": -5, "x_max": 5, **changes})
+bounded = partial(small_mpc, MODEL, R=[[0.1]], horizon=3)
 
 
 def points(count: int = 200) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import itertools
 import pickle
-import warnings
 
 import numpy as np
 import pytest
@@ -13,17 +12,14 @@ from sample_plants import Plant, played
 from sample_problems import input_bounds_only, small_mpc
 from sample_problems import solved as sample_problem
 from sb3_yann import LinearModel, LinearMPC, Log, RateLimits, Terminal, Tracking, identify
-from sb3_yann.control import OnlineLaw, OnlineLawWarning, PiecewiseAffine
+from sb3_yann.control import OnlineLaw, OnlineLawWarning
 from sb3_yann.control.explicit import budget, solve
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.mpc import linear_mpc
 
-CART = LinearModel([[1, 1], [0, 1]], [[0], [1]], dt=1.0)
-BOUNDS = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 1}
-
 
 def test_a_simulation_is_the_law_on_its_model() -> None:
-    mpc = LinearMPC(CART, Q=np.eye(2), R=[[1]], horizon=2, **BOUNDS)
+    mpc = small_mpc()
     thetas, inputs = mpc.simulate([-3, 1], 12)
     assert (thetas.shape, inputs.shape) == ((13, 2), (12, 1))
     np.testing.assert_allclose(inputs, mpc.explicit()(thetas[:-1]))
@@ -32,7 +28,7 @@ def test_a_simulation_is_the_law_on_its_model() -> None:
 
 
 def test_it_plays_the_law_that_was_chosen(monkeypatch) -> None:
-    mpc = LinearMPC(CART, Q=np.eye(2), R=[[1]], horizon=2, **BOUNDS)
+    mpc = small_mpc()
     online = mpc.law("online")
     monkeypatch.setattr(LinearMPC, "explicit", None)  # nothing is searched for
     thetas, inputs = mpc.simulate([-3, 1], 5)
@@ -40,10 +36,7 @@ def test_it_plays_the_law_that_was_chosen(monkeypatch) -> None:
 
 
 def test_r_stays_and_u_prev_follows() -> None:
-    mpc = LinearMPC(
-        CART, Q=np.eye(2), R=[[1]], horizon=2, **BOUNDS,
-        tracking=Tracking([0], -2, 2), rate=RateLimits(-0.5, 0.5),
-    )  # fmt: skip
+    mpc = small_mpc(tracking=Tracking([0], -2, 2), rate=RateLimits(-0.5, 0.5))
     thetas, inputs = mpc.simulate([0, 0, 1.0, 0], 30)
     assert np.all(thetas[:, 2] == 1)
     np.testing.assert_array_equal(thetas[1:, 3], inputs[:, 0])
@@ -52,13 +45,13 @@ def test_r_stays_and_u_prev_follows() -> None:
 
 @pytest.mark.parametrize(("theta", "steps"), [([1, 2, 3], 5), ([0, 0], 0), ([0, np.nan], 5)])
 def test_a_bad_start_is_named(theta: list[float], steps: int) -> None:
-    mpc = LinearMPC(CART, Q=np.eye(2), R=[[1]], horizon=2, **BOUNDS)
+    mpc = small_mpc()
     with pytest.raises(ValueError, match=r"theta0|steps = 0"):
         mpc.simulate(theta, steps)
 
 
 def test_a_problem_names_its_bounds() -> None:
-    text = repr(LinearMPC(CART, Q=np.eye(2), R=[[1]], horizon=2, **BOUNDS))
+    text = repr(small_mpc())
     assert "x_min=[-5, -5], x_max=[5, 5], u_min=[-1], u_max=[1]" in text
     assert "r_min" not in text
     assert "r_min=[" in repr(servo())
@@ -168,10 +161,6 @@ def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> Non
 # ---- Which law a problem takes, and that it keeps to it ----
 
 
-def test_auto_is_the_explicit_law_where_it_is_soon_found() -> None:
-    assert isinstance(servo().law(), PiecewiseAffine)
-
-
 def test_auto_is_the_online_law_beyond_the_budget_and_says_so_once(monkeypatch) -> None:
     monkeypatch.setattr(linear_mpc, "REGIONS", 2)
     mpc = servo()
@@ -181,10 +170,8 @@ def test_auto_is_the_online_law_beyond_the_budget_and_says_so_once(monkeypatch) 
         law = mpc.law()
     assert caught[0].filename == __file__
     assert isinstance(law, OnlineLaw)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert mpc.law() is law
-        assert isinstance(pickle.loads(pickle.dumps(mpc)).law(), OnlineLaw)
+    assert mpc.law() is law  # a warning would be an error
+    assert isinstance(pickle.loads(pickle.dumps(mpc)).law(), OnlineLaw)
 
 
 def test_regions_of_a_very_large_program_are_not_looked_for(monkeypatch) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.online_problems import points, six_masses, three_masses, wide_plant, worst_condition
 from general_problems import PROBLEMS, solved
+from sample_problems import braking
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, SoftBounds
 from sb3_yann.control._kernels import online as _kernels
 from sb3_yann.control._kernels.online import SOLVED
@@ -20,14 +21,6 @@ from sparse_qp import online_answers, relative_error
 def drawn(mpc: LinearMPC, count: int, stretch: float = 1.0) -> np.ndarray:
     rng = np.random.default_rng(0)
     return stretch * rng.uniform(mpc.theta_min, mpc.theta_max, (count, mpc.n_theta))
-
-
-def regulator(**changes) -> LinearMPC:
-    """A double integrator with hard bounds of its states: part of its box has no solution."""
-    model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
-    design = {"Q": np.eye(2), "R": [[0.03]], "horizon": 6}
-    bounds = {"x_min": [-5, -2], "x_max": [5, 2], "u_min": -1, "u_max": 1}
-    return LinearMPC(model, **{**design, **bounds, **changes})
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -67,7 +60,7 @@ def test_what_is_feasible_by_a_hair_is_solved_too() -> None:
 
 
 def test_infeasible_constraints_give_way_and_the_input_does_not_jump_at_the_border() -> None:
-    law = regulator().online()
+    law = braking().online()
     inside = np.array([4.9, 0.0])
     outside = np.array([4.9, 2.0])
     assert law.in_domain(inside)
@@ -80,14 +73,14 @@ def test_infeasible_constraints_give_way_and_the_input_does_not_jump_at_the_bord
 
 
 def test_zero_input_is_none_where_there_is_no_solution() -> None:
-    mpc = regulator(infeasible="zero_input")
+    mpc = braking(infeasible="zero_input")
     assert mpc.online()([4.9, 2.0]) == 0
     assert np.all(mpc.online().gain([4.9, 2.0]) == 0)
     assert mpc.online()([4.9, 0.0]) == pytest.approx(mpc.explicit()([4.9, 0.0]))
 
 
 def test_its_gain_is_its_slope_softened_or_not() -> None:
-    law = regulator().online()
+    law = braking().online()
     for theta in ([0.1, 0.1], [4.9, 0.2], [4.9, 0.8], [0.5, 1.95], [-5.1, 0.3]):
         step = 1e-6 * np.eye(2)
         slopes = []
@@ -97,21 +90,21 @@ def test_its_gain_is_its_slope_softened_or_not() -> None:
 
 
 def test_constraints_that_depend_on_each_other_are_no_obstacle() -> None:
-    law = regulator().online()
+    law = braking().online()
     double = replace(
         law,
         G=np.vstack([law.G] * 2 + [law.G[:1]]),
         w=np.concatenate([law.w, law.w, law.w[:1]]),
         S=np.vstack([law.S] * 2 + [law.S[:1]]),
     )
-    theta = drawn(regulator(), 500)
+    theta = drawn(braking(), 500)
     assert np.array_equal(law.in_domain(theta), double.in_domain(theta))
     feasible = law.in_domain(theta)
     assert np.abs(law(theta) - double(theta))[feasible].max() < 1e-9
 
 
 def test_daqp_is_asked_where_there_is_no_certificate(monkeypatch) -> None:
-    mpc = regulator()
+    mpc = braking()
     theta = drawn(mpc, 60)
     solve = DualProgram.solve
     expected = mpc.online()(theta)
@@ -126,7 +119,7 @@ def test_daqp_is_asked_where_there_is_no_certificate(monkeypatch) -> None:
         return found
 
     monkeypatch.setattr(DualProgram, "solve", unsure)
-    fresh = regulator().online()
+    fresh = braking().online()
     assert np.array_equal(fresh.in_domain(theta), feasible)
     assert np.abs(fresh(theta) - expected).max() < 1e-8
     assert np.abs(fresh.gain(theta) - gains)[feasible].max() < 1e-6
@@ -154,7 +147,7 @@ def test_a_file_without_a_law_is_named(tmp_path) -> None:
 
 
 def test_a_program_that_has_no_unique_solution_is_refused() -> None:
-    law = regulator().online()
+    law = braking().online()
     skew = law.H.copy()
     skew[0, 1] += 0.25
     for H, fault in ((skew, r"H\[0, 1\] = .*, H\[1, 0\] = "), (-law.H, "smallest eigenvalue is -")):
@@ -209,10 +202,7 @@ def cart(unit: float = 1.0, infeasible: str = "nearest_region", soft=STEEP) -> L
 
 
 def test_far_outside_a_softened_program_is_solved() -> None:
-    model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
-    mpc = LinearMPC(
-        model, Q=np.eye(2), R=[[0.03]], horizon=12, u_min=-1, u_max=1, x_min=[-5, -2], x_max=[5, 2]
-    )
+    mpc = braking(horizon=12)
     law = mpc.online()
     rng = np.random.default_rng(0)
     dual = law.dual
