@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
@@ -13,6 +14,7 @@ from sb3_yann.control.gains import (
     UNTOLD,
     Gains,
     count_integrators,
+    settled,
 )
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
@@ -186,23 +188,35 @@ def _gains(model: LinearSystem) -> list[str]:
     pace, time = (model.dt, model.time_unit) if model.time_unit else (1.0, "sample")
     rates = "", f" per {time}", f" per {time}²"
 
-    def effect(i: int, j: int) -> str:
-        degree = gains.degrees[i, j]
-        value, doubt = (each[i, j] / pace**degree for each in (values, width))
-        size = f"{value:+.4g}" if value else "0"
-        size += f" ± {doubt:.2g}" * bool(doubt)
-        return f"{states[i]} {size} {units[i]}".rstrip() + rates[degree]
+    def effects(values: Array, width: Array, degrees: NDArray[np.int64]) -> list[str]:
+        found = []
+        for j, name in enumerate(with_units(model)[1]):
+            each = []
+            for i in rows:
+                degree = degrees[i, j]
+                value, doubt = (part[i, j] / pace**degree for part in (values, width))
+                size = f"{value:+.4g}" if value else "0"
+                size += f" ± {doubt:.2g}" * bool(doubt)
+                each.append(f"{states[i]} {size} {units[i]}".rstrip() + rates[degree])
+            found.append(f"  {name}: {', '.join(each)}.")
+        return found
 
     # An unstable plant has this steady state but does not approach it.
     stable = np.all(np.abs(_beside(model, gains)) < 1 - ON_CIRCLE)
     verb = "does in the end" if stable else "would balance"
     lines = [f"What one unit more of an input, held, {verb}:"]
-    for j, name in enumerate(with_units(model)[1]):
-        lines.append(f"  {name}: {', '.join(effect(i, j) for i in rows)}.")
+    lines += effects(values, width, gains.degrees)
     if np.any(gains.degrees):
         lines.append(
             f"  What integrates moves on, by so much per {time}: it has no steady-state gain."
         )
+        if np.abs(np.linalg.eigvals(model.A) - 1).min() > ON_CIRCLE:
+            own = settled(model.A, np.zeros_like(model.A)) @ model.B
+            lines.append(
+                "  A load that drifts, and is not measured, looks like that too. If it is one, the "
+                "gains are about:"
+            )
+            lines += effects(own, np.zeros_like(own), np.zeros_like(gains.degrees))
     if np.any(width):
         unsure = np.argwhere((np.abs(values) <= width) & (width > 0))
         none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in unsure)
