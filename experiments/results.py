@@ -9,7 +9,7 @@ from pathlib import Path
 
 import sb3_yann
 from experiments.markdown import number, table
-from experiments.measures import EXPLORED, MPC, OPTIMUM, OURS, Row, plants_of, rows_of
+from experiments.measures import EXPLORED, MPC, OBSERVER, OPTIMUM, OURS, Row, plants_of, rows_of
 from experiments.pictures import save_pictures
 from experiments.published import paper_table
 from experiments.runner import Outcome, Run
@@ -79,14 +79,14 @@ def in_short(outcomes: Mapping[Run, Outcome]) -> str:
             found.append(_short_row(plant, rows))
     if not found:
         return ""
-    header = ("plant", OPTIMUM, MPC, f"**{OURS}**", "worst start", RIVAL)
+    header = ("plant", OPTIMUM, MPC, OBSERVER, f"**{OURS}**, worst start", RIVAL)
     starts = max(len(out.test_costs[-1]) for out in outcomes.values())
     legend = (
         f"Mean cost of a test episode after {episodes} training episodes, over {starts} starts "
         "that training and guard never see: the median over the seeds (and the range). "
         f"**{OURS}**, the policy of this package under its guard, has one set of options for every "
         "plant and explores in a simulator. *Worst start*: by how much the cost of one start is "
-        "above the MPC's at most, over all seeds."
+        "above the MPC's at most, over all seeds. A dash: not run."
     )
     return f"{table(header, found)}\n\n{legend}"
 
@@ -95,10 +95,8 @@ def _short_row(plant: str, rows: Mapping[str, Row]) -> list[str]:
     ours = rows.get(EXPLORED) or rows[OURS]
     return [
         plant,
-        _mean(rows.get(OPTIMUM)),
-        _mean(rows.get(MPC)),
-        f"**{_mean(ours)}**",
-        number(ours.worst, sign="+"),
+        *(_mean(rows.get(each)) for each in (OPTIMUM, MPC, OBSERVER)),
+        f"**{_mean(ours)}**, {number(ours.worst, sign='+')}",
         _mean(rows.get(RIVAL)),
     ]
 
@@ -161,6 +159,6 @@ def _beyond_limits(rows: Sequence[Row]) -> str:
 
 def _mean(row: Row | None) -> str:
     if row is None:
-        return ""
+        return "—"
     spread = f" ({number(row.low)} to {number(row.high)})" if row.seeds > 1 else ""
     return number(row.median) + spread

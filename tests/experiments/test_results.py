@@ -191,8 +191,8 @@ def test_the_short_table_has_a_row_for_each_plant_that_was_learnt() -> None:
     more = {Run("CSTR", "YANN-RL, a simulator explored", 0, 50): learned([91.0, 290.0])}
     _, _, *rows, empty, legend = in_short({**reactor(), **more, **pendulum()}).splitlines()
     assert rows == [
-        "| CSTR | 190.00 | 200.00 | **190.50** | -9.00 | 300.00 (300.00 to 300.00) |",
-        "| pendulum, Q = I | 15.00 | 100.50 | **15.50 (15.50 to 15.50)** | +0.00 |  |",
+        "| CSTR | 190.00 | 200.00 | — | **190.50**, -9.00 | 300.00 (300.00 to 300.00) |",
+        "| pendulum, Q = I | 15.00 | 100.50 | — | **15.50 (15.50 to 15.50)**, +0.00 | — |",
     ]
     assert empty == "" and "after 50 training episodes, over 2 starts" in legend
     left = {run: out for run, out in reactor().items() if run.learner != "YANN-RL"}
