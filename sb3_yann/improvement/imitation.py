@@ -279,7 +279,6 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     and of that with what costs the least.
     """
     scenarios = teacher.scenarios
-    problem = teacher.problem
     mpc = teacher.mpc.costs
     known = np.flatnonzero(np.isfinite(mpc))
     if not len(known):
@@ -315,27 +314,37 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
         chosen = teacher.rng.permutation(known[np.isfinite(last.costs[known])])[:count]
         if not len(chosen):
             break
-        some = last.of(chosen)
-        slopes = slopes_of_inputs(
-            scenarios.of(chosen).plant,
-            teacher.task,
-            policy_of(layer, problem),
-            some.rows,
-            some.inputs,
-        )
-        slopes *= problem.u_half
-        sizes = np.linalg.norm(slopes, axis=(0, 2))
-        limit = STEEPEST * np.median(sizes)
-        shares = np.minimum(1.0, limit / np.maximum(sizes, np.finfo(float).tiny))
-        slopes *= ((1 + price * (some.costs > (mpc + room)[chosen])) * shares)[:, None]
-        moves = -slopes / (np.sqrt(np.mean(slopes**2)) or 1.0)
-        moves = size * np.clip(moves, -FARTHEST, FARTHEST).reshape(-1, moves.shape[-1])
-        at = th.as_tensor(some.thetas[:-1].reshape(len(moves), -1))
-        with th.no_grad():
-            to = layer(at) + th.as_tensor(moves, dtype=th.float32)
-        _fit(layer, at, to, nn.functional.mse_loss, teacher.rng, updates)
+        prices = np.where(last.costs > mpc + room, 1 + price, 1.0)[chosen]
+        lower = _downhill(layer, teacher, scenarios.of(chosen), last.of(chosen), prices, size)
+        _fit(layer, *lower, nn.functional.mse_loss, teacher.rng, updates)
     layer.load_state_dict(best)
     return saved
+
+
+def _downhill(
+    layer: LawLayer,
+    teacher: Teacher,
+    scenarios: Scenarios,
+    played: Imagined,
+    prices: Array,
+    size: float,
+) -> tuple[th.Tensor, th.Tensor]:
+    """Return the thetas of episodes that a layer played, and its actions moved down the slopes.
+
+    Each of the k episodes has its price; the moves' root mean square is ``size``.
+    """
+    problem = teacher.problem
+    act = policy_of(layer, problem)
+    slopes = slopes_of_inputs(scenarios.plant, teacher.task, act, played.rows, played.inputs)
+    slopes *= problem.u_half
+    sizes = np.linalg.norm(slopes, axis=(0, 2))
+    steep = np.maximum(sizes, np.finfo(float).tiny)
+    slopes *= (prices * np.minimum(1.0, STEEPEST * np.median(sizes) / steep))[:, None]
+    moves = -slopes / (np.sqrt(np.mean(slopes**2)) or 1.0)
+    moves = size * np.clip(moves, -FARTHEST, FARTHEST).reshape(-1, moves.shape[-1])
+    at = th.as_tensor(played.thetas[:-1].reshape(len(moves), -1))
+    with th.no_grad():
+        return at, layer(at) + th.as_tensor(moves, dtype=th.float32)
 
 
 def fit_layer(
