@@ -147,10 +147,10 @@ def loops_part(subject: Subject) -> Part:
 
 def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float]:
     """Return what an episode costs with inputs at u_s of theta, and what inputs off u_s add."""
-    theta, u, _ = loops.steps()
-    rest = problem.units.to_deviations(theta) @ problem.error_system.to_input.T
-    of_states = problem.stage_cost(theta, problem.units.input_to_plant(rest))
-    of_inputs = problem.stage_cost(theta, u) - of_states
+    theta, u, _ = loops.steps()  # in deviations
+    stage_cost = problem.deviations.stage_cost
+    of_states = stage_cost(theta, theta @ problem.error_system.to_input.T)
+    of_inputs = stage_cost(theta, u) - of_states
     count = len(loops.costs)
     return float(of_states.sum()) / count, float(of_inputs.sum()) / count
 

@@ -298,6 +298,14 @@ def test_starts_beyond_those_of_episodes_are_a_finding_of_their_own(takes) -> No
                 weights += 0.3
 
 
+def check_that_costs_add_up(page: str) -> None:
+    cost, states, inputs = (
+        float(re.findall(f"{row}</td><td[^>]*>([^<]+)", page)[0])
+        for row in ("mean cost", "cost of states", "inputs off their rest")
+    )
+    assert states > 0 < inputs and states + inputs == pytest.approx(cost, rel=1e-4)
+
+
 class OwnStarts(gym.Wrapper):
     def reset(self, *, seed=None, options=None):
         return self.env.reset(seed=seed)
@@ -309,7 +317,9 @@ def test_the_mpc_is_played_through_the_policy_s_own_maps(shows, tmp_path) -> Non
     env = partial(unit_samples.plant, shows, "normalized")
     kwargs = {"problem": mpc, "observation": unit_samples.SAYS[shows]}
     model = DDPG("YannPolicy", env(), policy_kwargs=kwargs)
-    text = Outline(report(model, tmp_path / "r.html", env=env, seeds=range(3))).text
+    page = report(model, tmp_path / "r.html", env=env, seeds=range(3))
+    check_that_costs_add_up(page.read_text(encoding="utf-8"))
+    text = Outline(page).text
     law = mpc.explicit()
     same = evaluate(law, partial(unit_samples.plant, "plant", "plant"), range(3))
     assert "From these starts the policy costs what the MPC costs." in text
@@ -429,11 +439,7 @@ def test_of_a_twin_alone_its_episodes_are_played_and_said_to_be_no_plant_s(tmp_p
     assert "The env is a twin, fitted to the plant&#x27;s log: the plant has played none" in text
     assert "Closed loops against the MPC" in text and "samples for which a move" not in text
     assert "The policy is the MPC: its networks add nothing." in text
-    cost, states, inputs = (
-        float(re.findall(f"{row}</td><td[^>]*>([^<]+)", text)[0])
-        for row in ("mean cost", "cost of states", "inputs off their rest")
-    )
-    assert states > 0 < inputs and states + inputs == pytest.approx(cost, rel=1e-4)
+    check_that_costs_add_up(text)
 
 
 def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
