@@ -421,6 +421,7 @@ def slopes_of_inputs(
     K = np.stack(gains, axis=-1).reshape(*inputs.shape, n)
     found = np.empty_like(inputs)
     costate: Array = np.zeros(states.shape[1:])
+    shown(costate)[:] = 2 * thetas[-1] @ task.end + task.end_slope
     for t in reversed(range(len(inputs))):
         shown(costate)[:, problem.layout.state] += outside[t]
         found[t] = own[t][:, n:] + _pulled(B[t], costate)

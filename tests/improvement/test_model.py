@@ -201,7 +201,6 @@ def test_slopes_of_inputs_are_those_of_the_cost_with_the_feedback_at_work(make, 
     some = replace(some, members=None if members is None else np.array(members))
     mpc = found.problem
     task = task_of(found, 1.0, priced=members is None)
-    task = replace(task, end=0 * task.end, end_slope=0.0)
     K = -0.05 * mpc.u_half[:, None] * rng.random((mpc.model.n_inputs, mpc.n_theta))
     moved = np.zeros((*some.given.shape[:2], mpc.model.n_inputs))
 

@@ -22,7 +22,7 @@ def quick(patch: pytest.MonkeyPatch) -> None:
     """Let fits be short."""
     patch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=300))
     patch.setattr(imitation, "FITS", 2)
-    patch.setattr(imitation, "DESCENTS", 20)
+    patch.setattr(imitation, "DESCENTS", 2)
     patch.setattr(imitation, "RETURNS", 512)
     patch.setattr(imitation, "RETURN_STEPS", 20)
     patch.setattr(imitation, "CRITIC_UPDATES", 20)
