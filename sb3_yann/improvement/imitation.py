@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -211,11 +212,15 @@ class Teacher:
         """Return the episodes of a layer in the scenarios."""
         return self.scenarios.play(controller_of(policy_of(layer, self.problem)))
 
-    def objection(self, played: Imagined) -> str:
-        """Return what the rule of acceptance says against a policy, empty for nothing."""
+    def objection(self, played: Imagined, share: float = 1.0) -> str:
+        """Return what the rule of acceptance says against a policy, empty for nothing.
+
+        Starts may cost a ``share`` of what they may cost more.
+        """
         part = np.flatnonzero(np.isfinite(self.mpc.costs[self.usual]))
         mpc, policy = (Scores(each.costs[part], each.unsafe[part]) for each in (self.mpc, played))
-        return no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
+        rule = replace(RULE, margin=share * RULE.margin)
+        return no_worse(policy, mpc, mpc, rule.tolerance(mpc.costs)).reason
 
 
 def imitate(
@@ -291,7 +296,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     what = "the policy descends in the model: steps, at most"
     for k in bar(what, range(DESCENTS + 1), timed=True):
         played = teacher.play(layer)
-        passes = not teacher.objection(played)
+        passes = not teacher.objection(played, NEARLY)  # new starts lose more
         rank = passes, teacher.score(played.costs)
         if rank > most:
             most = rank
