@@ -18,7 +18,7 @@ from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.wrapper_stack import require_state_shown, require_theta_order
 from sb3_yann.rollout import Trajectories
 from sb3_yann.units import ActionUnits, Units
-from sb3_yann.wrappers import SetPoint
+from sb3_yann.wrappers import EstimateState, SetPoint
 from sb3_yann.wrappers.theta import below, require_vector
 
 MOSTLY = 0.5  # share of the starts beyond a box that is no chance
@@ -40,6 +40,7 @@ Reading = tuple[Array, Array]
 """A matrix M (n, n) and an offset v (n,): what is shown as x, in plant units, may mean M x + v."""
 SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
+SIGN_STEPS = 10  # steps for which it is pushed where outputs are read
 LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
 EXPLAINED_REWARD = 0.95
 """Share of the rewards' variance from which on they are taken for minus the stage cost."""
@@ -176,35 +177,56 @@ def warn_of_signs(
 
     Two steps from one start differ by that input alone: neither noise that the seed repeats, nor
     what is not linear in the states, gets in. It costs a step of the env for each input and start.
-    ``played`` are the MPC's episodes from the seeds; ``theta`` and ``inputs`` map what the env
-    shows and takes to the problem's.
+    Estimates go at first where their model goes: where an estimator stands between, its readings
+    count, and inputs are held for `SIGN_STEPS`, since outputs may answer late. ``played`` are the
+    MPC's episodes from the seeds; ``theta`` and ``inputs`` map what the env shows and takes to the
+    problem's.
     """
-    names = labels_of(problem.model)[1]
-    B = problem.model.B
+    model = problem.model
+    names = labels_of(model)[1]
     states = problem.layout.state
     shown = np.concatenate([theta(each)[:, states] for each in played.observations])
-    spread = np.std(shown[np.isfinite(shown).all(axis=1)], axis=0)
+    estimating = below(env, EstimateState)
+    C = np.eye(model.n_states) if estimating is None else estimating.observer.C
+    steps = 1 if estimating is None else SIGN_STEPS
+    spread = np.std(shown[np.isfinite(shown).all(axis=1)] @ C.T, axis=0)
     weight = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 0)
+    response = np.cumsum([np.linalg.matrix_power(model.A, k) @ model.B for k in range(steps)], 0)
     starts = [i for i in range(len(seeds)) if len(played.actions[i])][:SIGN_STARTS]
+    when = "a step" if steps == 1 else f"{steps} steps"
+
+    def hold(i: int, action: Array) -> Array:
+        env.reset(seed=seeds[i])
+        found: list[Any] = []
+        for _ in range(steps):
+            after = theta(env.step(action)[0][None])[0, states]
+            found.append(after if estimating is None else estimating.readings)
+        return np.array(found)
+
+    unmoved: dict[int, Array] = {}
     for j, name in enumerate(names):
         gains = []
         for i in starts:
             action = played.actions[i][0]
             pushed = _push(env, action, j)
             try:
-                env.reset(seed=seeds[i])
-                after = np.array([played.observations[i][1], env.step(pushed)[0]])
+                if i not in unmoved:
+                    first = theta(played.observations[i][1:2])[:, states]
+                    unmoved[i] = first if estimating is None else hold(i, action)
+                effect = weight * (hold(i, pushed) - unmoved[i])
             except Exception:  # of a brittle simulator: what it says under the MPC counts
                 return
-            effect = weight * np.diff(theta(after)[:, states], axis=0)[0]
-            expected = weight * B[:, j] * np.diff(inputs(np.array([action, pushed])), axis=0)[0, j]
-            size = float(expected @ expected)
+            by = np.diff(inputs(np.array([action, pushed])), axis=0)[0, j]
+            expected = weight * (response[..., j] @ C.T) * by
+            expected[~np.isfinite(effect)] = 0  # readings that come now and then
+            effect = np.nan_to_num(effect)
+            size = float(np.sum(expected**2))
             if size > 0 and np.linalg.norm(effect) > LEAST_EFFECT:
-                gains.append(float(effect @ expected) / size)
+                gains.append(float(np.sum(effect * expected)) / size)
         if len(gains) == len(starts) > 0 and max(gains) < 0:
             warn(
                 f"{name} moves the env against the sign of the model's B: {np.median(gains):.2g} "
-                f"times as far in a step, from {len(gains)} starts. The MPC steers the wrong way. "
+                f"times as far in {when}, from {len(gains)} starts. The MPC steers the wrong way. "
                 "Look at the sign and the order of the actions, and at B.",
             )
 

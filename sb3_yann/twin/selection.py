@@ -6,6 +6,7 @@ linear one makes the re-identified MPC.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -490,7 +491,9 @@ def reidentified(
     own |= {"notes": [note], "drift": None, "gains": None}  # what was said of the given one
     found = LinearModel(**{**vars(model), **own})
     terminal = Terminal(set="invariant" if len(problem.terminal.set[1]) else None)
-    return replace(problem, model=found, terminal=terminal)
+    with warnings.catch_warnings():  # what it is told of boxes that are not its own
+        warnings.simplefilter("ignore")
+        return replace(problem, model=found, terminal=terminal)
 
 
 def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, Array]:

@@ -496,6 +496,7 @@ class EstimateState(Appending):
         self.outer = Units(np.concatenate([model.x_ss, model.d_ss[estimated]]), model.u_ss)
         self.load: Array | None = None
         self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
+        self.readings: Vector = np.full(observer.n_measured, np.nan)  # the latest, in deviations
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         observer = self.observer
@@ -509,6 +510,7 @@ class EstimateState(Appending):
             warn(at, NonFiniteWarning)
         self.failing = failing
         measured[failing] = np.nan
+        self.readings = measured
         if u is None:
             x_hat, d_hat = observer.reset(measured)
         else:

@@ -16,13 +16,14 @@ from sb3_yann import (
     LinearModel,
     LinearMPC,
     NoActionNoise,
+    StateEstimator,
     headroom,
     report,
 )
 from sb3_yann.audit.meaning import warn_of_box, warn_of_order
 from sb3_yann.improvement.simulator import of_law
 from sb3_yann.rollout import rollout
-from sb3_yann.wrappers import StageCost
+from sb3_yann.wrappers import EstimateState, StageCost
 from sb3_yann_envs import problems
 
 A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.2], [0.1, 0.0, 0.5]])
@@ -248,6 +249,17 @@ def test_another_gain_and_dead_time_are_no_other_sign(plant: Any) -> None:
 
 def test_headroom_tells_it_too() -> None:
     assert len(against(lambda: headroom(STEERED, lambda: Plant((-1, -1)), n_starts=3))) == 2
+
+
+@pytest.mark.parametrize("gains", [(1, -0.6), (3, 0.2)])
+def test_an_estimator_that_goes_where_its_model_goes_hides_no_sign(gains: Any) -> None:
+    slow = StateEstimator(COUPLED, measurement_noise=5)
+
+    def make() -> EstimateState:
+        return EstimateState(Plant(gains), slow)
+
+    told = against(lambda: headroom(STEERED, make, n_starts=3, max_steps=150))
+    assert ["in 10 steps, from 3 starts" in each for each in told] == [True] * (min(gains) < 0)
 
 
 def test_a_plant_that_is_not_linear_has_the_signs_of_its_model() -> None:

@@ -124,6 +124,9 @@ def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() ->
     for (old, _), (new, _) in zip(worn_log(mpc), worn_log(found), strict=True):
         x, r = new[-10:].T
         assert np.abs(x.mean() - r[0]) < 0.01 < np.abs(old[-10:, 0].mean() - r[0])
+    far = dataclasses.replace(mpc, terminal=Terminal())  # bounds it was not given: no warning
+    found = PlantTwin.fit(far, worn_log(far, leak=0.15)).reidentified()
+    assert found.model.u_ss > far.u_max
 
 
 def test_where_the_model_is_right_the_mpc_is_the_given_one() -> None:
