@@ -253,6 +253,7 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(wr
     assert repr(log) == "Log(1 episode, 59 steps of dt = 10 s; 1 state (T), 1 input (valve))"
     model = identify(log).model
     assert (model.state_names, model.units, model.time_unit) == (("T",), ("K", ""), "s")
+    assert identify_outputs(log, order=1, delay=0).model.units == ("K", "")
     assert "sampled every 10 s" in model.report() and "time constant 44.81 s" in model.report()
     assert replace(model, dt=5).time_unit == "s"
     limits = {"x_min": -9, "x_max": 9, "u_min": -4, "u_max": 4}

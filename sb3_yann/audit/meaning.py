@@ -359,7 +359,7 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
             "the env so that it shows theta: see PastInputs and ObserveDisturbance in "
             "sb3_yann.wrappers."
         )
-    require_theta_order(env, problem.layout)
+    require_theta_order(env, problem)
 
 
 def require_theta_shown(problem: LinearMPC, theta: Array) -> None:

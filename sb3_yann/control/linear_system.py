@@ -194,13 +194,16 @@ def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
 
 def missing_observer(model: LinearSystem) -> str:
     """Return what a law or a policy of this model lacks; empty where nothing is estimated."""
-    if not model.estimated:
-        return ""
     which = [f"d[{i}]" for i in model.estimated]
-    verb = "is" if len(which) == 1 else "are"
+    observer = "DisturbanceObserver" if which else "StateEstimator"
+    if not np.array_equal(model.shown, np.eye(model.n_states)):
+        which.insert(0, "the states")
+    if not which:
+        return ""
+    verb = "are" if which[1:] or which[0] == "the states" else "is"
     return (
-        f"{', '.join(which)} {verb} estimated: the DisturbanceObserver is no part of the law or "
-        "the policy. Whoever calls it runs the observer, and passes its x_hat and d_hat."
+        f"{', '.join(which)} {verb} estimated: the {observer} is no part of the law or the policy. "
+        "Whoever calls it runs the observer, and passes its estimates."
     )
 
 

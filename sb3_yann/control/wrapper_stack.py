@@ -10,7 +10,7 @@ import numpy as np
 from sb3_yann._validation import warn
 
 if TYPE_CHECKING:
-    from sb3_yann.control.mpc.coordinates import ThetaLayout
+    from sb3_yann.control.mpc.problem import MPCProblem
 
 WRAPPER_LIBRARIES = {"gymnasium", "stable_baselines3"}
 LEAVE_OUT = (
@@ -28,11 +28,13 @@ def layers_of(env: Any) -> Iterator[Any]:
         yield from layers_of(each)
 
 
-def require_theta_order(env: Any, layout: ThetaLayout) -> None:
+def require_theta_order(env: Any, problem: MPCProblem) -> None:
     """Raise ValueError where one of our wrappers appends what has another place in theta.
 
     Of a vector env the first env counts; below a wrapper that shows another size, nothing does.
+    Warn of set-points beyond those of the problem.
     """
+    layout = problem.layout
     end = layout.size
     for layer in layers_of(env):
         if parts := getattr(type(layer), "appends", ()):
@@ -46,11 +48,26 @@ def require_theta_order(env: Any, layout: ThetaLayout) -> None:
                     "PastInputs, SetPoint, MeasuredDisturbance, ObserveDisturbance, SetPoint of "
                     "bounds that change, PreviousInput."
                 )
+            if start < end and "reference" in parts:
+                _warn_of_wide(layer, problem, slice(start, end))
             end = start
         elif "envs" not in vars(layer) and "venv" not in vars(layer):
             inner = vars(layer).get("env")
             if inner is None or inner.observation_space.shape != layer.observation_space.shape:
                 return
+
+
+def _warn_of_wide(layer: Any, problem: MPCProblem, slots: slice) -> None:
+    """Warn where a wrapper draws set-points from beyond their box."""
+    low = problem.theta_min[slots]
+    high = problem.theta_max[slots]
+    room = 1e-3 * (high - low)
+    for i in np.flatnonzero((layer.low < low - room) | (layer.high > high + room))[:1]:
+        warn(
+            f"{type(layer).__name__} shows {problem.labels()[slots][i]} from {layer.low[i]:g} to "
+            f"{layer.high[i]:g}, and the MPC takes one beyond {low[i]:g} to {high[i]:g} as at its "
+            "end. Give both the same range."
+        )
 
 
 def require_state_shown(env: Any, observation_given: bool) -> None:

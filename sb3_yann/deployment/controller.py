@@ -6,6 +6,7 @@ float64, and every step checks the readings. The C code of an export does the sa
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from enum import IntFlag
 from os import PathLike
@@ -240,6 +241,7 @@ class Controller:
             raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
         known = self.counters["steps"] == 0 and bool(np.isfinite(given).all())
         if known:
+            self._warn_of_present(given)
             self._output = given.copy()
         faulty, status = self._readings(rows[0])
         if elapsed is not None and elapsed > float(data["late_after"]):
@@ -277,6 +279,18 @@ class Controller:
         for name in ("steps", mode, *found):
             self.counters[name] += 1
         return self._output.copy()
+
+    def _warn_of_present(self, given: Array) -> None:
+        """Warn of a present input (m,) that is further beyond its bounds than half their width."""
+        low, high = self.data["bounds"] * self.data["action_scale"] + self.data["action_shift"]
+        room = (high - low) / 2
+        for i in np.flatnonzero((given < low - room) | (given > high + room)):
+            warnings.warn(
+                f"The plant's present input, manual = {given[i]:g} of {self.action_names[i]}, is "
+                f"far beyond its bounds, {low[i]:g} to {high[i]:g}: the output begins at one of "
+                "them. Is it in another unit?",
+                stacklevel=3,
+            )
 
     def _readings(self, obs: Array) -> tuple[NDArray[np.bool_], Status]:
         """Keep the good readings; return which others there are, and what is wrong with them."""

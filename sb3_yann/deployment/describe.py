@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from sb3_yann._validation import Array, check_bounds, check_int, check_positive
+from sb3_yann._validation import Array, check_bounds, check_int, check_positive, warn
 from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine, StateEstimator
 from sb3_yann.control.linear_system import labels_of, missing_observer, with_units
 from sb3_yann.deployment.code import scale_within
@@ -235,6 +235,8 @@ def describe(
         units = policy.action_units if isinstance(policy, StartsAsMPC) else units
         signals = estimator_arrays(problem, own, labels, seen_rest, units)
     limits = checks.arrays(len(signals["obs_rest"]))
+    if problem is not None and problem.units.shifted:
+        _warn_of_limits(limits, signals)
     return {
         **_law_arrays(law),
         **program,
@@ -258,6 +260,19 @@ def describe(
     }
 
 
+def _warn_of_limits(limits: dict[str, Any], signals: dict[str, Any]) -> None:
+    """Warn of limits of a state, or of an output, that leave out the operating point."""
+    low = limits["obs_min"]
+    high = limits["obs_max"]
+    rest = signals["obs_rest"]
+    for i in np.flatnonzero(((rest < low) | (rest > high)) & signals["watched"]):
+        warn(
+            f"Checks: obs_min = {low[i]:g} and obs_max = {high[i]:g} of {signals['obs_names'][i]} "
+            f"leave out the operating point, {rest[i]:g}: there the controller takes its reading "
+            "for a fault. Have they the same units, and the order of the readings?"
+        )
+
+
 def _lacks(policy: Any, problem: LinearMPC | None, estimator: Estimator) -> str:
     """Return what the controller leaves to its caller; raise where an estimator has no place."""
     model = policy.model if problem is None else problem.model
@@ -273,9 +288,9 @@ def _lacks(policy: Any, problem: LinearMPC | None, estimator: Estimator) -> str:
     note = "" if model is None else missing_observer(model)
     if estimator is None and note:
         raise ValueError(
-            f"{note} The controller does not reach its set-points without. Have it exported too: "
-            "export(..., estimator=observer), the one of offset_free or of the env. Where your "
-            'code runs it: estimator="caller".'
+            f"{note} Have it exported too: export(..., estimator=observer), the one of "
+            "offset_free, of found.estimator(), or of the env. Where your code runs it: "
+            'estimator="caller".'
         )
     return note
 

@@ -96,7 +96,7 @@ def export(
         What estimates states and disturbances from measured outputs. It becomes part of the
         controller, which then takes the outputs y, references r, measured disturbances, and puts
         out the input: ``controller([*y, *r])``. "caller" leaves it to your code, and every file
-        says so. A problem with estimated disturbances is refused without.
+        says so. A problem with estimated states or disturbances is refused without.
 
     Returns
     -------

@@ -211,7 +211,8 @@ class Improvement:
         if "Ctrl-C" in self.note:
             return "keep the MPC, or start again"
         if "max_steps" in self.note:
-            return "give more max_steps, or keep the MPC"
+            end = "end episodes by a TimeLimit, " * ("TimeLimit" in self.note)
+            return f"{end}give more max_steps, or keep the MPC"
         if self.where == "the twin":
             return "keep the MPC; log more episodes, of other starts and set-points, and fit anew"
         more = [f"{k}={2 * v}" for k, v in self.settings.items() if k in ("n_starts", "updates")]
@@ -607,7 +608,8 @@ class _Work:
             note = f"max_steps = {max_steps:,} are too few to go on, {simulator.steps:,} are taken"
             needed = simulator.needed(least + self.rounds * FIRST_LOOK)
             counts = f"; at least {simulator.needed(least):,}, for all rounds about {needed:,}"
-            note += f"{counts} are needed" if needed else ": an episode takes more"
+            endless = ": an episode takes more, or has no end: wrap the env in a TimeLimit"
+            note += f"{counts} are needed" if needed else endless
         finally:
             simulator.close()
         change = self.checks[-1].change if accepted else 0.0

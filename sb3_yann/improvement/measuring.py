@@ -359,7 +359,8 @@ class _Search:
             if not hasattr(self, "base"):
                 raise ValueError(
                     f"max_steps = {self.simulator.max_steps:,} are too few for "
-                    f"{len(self.seeds)} episodes of the MPC."
+                    f"{len(self.seeds)} episodes of the MPC. Where these have no end, wrap the env "
+                    "in a TimeLimit."
                 ) from None
             note = f"max_steps = {self.simulator.max_steps:,} were too few to go on."
         except KeyboardInterrupt:

@@ -181,7 +181,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         if algorithm is not None and algorithm.get_env() is not None:
             require_state_shown(algorithm.get_env(), self.observation_given)
             if not self.observation_given:
-                require_theta_order(algorithm.get_env(), self.problem.layout)
+                require_theta_order(algorithm.get_env(), self.problem)
 
     def _meets_another_env(self) -> None:
         """Do the same where `set_env` has given the algorithm another env since.

@@ -479,14 +479,17 @@ def improve_part(subject: Subject) -> Part:
         "the simulator to compare. What was confirmed there holds for the plant as far as the "
         "twin or the simulator is like it."
     )
+    candidates = [
+        tag("h3", "Every candidate"),
+        paragraph("What it changes of the MPC's mean cost of its starts; minus is cheaper."),
+        table(["", "starts", "change", "worst start", "verdict"], tried),
+    ]
     content = [
         paragraph(finding.text),
         paragraph(how),
         table(["", "in", "episodes", "candidates"], rows),
         *(lines(f"{k}. {each.report()}") for k, each in enumerate(found, start=1)),
-        tag("h3", "Every candidate"),
-        paragraph("What it changes of the MPC's mean cost of its starts; minus is cheaper."),
-        table(["", "starts", "change", "worst start", "verdict"], tried),
+        *(candidates if tried else []),
         tag("h3", "Settings of the last improvement"),
         table(["setting", "value", "what it is"], settings),
     ]

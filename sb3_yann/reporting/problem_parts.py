@@ -76,7 +76,8 @@ def plant_part(subject: Subject) -> Part:
             lines(model.report()),
         ]
     )
-    found = (Finding("note", missing_observer(model)),) if model.estimated else ()
+    lacks = missing_observer(model)
+    found = (Finding("note", lacks),) if lacks else ()
     return Part("Plant and problem", content, found)
 
 

@@ -99,7 +99,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 "pass observation=AffineObservation(matrix, offset)."
             )
         if observation is None:
-            require_theta_order(env, problem.layout)
+            require_theta_order(env, problem)
         self.problem = problem
         self.violation_cost = check_number("violation_cost", violation_cost)
         self.bounds = Bounds.of(problem)

@@ -212,6 +212,7 @@ def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
     assert outputs[-1] == pytest.approx(float(controller.evaluate(obs[9])[0]))
 
 
+@pytest.mark.filterwarnings("ignore:The plant's present input")
 def test_rates_hold_whatever_happens(tmp_path):
     mpc = policy_of("references and rates").problem
     controller = controller_of(policy_of("references and rates"), tmp_path)

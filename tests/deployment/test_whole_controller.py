@@ -313,14 +313,30 @@ def test_what_estimates_is_refused_where_it_does_not_fit(tmp_path) -> None:
     mpc, observer = problem()
     path = tmp_path / "plant.npz"
     other = StateEstimator(LinearModel(A, 2 * B, 1.0, X_SS, U_SS, C=C))
+    plain = LinearMPC(
+        LinearModel(A, B, 1.0, X_SS, U_SS, C=C), Q=np.eye(3), R=np.eye(2), horizon=1,
+        theta_min=X_SS - 20, theta_max=X_SS + 20, u_min=U_SS - 2, u_max=U_SS + 2,
+    )  # fmt: skip
     for given, options, message in (
         (mpc, {"estimator": other}, "of another model than the problem"),
         (mpc, {"estimator": "me"}, "must be a StateEstimator"),
         (mpc.explicit(), {"estimator": observer}, "do not say where"),
         (mpc, {}, "estimator=observer"),
+        (plain, {}, "the states are estimated.* estimator=observer"),
         (mpc, {"estimator": observer, "format": "onnx"}, "no memory"),
         (mpc, {"estimator": observer, "checks": Checks(missing=[1, 2])}, "one number, or 5"),
     ):
         with pytest.raises(ValueError, match=message):
             export(given, path, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_limits_and_a_present_input_in_other_units_are_told(tmp_path) -> None:
+    mpc, observer = problem()
+    swapped = Checks([290, 40, 40, 290, 0], [310, 60, 60, 310, 2])
+    with pytest.warns(UserWarning, match="leave out the operating point") as told:
+        export(mpc, tmp_path / "plant.npz", estimator=observer, checks=swapped)
+    assert [str(each.message).split(" leave")[0][-4:] for each in told] == ["x[0]", "x[2]"]
+    controller = Controller.load(tmp_path / "plant.npz")
+    with pytest.warns(UserWarning, match=r"300 of u\[0\], is far beyond its bounds, 1 to 5"):
+        controller([50, 300, 50, 300, 1], manual=[300, 7])

@@ -378,6 +378,7 @@ def test_other_units_are_refused(shows, takes, message) -> None:
 
 
 @pytest.mark.parametrize("low", [-1, 353])
+@pytest.mark.filterwarnings("ignore:SetPoint shows")
 def test_set_points_that_are_not_the_problem_s_are_named(low) -> None:
     plant = SetPoint(units.plant("plant", "plant"), low, low + 2)
     with pytest.raises(

@@ -546,6 +546,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
         ),
         ("the twin", "2 starts with violations", "log more episodes, of other starts"),
         ("the simulator", "max_steps = 9 are too few to go on", "give more max_steps, or keep"),
+        ("the simulator", "max_steps = 9: wrap the env in a TimeLimit", "end episodes by a Time"),
         ("the simulator", "2 starts with violations", "improve(..., n_starts=80, updates=8000)"),
     ],
 )

@@ -159,8 +159,11 @@ def test_set_points_in_deviations_are_named() -> None:
     right = SetPoint(plant, 345, 355)
     build(right, mpc=mpc).predict(right.reset(seed=0)[0])
     wrong = SetPoint(plant, -5, 5)
+    beyond = "SetPoint shows set-point of temperature from -5 to 5, and .* beyond 345 to 355 as at"
+    with pytest.warns(UserWarning, match=beyond):
+        model = build(wrong, mpc=mpc)
     with pytest.warns(UserWarning, match="set-point of temperature = .* this is a deviation"):
-        build(wrong, mpc=mpc).predict(wrong.reset(seed=0)[0])
+        model.predict(wrong.reset(seed=0)[0])
 
 
 def test_a_plant_that_lacks_a_part_of_theta_is_told_of_the_wrappers() -> None:

@@ -265,6 +265,8 @@ def identify_outputs(
     errors = np.zeros((3, *B.shape))
     if np.array_equal(model.C, np.eye(q, n)):  # the first states are the outputs
         errors[:, :q] = found.gain_errors[..., :m] * scale[:q, None] / scale[q : q + m]
+    state_names = _state_names(log, model, found.delays)
+    units = zip([*log.state_names, *log.input_names], log.units, strict=False)
     whole = LinearModel(
         A,
         B,
@@ -275,9 +277,9 @@ def identify_outputs(
         system.d_ss if d else None,
         notes=[*system.notes, *_notes(log, found, plain, step, model.noise), *_rates(log, every)],
         gains=Gains.of(A, B, found.integrators, errors),
-        state_names=_state_names(log, model, found.delays),
+        state_names=state_names,
         input_names=log.input_names,
-        units=dict(zip(log.input_names, log.units[q : q + m], strict=True)) if log.units else (),
+        units={name: unit for name, unit in units if name in (*state_names, *log.input_names)},
         C=C,
         time_unit=log.time_unit,
     )

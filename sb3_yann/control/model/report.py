@@ -252,9 +252,9 @@ def _sampling(model: LinearSystem) -> list[str]:
         ]
     if min(moving, default=np.inf) < SLOW_SAMPLING or period < 6:
         lines.append(
-            "  Slow: a mode dies out or swings round within a few samples, where no input can act "
-            "on it. Sample faster, or leave it out of the model. Is dt in the unit of time of "
-            "the equations, or of the log?"
+            "  Slow: the fastest mode decays, or swings round, within so few samples that inputs "
+            "come too late for it. Sample faster, or leave it out of the model. Is dt in the unit "
+            "of time of the equations, or of the log?"
         )
     elif min(moving, default=0.0) > FAST_SAMPLING and period > 2 * np.pi * FAST_SAMPLING:
         lines.append(

@@ -238,7 +238,7 @@ class LinearMPC(MPCProblem):
         }
         _warn_of_misread_bounds(model, ranges, layout.has_constants)
         _warn_of_unused_softness(soft.x, x, states)
-        _warn_of_unreachable(tracking, x)
+        _warn_of_unreachable(tracking, x, states)
         _warn_of_drift(model, *states)
         checked = (
             model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
@@ -637,20 +637,21 @@ def _warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> No
         )
 
 
-def _warn_of_unreachable(tracking: Tracking, bounds: Bounds) -> None:
-    """Warn where the bounds of the states leave a tracked output no set-point of its range."""
+def _warn_of_unreachable(tracking: Tracking, bounds: Bounds, box: Bounds) -> None:
+    """Warn where bounds and box of the states leave a tracked output no set-point of its range."""
     C = tracking.C[..., None]
+    both = np.maximum(bounds[0], box[0]), np.minimum(bounds[1], box[1])
     with np.errstate(invalid="ignore"):  # 0 times an open side
-        ends = np.where(C != 0, C * np.stack(bounds, axis=-1), 0.0)
+        ends = np.where(C != 0, C * np.stack(both, axis=-1), 0.0)
     low = ends.min(axis=-1).sum(axis=-1)
     high = ends.max(axis=-1).sum(axis=-1)
     beyond = np.flatnonzero((tracking.r_min > high) | (tracking.r_max < low))
     if len(beyond):
         i = beyond[0]
         warn(
-            f"x_min and x_max keep r[{i}] between {low[i]:g} and {high[i]:g}, and its set-points "
-            f"are {tracking.r_min[i]:g} to {tracking.r_max[i]:g}: none can be reached. Have they "
-            "the same units?"
+            f"x_min and x_max, or theta_min and theta_max, keep r[{i}] between {low[i]:g} and "
+            f"{high[i]:g}, and its set-points are {tracking.r_min[i]:g} to {tracking.r_max[i]:g}: "
+            "none can be reached. Have they the same units, and the same order?"
         )
 
 

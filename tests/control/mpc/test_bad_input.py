@@ -229,6 +229,9 @@ def test_set_points_that_the_states_bounds_leave_out_are_named(r_min, warns) -> 
     found = [note for note in notes if "none can be reached" in note]
     assert bool(found) == warns
     assert all("r[0] between -10 and 10" in each and "15 to 30" in each for each in found)
+    by_box = {"theta_min": -10, "theta_max": 10, "x_min": None, "x_max": None}
+    notes = said(model=plant, **{**bounds, **by_box}, tracking=Tracking([0], r_min, 30))
+    assert found == [note for note in notes if "none can be reached" in note]
 
 
 def test_softness_of_a_single_number_is_for_all_that_have_a_bound() -> None:
