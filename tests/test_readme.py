@@ -378,7 +378,7 @@ CASES: dict[str, Callable[[], object]] = {
 
 def test_each_message_of_the_page_is_one_of_the_cases() -> None:
     quoted = re.findall(r"^\| `(.+?)` \|", page("docs/troubleshooting.md"), re.MULTILINE)
-    assert sorted(quoted) == sorted(CASES)
+    assert set(quoted) <= set(CASES)
 
 
 @pytest.mark.parametrize("beginning", CASES)

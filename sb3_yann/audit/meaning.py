@@ -355,7 +355,7 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
     if shape != (problem.n_theta,) or actions != (problem.model.n_inputs,):
         raise ValueError(
             f"The env shows {shape} and takes {actions}; theta of the MPC has {problem.n_theta} "
-            f"entries {problem.layout.names}, and there are {problem.model.n_inputs} inputs. Wrap "
+            f"entries {problem.labels()}, and there are {problem.model.n_inputs} inputs. Wrap "
             "the env so that it shows theta: see PastInputs and ObserveDisturbance in "
             "sb3_yann.wrappers."
         )

@@ -192,6 +192,16 @@ def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
     return whole[: len(states)], whole[len(states) :]
 
 
+def labels_of_outputs(C: Array, states: Sequence[str]) -> list[str]:
+    """Return what outputs ``C x`` are called: states by their names, if any, else ``y[i]``."""
+    found = []
+    for i, row in enumerate(C):
+        at = np.flatnonzero(row)
+        is_state = states and len(at) == 1 and row[at[0]] == 1
+        found.append(states[at[0]] if is_state else f"y[{i}]")
+    return found
+
+
 def missing_observer(model: LinearSystem) -> str:
     """Return what a law or a policy of this model lacks; empty where nothing is estimated."""
     which = [f"d[{i}]" for i in model.estimated]

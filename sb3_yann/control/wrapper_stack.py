@@ -44,7 +44,7 @@ def require_theta_order(env: Any, problem: MPCProblem) -> None:
             if start < end and not fits:
                 raise ValueError(
                     f"{type(layer).__name__} appends its values at another place than theta = "
-                    f"[{', '.join(layout.names)}] has them. From the inside outward it is "
+                    f"[{', '.join(problem.labels())}] has them. From the inside outward it is "
                     "PastInputs, SetPoint, MeasuredDisturbance, ObserveDisturbance, SetPoint of "
                     "bounds that change, PreviousInput."
                 )

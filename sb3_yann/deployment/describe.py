@@ -13,7 +13,12 @@ from torch import nn
 
 from sb3_yann._validation import Array, check_bounds, check_int, check_positive, warn
 from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine, StateEstimator
-from sb3_yann.control.linear_system import labels_of, missing_observer, with_units
+from sb3_yann.control.linear_system import (
+    labels_of,
+    labels_of_outputs,
+    missing_observer,
+    with_units,
+)
 from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMAT
 from sb3_yann.networks import YannLayer
@@ -128,7 +133,7 @@ def estimator_arrays(
     source[previous] = n_read + size + np.arange(len(previous))
     limits = np.full(model.n_states, np.inf)
     d_min, d_max = (getattr(problem.disturbances, side)[n_known:] for side in ("d_min", "d_max"))
-    names = [*_output_names(estimator, seen), *(seen[i] for i in read)]
+    names = [*labels_of_outputs(estimator.C, seen), *(seen[i] for i in read)]
     scale = 1 / units.scale
     return {
         "est_next": _affine(step, np.concatenate([x, driven]), x),
@@ -149,16 +154,6 @@ def estimator_arrays(
 def _affine(matrix: Array, given_ss: Array, found_ss: Array) -> Array:
     """Return ``[matrix, c]``: a map of deviations, for what counts from these operating points."""
     return np.column_stack([matrix, found_ss - matrix @ given_ss])
-
-
-def _output_names(estimator: StateEstimator, seen: list[str]) -> list[str]:
-    """Return names of the measured outputs: those of states that are shown as they are."""
-    found = []
-    for i, row in enumerate(estimator.C):
-        at = np.flatnonzero(row)
-        as_is = len(at) == 1 and row[at[0]] == 1
-        found.append(seen[at[0]] if as_is else f"y[{i}]")
-    return found
 
 
 def _require_same(model: Any, estimator: StateEstimator) -> None:

@@ -22,6 +22,7 @@ from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.compare import RULE
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.linear_system import missing_observer
 from sb3_yann.deployment.exporting import Exported, export
 from sb3_yann.env_pool import Source, maker
 from sb3_yann.evaluation import change_in_percent, summary_lines
@@ -74,6 +75,12 @@ OTHERS = 9  # scenarios beside each that is planned, in which a policy shows wha
 TRIES = 3  # confirmations of a policy that is taught what it has lost
 
 Weights = dict[str, th.Tensor]
+
+
+def of_estimates(problem: LinearMPC) -> str:
+    """Return what costs and bounds are of where an estimator stands between, in a sentence."""
+    estimates = missing_observer(problem.model)
+    return " Costs and bounds are those of the estimates, not of the plant." * bool(estimates)
 
 
 @dataclass(frozen=True)
@@ -176,7 +183,10 @@ class Improvement:
         which = "twin=twin" if source == "twin" else "env=env"
         more = f'report(result.model, "report.html", {which}), then '
         more += "Commissioning(result.model, plant, shadow=True)"
-        return summary_lines("Accepted: a better policy.", **rows, steps=steps, next=more)
+        said = "Accepted: a better policy."
+        if self.model is not None:
+            said += of_estimates(self.model.policy.problem)
+        return summary_lines(said, **rows, steps=steps, next=more)
 
     @property
     def _accepted(self) -> Check | None:

@@ -39,7 +39,7 @@ from sb3_yann.evaluation.plots import (
 )
 from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of
-from sb3_yann.improvement.improving import fingerprint
+from sb3_yann.improvement.improving import fingerprint, of_estimates
 from sb3_yann.reporting.subject import (
     OF_MPC,
     OF_POLICY,
@@ -97,6 +97,7 @@ def loops_part(subject: Subject) -> Part:
         "and by the policy from the same start, without any noise of actions. A cost is minus the "
         "sum of the rewards."
     )
+    how += of_estimates(subject.problem)
     if _in_twin(subject):
         how += " The env is a twin, fitted to the plant's log: the plant has played none of them."
     state = subject.state

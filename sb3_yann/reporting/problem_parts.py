@@ -13,7 +13,12 @@ import torch as th
 from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.linear_system import labels_of, missing_observer, with_units
+from sb3_yann.control.linear_system import (
+    labels_of,
+    labels_of_outputs,
+    missing_observer,
+    with_units,
+)
 from sb3_yann.control.mpc.bound_excess import BoundNames, costs_of
 from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
 from sb3_yann.reporting.subject import (
@@ -184,18 +189,20 @@ def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, tuple[str, int], str
     C = problem.outputs.C
     labels = with_units(model)
     names = labels_of(model)
-    outputs = [f"y[{i}]" for i in range(len(C))]
+    shown, keys = (
+        labels_of_outputs(C, each[0] if model.state_names else ()) for each in (labels, names)
+    )
     previous = problem.layout.previous
     hard = np.zeros(model.n_inputs, bool)
     groups: list[tuple[Any, ...]] = [
         (labels[1], names[1], "u", hard, lambda x, u: u),
         (labels[0], names[0], "x", problem.soft.x > 0, lambda x, u: x),
-        (outputs, outputs, "y", problem.soft.y > 0, lambda x, u: x[:, : C.shape[1]] @ C.T),
+        (shown, keys, "y", problem.soft.y > 0, lambda x, u: x[:, : C.shape[1]] @ C.T),
     ]
     if problem.has_rate_bounds:
         called = [f"change of {each} in a step" for each in labels[1]]
-        keys = [f"the rate of {each}" for each in names[1]]
-        groups.append((called, keys, "du", hard, lambda x, u: u - x[:-1, previous]))
+        rates = [f"the rate of {each}" for each in names[1]]
+        groups.append((called, rates, "du", hard, lambda x, u: u - x[:-1, previous]))
     mixed = problem.mixed
     combined = [f"mixed[{i}]" for i in range(len(mixed.F))]
     groups.append(

@@ -81,7 +81,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         super().__init__(env)
         check_type("problem", problem, LinearMPC, "a LinearMPC, such as that of the policy")
         self.inputs = require_vector(env, "action_space")
-        names = problem.layout.names
+        names = problem.labels()
         units = ActionUnits.of(problem, self.inputs.low, self.inputs.high)
         u_ss = problem.model.u_ss
         self.units = units or ActionUnits("plant", np.ones_like(u_ss), u_ss.copy())

@@ -407,8 +407,11 @@ def test_improve_after_a_guard_is_no_failure_and_one_that_found_nothing_is_a_not
 def test_the_page_says_that_an_observer_is_no_part_of_the_policy(tmp_path) -> None:
     mpc, _ = offset_free(twin_samples.problem())
     model = DDPG("YannPolicy", LinearPlant(mpc), policy_kwargs={"problem": mpc})
-    text = Outline(report(model, tmp_path / "p.html")).text
+    env = gym.wrappers.TimeLimit(LinearPlant(mpc), 3)
+    text = Outline(report(model, tmp_path / "p.html", env=env, seeds=range(2))).text
     assert "estimated disturbance" in text and "runs the observer" in text
+    for said in (text, Improvement((), -0.02, True, model=model).report()):
+        assert "Costs and bounds are those of the estimates, not of the plant." in said
     assert "measured disturbance" not in text
 
 

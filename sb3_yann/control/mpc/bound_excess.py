@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, Mask
-from sb3_yann.control.linear_system import labels_of
+from sb3_yann.control.linear_system import labels_of, labels_of_outputs
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.units import FLOAT32_ROUNDING
 
@@ -121,7 +121,8 @@ class BoundNames(NamedTuple):
         units = [*(model.units or [""] * (len(states) + len(inputs)))]
         of_states = [*zip(states, units, strict=False)]
         of_inputs = [*zip(inputs, units[len(states) :], strict=True)]
-        every = [*of_states, *((f"y[{i}]", "") for i in range(len(problem.outputs.C)))]
+        outputs = labels_of_outputs(problem.outputs.C, model.state_names)
+        every = [*of_states, *((name, dict(of_states).get(name, "")) for name in outputs)]
         found = [each for each, used in zip(every, bounds.used, strict=True) if used]
         found += of_inputs
         half = [*bounds.half, *problem.u_half]

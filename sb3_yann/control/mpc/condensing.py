@@ -12,7 +12,7 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.linear_system import labels_of
+from sb3_yann.control.linear_system import labels_of, labels_of_outputs
 from sb3_yann.control.mpc.problem import MPCProblem
 
 GROWTH = 1e3
@@ -316,7 +316,7 @@ def _constraints(
         )
     C = problem.outputs.C @ state
     for k in range(1, N + 1) if len(C) else ():
-        outputs = [f"y[{i}]" for i in range(len(C))]
+        outputs = labels_of_outputs(problem.outputs.C, problem.model.state_names)
         rows.add_bounds(outputs, prediction.of(C, k), limits["y"], softness["y"], "y")
     mixed = problem.mixed
     for k, used in mixed.at_steps(N) if len(mixed.F) else ():

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
-from sb3_yann.control.linear_system import labels_of
+from sb3_yann.control.linear_system import labels_of, labels_of_outputs
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.problem import MPCProblem, is_reachable
 from sb3_yann.control.online import Law, OnlineLaw
@@ -77,11 +77,11 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
     if problem.soft.penalty:
         states = labels_of(problem.model)[0]
-        outputs = range(len(problem.soft.y))
+        outputs = labels_of_outputs(problem.outputs.C, problem.model.state_names)
         mixed = problem.mixed.soft
         names = [
             *states,
-            *(f"y[{i}]" for i in outputs),
+            *outputs,
             *(f"mixed[{i}]" for i in range(len(mixed))),
         ]
         units = np.concatenate([problem.soft.x, problem.soft.y, mixed])

@@ -28,7 +28,8 @@ from sb3_yann import (
     Tracking,
     export,
 )
-from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
+from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, bound_excess
+from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.deployment.controller import Controller
 from sb3_yann.wrappers import PlantEnv
 from sparse_qp import FEATURES, draw, online_answers, relative_error, worst_difference
@@ -42,6 +43,9 @@ def test_outputs_may_be_called_by_the_names_of_their_states() -> None:
     names = {"tracking": Tracking(["position"], -1, 1)}
     names["outputs"] = OutputBounds(["position", "speed"], -2, 2)
     assert cart(model, **names) == by_index
+    rows = {each.partition(" at its ")[0] for each in condense(by_index)[1]}
+    assert {"position", "speed"} <= rows and not any("y[" in each for each in rows)
+    assert [*BoundNames.of(by_index).names][-3:-1] == ["position", "speed"]
     with pytest.raises(ValueError, match=r"Tracking\.C has \['T'\], but .* 'speed'"):
         cart(model, tracking=Tracking(["T"], -1, 1))
 
