@@ -42,6 +42,7 @@ DESCENTS = 10  # steps down the costs of a model's episodes, after the fits
 DESCENT_ROWS = 48_000  # steps of episodes whose slopes each of these follows, about
 MOVE = 0.1  # of an action in the first of these, root mean square
 LONGER = 1.5  # times the last one's is the next, where the policy got better; else half of it
+SHORTEST_MOVE = 0.02  # so small a one ends the descent
 FARTHEST = 3.0  # moves of an action, in times their root mean square
 STEEPEST = 10.0  # slopes of an episode, in times the median's, at most
 NEARLY = 0.5
@@ -311,7 +312,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
         else:
             layer.load_state_dict(present)
             size /= 2
-        if k == DESCENTS:
+        if k == DESCENTS or size < SHORTEST_MOVE:
             break
         if objects:
             price *= 2
