@@ -214,12 +214,15 @@ def test_the_results_it_quotes_are_those_of_the_report() -> None:
     rows = [[cell.strip(" *") for cell in row.split("|")] for row in quoted.strip().splitlines()]
     plants = [row for row in rows if len(row) > 6 and row[2][:1].isdigit()]
     assert len(plants) == 4
-    for _, plant, optimum, mpc, ours, _, ddpg, _ in plants:
-        of_plant = report.partition(f"### {plant}\n")[2].partition("\n###")[0]
+    for _, plant, optimum, mpc, observer, ours_and_worst, ddpg, _ in plants:
+        ours = ours_and_worst.partition("**,")[0]
+        of_plant = report.partition(f"### {plant}\n")[2].partition("\n##")[0]
         explored = rf"\| \*\*YANN-RL, a simulator explored\*\* \| \d+ \| {re.escape(ours)} \|"
         assert re.search(explored, of_plant)
-        for learner, cost in (("optimum", optimum), ("MPC", mpc), ("DDPG", ddpg)):
-            assert not cost or re.search(rf"\| {learner} \| \d+ \| {re.escape(cost)} \|", of_plant)
+        others = {"optimum": optimum, "MPC": mpc, "MPC with observer": observer, "DDPG": ddpg}
+        for learner, cost in others.items():
+            row = rf"\| {learner} \| \d+ \| {re.escape(cost)} \|"
+            assert re.search(row, of_plant) if cost != "—" else f"| {learner} |" not in of_plant
 
 
 DOCS = ROOT / "docs"
