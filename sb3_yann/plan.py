@@ -398,7 +398,7 @@ def _backward(
 def slopes_of_inputs(
     plant: TwinPlant, task: Task, act: Feedback, states: Array, inputs: Array
 ) -> Array:
-    """Return the derivatives (T, k, m) of episodes' costs by inputs that a feedback answers.
+    """Return the derivatives (T, k, m) of a task's costs by inputs that a feedback answers.
 
     ``states`` (T + 1, k, size) are the twin's rows of k episodes, ``inputs`` (T, k, m) what the
     feedback put in. The costates run backward, as in Pontryagin's principle, and slopes of the
