@@ -47,6 +47,7 @@ from sb3_yann.reporting.subject import (
     Html,
     Part,
     Subject,
+    is_rewarded,
     join,
     left_out,
     lines,
@@ -94,9 +95,11 @@ def loops_part(subject: Subject) -> Part:
     seeds = f"{first} to {last}" if is_range else ", ".join(map(str, subject.seeds))
     how = (
         f"{count} episodes of {subject.env_name}, seeds {seeds}, each played by the MPC "
-        "and by the policy from the same start, without any noise of actions. A cost is minus the "
-        "sum of the rewards."
+        "and by the policy from the same start, without any noise of actions. A cost is "
     )
+    of_rewards = "minus the sum of the rewards."
+    of_stages = "the sum of the MPC's stage cost: the env gives no reward."
+    how += of_rewards if is_rewarded(loops) else of_stages
     how += of_estimates(subject.problem)
     if _in_twin(subject):
         how += " The env is a twin, fitted to the plant's log: the plant has played none of them."
@@ -184,12 +187,12 @@ def statistics_part(subject: Subject) -> Part:
     if np.all(np.abs(change) <= FLOAT32_ROUNDING * scale):
         text = "From these starts the policy costs what the MPC costs."
     elif count > 1:
-        width = 100 * Difference.relative(change, mpc.costs).room(0.025)
+        width = 100 * Difference.relative(change, mpc.costs).room(RULE.significance)
         passed = True if mean + width < 0 else False if mean - width > 0 else None
         text = (
             f"On average the cost {'in the twin ' * _in_twin(subject)}changes by {mean:+.2f} %; "
             "the change lies between "
-            f"{mean - width:+.2f} and {mean + width:+.2f} % with a confidence of 95 %, by "
+            f"{mean - width:+.2f} and {mean + width:+.2f} % with a confidence of 90 %, by "
             f"Student's interval of {count} pairs, and of the MPC's mean."
         )
         if passed is None:

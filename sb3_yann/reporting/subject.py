@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._validation import Array, is_text
 from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.mpc.bound_excess import excess_of_episodes
+from sb3_yann.control.mpc.bound_excess import costs_of, excess_of_episodes
 from sb3_yann.control.online import Law
 from sb3_yann.control.wrapper_stack import require_state_shown
 from sb3_yann.env_pool import Source, name_of, one_env
@@ -227,6 +227,11 @@ def left_out(title: str, note: str = "") -> Part:
     return Part(title, join([]), (Finding("note", note),) if note else ())
 
 
+def is_rewarded(loops: Mapping[str, Trajectories]) -> bool:
+    """Return whether an env gives any reward but zero: if none, the stage cost counts."""
+    return any(each.any() for played in loops.values() for each in played.rewards)
+
+
 def _as_controller(act: Callable[[Any], Any]) -> Controller:
     return lambda t, observations, rows: act(observations)
 
@@ -319,13 +324,17 @@ class Subject:
         seeds = self.seeds[: None if states is None else len(states)]
         for name, act in {OF_MPC: self.act_as_mpc, OF_POLICY: self.act_as_policy}.items():
             played = rollout(_as_controller(act), self.env, seeds, states)
-            found[name] = replace(
+            played = replace(
                 played,
                 observations=tuple(map(self._theta, played.observations)),
                 actions=tuple(map(self.policy.inputs, played.actions)),
             )
-            excess = excess_of_episodes(self.problem, found[name].pairs)
-            found[name] = replace(found[name], excess=excess)
+            excess = excess_of_episodes(self.problem, played.pairs)
+            found[name] = replace(played, excess=excess)
+        if not is_rewarded(found):
+            for name, played in found.items():
+                costs = [costs_of(self.problem, *pair)[0] for pair in played.pairs]
+                found[name] = replace(played, costs=np.array(costs))
         return found
 
     @property

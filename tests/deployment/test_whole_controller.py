@@ -194,6 +194,7 @@ def test_steps_with_faults_are_the_controllers(form, name, tmp_path) -> None:
             for case in [
                 ("problem", False, False),
                 ("problem", True, False),
+                ("online", False, False),
                 ("policy", False, False),
                 ("policy", True, False),
                 ("policy", False, True),
@@ -205,8 +206,12 @@ def test_steps_with_faults_are_the_controllers(form, name, tmp_path) -> None:
     ],
 )
 def test_a_closed_loop_is_that_of_python(form, kind, rates, extra, tmp_path) -> None:
-    mpc, observer = problem(rates, extra)
-    given = mpc if kind == "problem" else policy(rates, extra)
+    given, observer = problem(rates, extra)
+    if kind == "online":
+        given, observer = problem.__wrapped__()
+        given.law("online")
+    elif kind == "policy":
+        given = policy(rates, extra)
     coded = form(given, tmp_path, estimator=observer, checks=WITH_EXTRA if extra else CHECKS)
     steps = noisy_steps(1000 if form is InC else 400)
     wanted, said = loop(InPython(coded.controller), steps, extra)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import Wrapper
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import TimeLimit, TransformReward
 from scipy import stats
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -268,10 +268,22 @@ def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
     of_mean = ratio * (
         before.costs - before.costs.mean()
     )  # as the MPC's mean of these starts moves
-    low, high = stats.ttest_1samp(change - of_mean, 0).confidence_interval(0.95)
+    low, high = stats.ttest_1samp(change - of_mean, 0).confidence_interval(0.9)
     assert f"between {scale * low:+.2f} and {scale * high:+.2f} %" in text
     assert "0 of 8 episodes violate a limit (0 with the MPC)" in text
     assert f"fewer than {100 * (1 - 0.05 ** (1 / 8)):.1f} % of such starts do" in text
+
+
+def test_where_an_env_gives_no_reward_the_stage_cost_counts() -> None:
+    model = moved(0.1)
+    subject = subject_of(model, env=lambda: TransformReward(Slide(), lambda reward: 0.0))
+    text = unescape(str(evidence_parts.loops_part(subject).content))
+    assert "the sum of the MPC's stage cost: the env gives no reward" in text
+    cost = model.policy.problem.stage_cost
+    for who, act in (("MPC", guard_samples.LAW), ("policy", model)):
+        played = evaluate(act, Slide, subject.seeds)
+        wanted = [cost(x[:-1], u).sum() for x, u in played.pairs]
+        np.testing.assert_allclose(subject.loops[who].costs, wanted, rtol=1e-5)
 
 
 @pytest.mark.parametrize("takes", [True, False])
