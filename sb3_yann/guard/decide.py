@@ -132,8 +132,7 @@ def decide_at_end(
     scores, verdict = _confirm(trial, tried, settings, level_of_look(rule.significance, 1))
     evidence = replace(evidence, next_seed=seeds.next)
     if scores is not None and verdict.accepted:
-        lost = np.flatnonzero(trial.starts.lost(scores))
-        return replace(evidence, lost=tuple(trial.starts.seeds[i] for i in lost)), None
+        return replace(evidence, confirmed=(trial.starts, scores)), None
 
     cost = evidence.mean_cost(evidence.scores)
     played = evidence.n_played(evidence.scores)
@@ -147,8 +146,9 @@ def decide_at_end(
             continue
         part = known.with_visited(policy, its_scores)
         level = level_of_look(rule.significance, number)
-        if _confirm(trial, part.accepted, settings, level)[1].accepted:
-            after = part.with_passed(part.accepted)
+        scores, found = _confirm(trial, part.accepted, settings, level)
+        if scores is not None and found.accepted:
+            after = replace(part.with_passed(part.accepted), confirmed=(trial.starts, scores))
             break
     after = replace(after, next_seed=seeds.next)
     regions = _accepted_regions(evidence.mpc, tried, after.accepted)
@@ -301,7 +301,9 @@ def _with_hard_starts(
     Others take the place of the new ones.
     """
     hard = np.zeros(1, dtype=np.int64) if scores is None else new.hardest(scores)
-    return replace(evidence, starts=evidence.starts.with_hard(new, hard), new=None), hard
+    return replace(
+        evidence, starts=evidence.starts.with_hard(new, hard), new=None, confirmed=None
+    ), hard
 
 
 def _after_loss(evidence: Evidence, new: Starts, scores: Scores | None, play: Play) -> Evidence:

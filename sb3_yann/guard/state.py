@@ -37,8 +37,8 @@ class Evidence:
     ``accepted`` is the policy accepted last, ``mpc`` has the weights that it goes on to learn from.
     ``scores`` are the accepted policy's on as many of the known ``starts`` as it has played, of
     which hard ones come first. ``passed`` are accepted checkpoints that new starts have confirmed,
-    the latest last; ``rejections`` come in a row. ``lost`` are seeds of final starts that the
-    accepted policy has lost, which the rule allows. Policies are confirmed on ``new`` starts until
+    the latest last; ``rejections`` come in a row. ``confirmed`` are the final starts that the
+    accepted policy has passed, and its scores there. Policies are confirmed on ``new`` starts until
     one loses there; the next one has the seed ``next_seed``.
     """
 
@@ -49,7 +49,7 @@ class Evidence:
     next_seed: int
     passed: tuple[ActorCheckpoint, ...] = ()
     rejections: int = 0
-    lost: tuple[int, ...] = ()
+    confirmed: tuple[Starts, Scores] | None = None
     new: Starts | None = None
 
     def mean_cost(self, scores: Scores | None) -> float:
@@ -88,7 +88,7 @@ class Evidence:
         changed = self.accepted.changed_regions(candidate)
         if self.accepted.is_confined_as(candidate) and np.any(changed & ~visited):
             candidate = self.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
-        return replace(self, accepted=candidate, scores=scores, lost=())
+        return replace(self, accepted=candidate, scores=scores, confirmed=None)
 
     def earlier(self) -> Iterator[tuple[ActorCheckpoint, Scores]]:
         """Yield the accepted policy and earlier ones, the latest first, with their known scores."""
@@ -300,12 +300,15 @@ REFUSAL_ADVICE = {
 def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
     """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
     decisions = state.decisions
-    starts = state.evidence.starts
-    played = slice(starts.n_hard, len(state.evidence.scores.costs))
-    ours = state.evidence.scores.at(played)
+    evidence = state.evidence
+    starts, scores = evidence.confirmed or (evidence.starts, evidence.scores)
+    played = slice(starts.n_hard, len(scores.costs))
+    ours = scores.at(played)
     mpc = starts.mpc.at(played)
+    rows = paired_rows(ours.costs, mpc.costs)
+    rows["change"] += " from the final starts" * (evidence.confirmed is not None)
     verdict = "The policy accepted last is better than the MPC."
-    if state.accepted.has_networks_of(state.evidence.mpc):
+    if state.accepted.has_networks_of(evidence.mpc):
         verdict = "The policy accepted last is the MPC."
     elif not ours.costs.mean() < mpc.costs.mean() - 1e-3 * abs(mpc.costs.mean()):
         verdict = "The policy accepted last is not the MPC, and gains nothing."
@@ -316,10 +319,10 @@ def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
         )
     less = int(less_safe(ours.unsafe, mpc.unsafe, starts.tolerance.excess_room).any(axis=1).sum())
     violations = f"more than the MPC's from {less} of {len(ours.costs)} starts"
-    if lost := state.evidence.lost:
+    if evidence.confirmed and (lost := np.array(starts.seeds)[starts.lost(scores)].tolist()):
         violations += (
-            f"; of the final starts {len(lost)} cost more by more than the margin, which the rule "
-            f"allows: seeds {', '.join(map(str, lost[:10]))}{', ...' * (len(lost) > 10)}"
+            f"; {len(lost)} cost more by more than the margin, which the rule allows: seeds "
+            f"{', '.join(map(str, lost[:10]))}{', ...' * (len(lost) > 10)}"
         )
     counts = Counter(each.verdict for each in decisions)
     refused = [each.reason for each in decisions if each.verdict == "rejected"]
@@ -341,7 +344,7 @@ def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
         more = REFUSAL_ADVICE.get(kind, "")
     return summary_lines(
         verdict,
-        **paired_rows(ours.costs, mpc.costs),
+        **rows,
         violations=violations,
         steps=f"{steps:,} of the guard's simulator" if steps else "",
         candidates=candidates or "none was tried yet",

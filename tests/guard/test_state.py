@@ -68,12 +68,17 @@ def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
     for row, decision in zip(written, guard.decisions, strict=True):
         for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
             np.testing.assert_equal(float(row[name]), getattr(decision, name))
-    guard.state.evidence = dataclasses.replace(guard.state.evidence, lost=(7, 12))
+    starts = dataclasses.replace(guard.state.evidence.starts, seeds=(7, 12, 5), n_hard=0)
+    mpc = starts.mpc.at(slice(3))
+    ours = mpc._replace(costs=mpc.costs + np.array([9.0, 8.0, -50.0]))
+    confirmed = dataclasses.replace(starts, mpc=mpc), ours
+    guard.state.evidence = dataclasses.replace(guard.state.evidence, confirmed=confirmed)
     for words in (
         "The policy accepted last is better than the MPC.",
         "1 accepted, 1 in part, 1 refused, in 3 episodes",
         f"most often (1 times): {guard.decisions[1].reason}",
         f"  next         {REFUSAL_ADVICE['finite']}",
+        "over 3 episodes from the final starts",
         "2 cost more by more than the margin, which the rule allows: seeds 7, 12",
     ):
         assert words in guard.summary()
