@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import signal
 import threading
 import weakref
@@ -79,13 +80,17 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
                 f"The MPC's episode of the guard's env {name} from the seed {seed} costs {cost:g}. "
                 "Policies are compared by their costs: rewards must be finite numbers."
             )
-    again = player.episodes(player.mpc, seeds[:REPEATED])
+    with preserve_rng():  # an env that draws from these would else repeat itself by accident
+        random.random()
+        np.random.random()  # noqa: NPY002
+        again = player.episodes(player.mpc, seeds[:REPEATED])
     for seed, first, second in zip(seeds[:REPEATED], mpc.costs, again.costs, strict=False):
         if not np.isclose(first, second, rtol=1e-6, atol=0):
             raise ValueError(
                 f"The MPC played two episodes of the guard's env {name} from the seed {seed}, "
                 f"at costs of {first:g} and {second:g}. Episodes are compared in pairs: all that "
-                "is random in the env must come from self.np_random."
+                "is random in the env must come from self.np_random. If it draws from numpy's "
+                "global generator, wrap it in sb3_yann.wrappers.SeededGlobals."
             )
     if len(seeds) > 1 and _all_alike(mpc):
         warn(

@@ -41,6 +41,7 @@ from sb3_yann import (
     NoActionNoise,
     restore_accepted,
 )
+from sb3_yann.wrappers import SeededGlobals
 from weights import is_mpc, last_layer
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
@@ -143,6 +144,18 @@ def test_costs_of_the_mpc_that_differ_by_more_than_a_millionth_cannot_be_compare
         begun(partial(Wobbly, 1e-4))
     with pytest.raises(ValueError, match=r"from the seed 1000003 costs -inf"):
         begun(partial(Wobbly, lost=1_000_003))
+
+
+def test_an_env_that_draws_from_the_global_generator_is_named() -> None:
+    class Unseeded(Slide):
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed, options=options)
+            self.x = np.random.uniform(-4, 4, 1)  # noqa: NPY002
+            return self.x.astype(np.float32), {}
+
+    with pytest.raises(ValueError, match=r"played two episodes .*SeededGlobals"):
+        begun(Unseeded)
+    begun(lambda: SeededGlobals(Unseeded()))
 
 
 def test_a_fault_while_the_first_episodes_are_played_leaves_the_next_learn_a_clean_start() -> None:
