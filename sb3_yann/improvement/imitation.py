@@ -51,7 +51,8 @@ PRICE = 40.0
 MPC; twice as often after each look with an objection."""
 NEAR = 0.02
 """Share of what plans gain that a policy may lack when its fits end; a fit that brings less than
-half of it, to a policy that gains half of what they do, is the last."""
+half of it, to a policy that gains half of what they do, is the last; so is a step of the descent
+that brings less than half of it."""
 RETURNS = 1000  # states whose returns the critic is fitted to
 RETURN_STEPS = 100  # steps of a return; the MPC's value counts after them
 CRITIC_BATCH = 256  # rows in a step of Adam on the critic
@@ -303,6 +304,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
             most = rank
             saved = teacher.saved(played.costs, teacher.usual)
             best = copy.deepcopy(layer.state_dict())
+        slow = passes and 0 < rank[1] - score < NEAR / 2 * score
         if rank[1] > score:
             score = rank[1]
             objects = not passes
@@ -312,7 +314,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
         else:
             layer.load_state_dict(present)
             size /= 2
-        if k == DESCENTS or size < SHORTEST_MOVE:
+        if k == DESCENTS or size < SHORTEST_MOVE or slow:
             break
         if objects:
             price *= 2

@@ -616,8 +616,9 @@ class _Work:
                 accepted = self._confirm(simulator, model, best)
         except OutOfStepsError:
             note = f"max_steps = {max_steps:,} are too few to go on, {simulator.steps:,} are taken"
-            needed = simulator.needed(least + self.rounds * FIRST_LOOK)
-            counts = f"; at least {simulator.needed(least):,}, for all rounds about {needed:,}"
+            most = FIRST_LOOK * (self.rounds + 1) + 2 * LOOKS[-1] * (TRIES + 1)
+            needed = simulator.needed(most)
+            counts = f"; at best {simulator.needed(least):,}, for all rounds and tries {needed:,}"
             endless = ": an episode takes more, or has no end: wrap the env in a TimeLimit"
             note += f"{counts} are needed" if needed else endless
         finally:
