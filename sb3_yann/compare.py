@@ -392,10 +392,10 @@ def no_worse(
         hopeless |= not np.isfinite(excess[worst]) or tolerance.is_tail_lost(excess[n_hard:])
     elif is_above(costs, before) and before is not of_mpc:
         mean, other = format_distinct(costs.mean(), before.mean())
-        reason = f"mean cost {mean}, accepted {other}"
+        reason = f"mean cost {mean} from {len(costs)} starts, accepted {other}"
     elif above_mpc:  # or by as much as rounding in many acceptances adds up to
         mean, other = format_distinct(costs.mean(), of_mpc.mean())
-        reason = f"mean cost {mean}, MPC {other}"
+        reason = f"mean cost {mean} from {len(costs)} starts, MPC {other}"
     return Verdict(reason, breaks, above_mpc, is_sure, hopeless)
 
 

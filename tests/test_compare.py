@@ -96,9 +96,9 @@ def refusal(costs: Any, unsafe: Any = (), accepted: Any = (10, 20, 30), margin: 
         ([11, 19, 30], ""),  # one start worse by exactly the margin
         ([11.01, 5, 5], "start 0 costs 5.05 % of the mean cost more than with the MPC"),
         ([5, 5, 31.5], "start 2 costs 7.5 % of the mean cost more"),
-        ([10, 20.5, 30], "mean cost 20.1667, accepted 20"),
+        ([10, 20.5, 30], "mean cost 20.1667 from 3 starts, accepted 20"),
         ([10, 20, 30.00003], ""),  # a relative difference of 5e-7 is rounding
-        ([10, 20, 30.0003], "mean cost 20.0001, accepted 20"),
+        ([10, 20, 30.0003], "mean cost 20.0001 from 3 starts, accepted 20"),
         ([NAN, 1, 1], "start 0 costs nan % of"),
         ([1, 1, INF], "start 2 costs inf % of"),
         ([-INF, NAN, 1], "start 1 costs nan % of"),
@@ -125,7 +125,9 @@ def test_rounding_adds_up_to_no_loss_however_many_policies_are_accepted_in_turn(
         verdict = no_worse(candidate, accepted, mpc, STRICT)
         accepted = candidate if verdict.accepted else accepted
     assert 0 < accepted.costs.mean() / mpc.costs.mean() - 1 <= 1e-6
-    assert verdict.reason.startswith("mean cost 50.0001, MPC 50") and verdict.above_mpc
+    assert (
+        verdict.reason.startswith("mean cost 50.0001 from 2 starts, MPC 50") and verdict.above_mpc
+    )
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,8 @@ class Check:
         :meth:`PlantTwin.forecast`: then ``logged`` and ``error`` are its forecast and half-width.
     starts : int
         Of a simulator, from which policy and MPC played.
+    mpc_exceeds : int
+        Of these, from which the MPC exceeds a hard bound of the problem.
     """
 
     iteration: int
@@ -89,6 +91,7 @@ class Check:
     final: bool = False
     interval: tuple[float, float] | None = None
     starts: int = 0
+    mpc_exceeds: int = 0
 
     @property
     def starts_in_words(self) -> str:
@@ -358,6 +361,7 @@ class SimulatorTrial(PairedTrial):
             final=final,
             interval=(of_mean.mean - room, of_mean.mean + room),
             starts=len(mpc),
+            mpc_exceeds=np.count_nonzero(self.mpc_scores.unsafe[:, LARGEST_EXCESS]),
         )
         return check, found
 

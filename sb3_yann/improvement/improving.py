@@ -180,6 +180,8 @@ class Improvement:
             rows["worst_start"] = f"{change_in_percent(last.worst)} of the MPC's mean cost"
             rows["worst_start"] += " in the twin: the plant's may be worse" * (source == "twin")
             rows["violations"] = "no more than the MPC's" if last.safe else "more than the MPC's"
+            if last.mpc_exceeds:
+                rows["violations"] += f"; that exceeds a hard bound from {last.mpc_exceeds} starts"
         which = "twin=twin" if source == "twin" else "env=env"
         more = f'report(result.model, "report.html", {which}), then '
         more += "Commissioning(result.model, plant, shadow=True)"

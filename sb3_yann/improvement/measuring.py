@@ -401,6 +401,8 @@ class _Search:
             )
         self.base = played
         self.simulator.learn(played, self.seeds)
+        if self.twin is None:
+            self.simulator.require_episodes()
         self.say(f"{len(self.seeds)} episodes of the MPC")
 
     def observe(self) -> None:
@@ -502,6 +504,11 @@ class _Search:
         if ended := int(self.base.terminated.sum()):
             which = f"{ended} of {len(base)} episodes of the MPC are ended by the env"
             note = f"{which}: their costs are those of fewer steps. {note}".strip()
+        excess = self.base.excess
+        if excess is not None and (beyond := np.count_nonzero(excess.largest)):
+            note = (
+                f"{note} The MPC exceeds a hard bound in {beyond} of {len(base)} episodes.".strip()
+            )
         # The MPC's own where another one is not better on average.
         both = (self.fair.get(name, base) for name in ("observer", "model"))
         observer, model = (each if each.mean() < base.mean() else base for each in both)

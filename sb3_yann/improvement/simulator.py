@@ -152,11 +152,15 @@ class Simulator:
         seeds = self.new_seeds(each - 1)
         self.learn(self.watch(seeds), seeds)
         self.excite(each)
+        self.require_episodes()
+
+    def require_episodes(self) -> None:
+        """Raise ValueError where no episode so far is of use."""
         if not self.episodes:
             raise ValueError(
-                f"None of {2 * each} episodes of the MPC in the simulator begins with {SHORTEST} "
-                "steps whose readings are finite, and at most its width beyond theta's box: there "
-                "is nothing to learn from."
+                f"None of {self.played} episodes of the MPC in the simulator begins with "
+                f"{SHORTEST} steps whose readings are finite, and at most its width beyond theta's "
+                "box: there is nothing to learn from."
             )
 
     @property

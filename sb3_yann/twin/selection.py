@@ -248,13 +248,15 @@ class Setting(NamedTuple):
 
     ``shrinkage`` is the weight of its squared coefficients, times the number of samples; terms with
     an input are shrunk ``factor`` times as strongly. ``gain`` is an input, and how many times as
-    the model says it acts where it is shrunk to.
+    the model says it acts where it is shrunk to. One that ``drifts`` has a constant term, which is
+    not shrunk, whatever theta holds.
     """
 
     degree: int
     shrinkage: float
     factor: float
     gain: tuple[int, float] | None = None
+    drifts: bool = False
 
     @property
     def freedom(self) -> float:
@@ -299,7 +301,7 @@ def ridge(
     problem = coordinates.row.problem
     (count, k) = z.shape
     n = y.shape[1]
-    constant = bool(problem.layout.has_constants)
+    constant = bool(problem.layout.has_constants) or any(each.drifts for each in settings)
     F = basis(z, constant, max(each.degree for each in settings))
     gram = F.T @ F
     cross = F.T @ y
@@ -331,19 +333,23 @@ def shrinkage_of(setting: Setting, problem: LinearMPC, k: int) -> Array:
     products = inputs[np.triu_indices(k)[1]] if setting.degree > 1 else inputs[:0]
     each = (setting.shrinkage * np.where(of, setting.factor, 1.0) for of in (inputs, products))
     first, second = each
-    constant = [1e-9] * int(problem.layout.has_constants)
+    constant = [1e-9] * int(problem.layout.has_constants or setting.drifts)
     return np.concatenate([first, constant, second]) + 1e-12
 
 
 def candidates(
-    coordinates: Coordinates, parts: Sequence[Episode], kinds: Sequence[str] = KINDS
+    coordinates: Coordinates,
+    parts: Sequence[Episode],
+    kinds: Sequence[str] = KINDS,
+    drifts: bool = False,
 ) -> list[Candidate]:
     """Return the model as it is, and polynomials of some kinds, the least free first."""
     kept = without_each_fold(parts)
     n = coordinates.row.problem.model.n_states
     k = len(coordinates.scale)
     degrees = [degree for kind, degree in DEGREES.items() if kind in kinds]
-    settings = [Setting(*each) for each in product(degrees, SHRINKAGES, INPUT_FACTORS)]
+    choices = product(degrees, SHRINKAGES, INPUT_FACTORS)
+    settings = [Setting(*each, drifts=drifts) for each in choices]
     settings.sort(key=lambda each: each.freedom)
     fits = [ridge(coordinates, each, settings) for each in kept if settings]
     found = [Candidate("none", (Residual.zero(k, n),) * len(kept))]
@@ -465,9 +471,14 @@ def judges(
 def reidentified(
     problem: LinearMPC, coordinates: Coordinates, log: tuple[Episode, ...]
 ) -> LinearMPC:
-    """Return the MPC of a model shrunk towards the given one: see `PlantTwin.reidentified`."""
+    """Return the MPC of a model shrunk towards the given one: see `PlantTwin.reidentified`.
+
+    Where the plant rests elsewhere, what drifts is fitted beside A and B.
+    """
     parts = pieces(log, FOLDS)
     choices = candidates(coordinates, parts, ["linear"])
+    if not problem.layout.has_constants:
+        choices += candidates(coordinates, parts, ["linear"], drifts=True)[1:]
     choice = choices[held_out(coordinates, parts, choices).choose()]
     if choice.setting is None:
         return problem
@@ -484,7 +495,7 @@ def reidentified(
     E = model.E + (E if d else 0.0)
     x: Array = np.zeros(n)
     u: Array = np.zeros(m)
-    if problem.layout.has_constants:  # else the residual has no constant term
+    if problem.layout.has_constants:  # else the operating point is where it is to be held
         x, u = _rest(problem, A, B, residual.predict(middle)[0])
     note = f"Re-identified from {len(log)} episodes: {choice.name}."
     own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}

@@ -11,8 +11,9 @@ from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, UntrustedTwinE
 from sb3_yann.control import OutputBounds, Terminal
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import Coordinates
+from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
-from sb3_yann.twin.selection import FreeRuns, Setting, ridge
+from sb3_yann.twin.selection import FreeRuns, Setting, reidentified, ridge
 from twin_samples import Cart, log, problem, twin
 from twin_samples import random_episode as episode
 
@@ -127,6 +128,24 @@ def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() ->
     far = dataclasses.replace(mpc, terminal=Terminal())  # bounds it was not given: no warning
     found = PlantTwin.fit(far, worn_log(far, leak=0.15)).reidentified()
     assert found.model.u_ss > far.u_max
+
+
+def test_what_drifts_is_not_taken_for_a_pole_where_there_are_no_set_points() -> None:
+    given = {"tracking": None, "terminal": Terminal(), "theta_min": 2, "theta_max": 8}
+    mpc = dataclasses.replace(tank(), **given)
+    rng = np.random.default_rng(3)
+    law = mpc.explicit().plant_input
+    episodes = []
+    for _ in range(6):
+        x = [np.array([rng.uniform(4, 6)])]
+        u = []
+        for _ in range(40):
+            u.append(np.clip(law(x[-1]) + 0.1 * rng.standard_normal(1), 1, 5))
+            x.append(5 + 0.9 * (x[-1] - 5) + PUMP * (u[-1] - 3) - LEAK)
+        episodes.append(Episode(np.array(x) - 5, np.array(u) - 3))
+    found = reidentified(mpc, Coordinates.of(RowLayout(mpc), episodes), tuple(episodes))
+    np.testing.assert_allclose([found.model.A, found.model.B], [[[0.9]], [[PUMP]]], atol=0.01)
+    assert found.model.u_ss == mpc.model.u_ss
 
 
 def test_where_the_model_is_right_the_mpc_is_the_given_one() -> None:
