@@ -303,7 +303,8 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
     """Yield which inputs, or which state instead, in another unit or with another zero are the law.
 
     A law that is nearly linear takes the zero of one state for that of another, or of its input:
-    the model tells them apart, or all are named.
+    the model tells them apart, or all are named. Where it predicts no better so, another controller
+    wrote the log.
     """
     names = log.names
     n = log.problem.model.n_states
@@ -357,6 +358,8 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
             words = f"The MPC gives the logged inputs where {names[0][i]} is {times}what is logged"
             words += f", {shift[i]:+.4g}"
             found.append((left_by_model(change, shift, log.inputs), words))
+    as_it_is = left_by_model(np.eye(n), np.zeros(n), log.inputs)
+    found = [(error, words) for error, words in found if error < as_it_is]
     least = min((error for error, _ in found), default=0.0)
     if said := [words for error, words in found if CLEARLY_BETTER * error <= least]:
         yield f"{'; or: '.join(said)}: is it in other units, or has it another zero? {CONFIRM}"
