@@ -129,22 +129,31 @@ def decide_at_end(
         return evidence, None
     seeds = NewSeeds(evidence.next_seed)
     trial = _new_trial(evidence, play, seeds, at_end=True)
-    scores, verdict = _confirm(trial, tried, settings, level_of_look(rule.significance, 1))
+    evidence, verdict = _on_all_known(evidence, play)
+    is_known_to_lose = not verdict.accepted
+    scores: Scores | None = evidence.scores
+    of_mpc = evidence.starts.mpc.at(slice(len(evidence.scores.costs)))
+    if not is_known_to_lose:
+        scores, verdict = _confirm(trial, tried, settings, level_of_look(rule.significance, 1))
+        of_mpc = trial.mpc_scores
     evidence = replace(evidence, next_seed=seeds.next)
     if scores is not None and verdict.accepted:
         return replace(evidence, confirmed=(trial.starts, scores)), None
 
     cost = evidence.mean_cost(evidence.scores)
     played = evidence.n_played(evidence.scores)
-    after, _ = _with_hard_starts(evidence.without_passed(tried), trial.starts, scores)
+    after = evidence.without_passed(tried)
+    if not is_known_to_lose:
+        after, _ = _with_hard_starts(after, trial.starts, scores)
     mpc = after = replace(after, accepted=after.mpc, scores=after.starts.mpc)
-    of_mpc = None if scores is None else trial.mpc_scores
     parts = [each for each, _ in _parts(mpc.mpc, tried, scores, of_mpc, rule)]
     for number, policy in enumerate([*parts, *reversed(mpc.passed)], start=2):
         known, its_scores, found = try_on_known(mpc, policy, play, settings)
         if its_scores is None or not found.accepted:
             continue
-        part = known.with_visited(policy, its_scores)
+        part, found = _on_all_known(known.with_visited(policy, its_scores), play)
+        if not found.accepted:
+            continue
         level = level_of_look(rule.significance, number)
         scores, found = _confirm(trial, part.accepted, settings, level)
         if scores is not None and found.accepted:
@@ -154,6 +163,24 @@ def decide_at_end(
     regions = _accepted_regions(evidence.mpc, tried, after.accepted)
     reason = f"at the end, {verdict.reason}; {_what_acts(after, tried)}"
     return after, _decision(after, cost, played, reason, True, regions)
+
+
+def _on_all_known(evidence: Evidence, play: Play) -> tuple[Evidence, Verdict]:
+    """Return whether the accepted policy is no worse than the MPC on all known starts.
+
+    It may have been accepted by few of them, and others have refused candidates like it.
+    """
+    starts = evidence.starts
+    mpc = starts.mpc
+    try:
+        evidence = evidence.known_up_to(len(starts.seeds), play)
+    except Unplayable as error:
+        return evidence, Verdict(str(error), breaks_limit=True)
+    names = starts.seeds
+    verdict = no_worse(
+        evidence.scores, mpc, mpc, starts.tolerance, names=names, n_hard=starts.n_hard
+    )
+    return evidence, verdict
 
 
 def try_before_training(

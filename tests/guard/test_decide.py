@@ -66,6 +66,34 @@ def spoil_left(policy, right: float = 0.5) -> None:
     correct(policy, LEFT, -2.0)
 
 
+class Awkward(Slide):
+    """Starts on the right; from one seed any other input than the MPC's costs much."""
+
+    def __init__(self, at: int | None = None) -> None:
+        super().__init__(low=2.0, high=4.0)
+        self.at = at
+
+    def reset(self, *, seed=None, options=None):
+        self.here = seed == self.at
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        apart = float(action[0] - LAW(self.x)[0])
+        seen, reward, *rest = super().step(action)
+        return seen, -1 - 9 * apart**2 if self.here else reward, *rest
+
+
+def test_a_policy_accepted_by_few_known_starts_must_pass_on_all_of_them_at_the_end() -> None:
+    options = {"n_new_starts": 0, "n_final_starts": 10, "rule": WHOLE}
+    model, guard = tried(better, env=Awkward, **options)
+    assert verdicts(guard) == ["accepted"] and not is_mpc(model.policy)
+    assert guard.decisions[0].played[0] == 5  # of ten
+    known = guard.state.evidence.starts.seeds
+    model, guard = tried(better, env=partial(Awkward, known[-1]), **options)
+    assert verdicts(guard) == ["accepted", "rejected"] and is_mpc(model.policy)
+    assert f"start {known[-1]} costs" in guard.decisions[1].reason
+
+
 def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_lose() -> None:
     model, guard = tried(spoil_left, env=OftenRight, n_new_starts=20)
     decision = guard.decisions[0]
