@@ -231,6 +231,8 @@ class Commissioning:
             verdict = f"The policy of {state.policy} is on trial."
             if state.is_kept:
                 verdict = f"The policy of {state.policy} surely costs less than the MPC, and acts."
+            elif (kept := state.kept.policy) != "MPC":
+                verdict += f" That of {kept} surely costs less than the MPC, and is kept."
             rows = rows_of_pairs(journal, self.policy.problem)
         ours = [each for each, by in zip(journal.episodes, journal.by_policy, strict=True) if by]
         every = sum(len(each.actions) for each in journal.episodes)

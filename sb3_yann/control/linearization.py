@@ -557,6 +557,10 @@ def require_order(f: Callable[..., ArrayLike], dt: float, *parts: Array) -> None
         raise TypeError(f"f(u, x) rests at the operating point. {called_as(*parts)}")
 
 
+class _WrongShapeError(ValueError):
+    """What f returned is not dx/dt of each state."""
+
+
 def _vector(value: Any, *parts: Array) -> Array:
     """Return what f returned as a vector (n,): of shape (n,), (n, 1) or (1, n), or a list."""
     size = parts[0].size
@@ -564,7 +568,7 @@ def _vector(value: Any, *parts: Array) -> Array:
         value = np.concatenate([np.ravel(to_float("f(x, u)", each)) for each in value])
     array = to_float("f(x, u)", value)
     if array.shape not in ((size,), (size, 1), (1, size)):
-        raise ValueError(f"f returned the shape {array.shape}. {called_as(*parts)}")
+        raise _WrongShapeError(f"f returned the shape {array.shape}. {called_as(*parts)}")
     return array.reshape(size)
 
 
@@ -579,6 +583,8 @@ def _rest_of(
         try:
             with np.errstate(all="ignore"):
                 return np.asarray(dt * rate(point) / scale[:n])
+        except _WrongShapeError:
+            raise
         except (ArithmeticError, ValueError):  # math functions raise where numpy's return NaN
             return np.full(n, np.nan)
 

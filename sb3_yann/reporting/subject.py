@@ -295,7 +295,14 @@ class Subject:
         """The closed loops of MPC and policy: theta and inputs in deviations; None without env."""
         if self.env is None:
             return None
+        own = self.policy.observation_space.shape, self.policy.action_space.shape
         with one_env(self.env) as env:
+            its = env.observation_space.shape, env.action_space.shape
+            if its != own:
+                raise ValueError(
+                    f"env = {name_of(env)} has observations and actions of shapes {its}, the model "
+                    f"{own}. Give the report a simulator of this plant."
+                )
             require_state_shown(env, self.policy.observation_given)
         return self._play()
 

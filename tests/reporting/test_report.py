@@ -274,6 +274,13 @@ def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
     assert f"fewer than {100 * (1 - 0.05 ** (1 / 8)):.1f} % of such starts do" in text
 
 
+def test_an_env_of_another_plant_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"shapes \(\(4,\), \(1,\)\), the model \(\(1,\), \(1,\)\)"
+    ):
+        _ = subject_of(moved(0.1), env="CSTR-v0").loops
+
+
 def test_where_an_env_gives_no_reward_the_stage_cost_counts() -> None:
     model = moved(0.1)
     subject = subject_of(model, env=lambda: TransformReward(Slide(), lambda reward: 0.0))

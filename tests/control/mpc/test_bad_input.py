@@ -39,6 +39,7 @@ BAD_MODELS: list[tuple[dict[str, Any], Message]] = [
 
 BAD_DYNAMICS: list[tuple[dict[str, Any], Message]] = [
     ({"f": lambda x, u: [1, 2, 3]}, r"f returned the shape \(3,\). It is called as f\("),
+    ({"f": lambda x, u: [1], "u_ss": [NAN]}, r"f returned the shape \(1,\). It is called as f\("),
     ({"f": lambda x, u: x * NAN}, r"f\(x_ss, u_ss\) holds NaN"),
     ({"f": lambda x, u: x + 1j}, TypeError(r"f\(x, u\) = .* is not an array of real")),
     ({"x_ss": [np.inf, 0]}, r"x_ss has .* expected a vector of finite numbers, or NaN"),
