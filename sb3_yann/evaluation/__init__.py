@@ -37,8 +37,13 @@ def comparison_table(title: str, before: Trajectories, after: Trajectories) -> s
         for number, (old, new) in enumerate(zip(before.costs, after.costs, strict=True), start=1):
             lines.append(f"  {number:<13}{old:>12,.2f}{new:>12,.2f}{new - old:>+12,.2f}")
     violations = f"{after.violations.sum()} steps, {before.violations.sum()} with the MPC"
+    old, new = (each.observations[0].shape[-1] for each in (before, after))
+    other = f"observations have {old} and {new} entries: rewards may be of different costs"
     return summary_lines(
-        "\n".join(lines), **paired_rows(after.costs, before.costs), violations=violations
+        "\n".join(lines),
+        **paired_rows(after.costs, before.costs),
+        violations=violations,
+        note=other * (old != new),
     )
 
 

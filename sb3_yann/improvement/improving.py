@@ -112,6 +112,8 @@ class Improvement:
         With the policy; not in the model's zip.
     note : str
         What ended the search before a final check; empty where nothing did.
+    rests_aside : bool
+        Whether the MPC's own episodes in the simulator end beside its targets.
 
     Examples
     --------
@@ -131,6 +133,7 @@ class Improvement:
     policy: str = ""
     model: Any = field(default=None, repr=False, compare=False)
     note: str = ""
+    rests_aside: bool = False
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -188,6 +191,11 @@ class Improvement:
         said = "Accepted: a better policy."
         if self.model is not None:
             said += of_estimates(self.model.policy.problem)
+        if self.rests_aside:
+            said += (
+                " The MPC rests beside its targets there, and the policy knows this one plant: "
+                "where yours changes, start from offset_free(mpc), which headroom plays."
+            )
         return summary_lines(said, **rows, steps=steps, next=more)
 
     @property
@@ -627,7 +635,8 @@ class _Work:
             simulator.close()
         change = self.checks[-1].change if accepted else 0.0
         where = "the simulator", simulator.name, simulator.played, simulator.steps
-        return Improvement(tuple(self.checks), change, accepted, before, *where, note=note)
+        found = Improvement(tuple(self.checks), change, accepted, before, *where, note=note)
+        return replace(found, rests_aside=simulator.rests_aside)
 
     def _taught(
         self, simulator: Simulator, lost: list[Any], number: int

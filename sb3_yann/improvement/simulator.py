@@ -45,6 +45,7 @@ SHORT = 3_000  # steps that they have at least: of short episodes there are more
 MOST = 60  # of such episodes, at most
 PUSH = 0.5  # half-widths by which inputs are moved at random, at most
 OFTEN = 0.7  # share of the time in which they are
+ASIDE = 0.01  # half-widths of a state, by which the MPC rests beside its target
 HELD = 5  # steps for which they stay
 
 
@@ -137,6 +138,7 @@ class Simulator:
         self.new_seeds = NewSeeds(FIRST + APART * seed)
         self.longest = 0
         self.episodes: list[Episode] = []
+        self.rests_aside = False
 
     def begin(self, later: int = 0) -> None:
         """Play the first episodes, of the MPC with and without random inputs; check the env.
@@ -151,6 +153,7 @@ class Simulator:
         each = self.usual // 2
         seeds = self.new_seeds(each - 1)
         self.learn(self.watch(seeds), seeds)
+        self.rests_aside = rests_aside(self.row, self.episodes)
         self.excite(each)
         self.require_episodes()
 
@@ -287,6 +290,24 @@ class Simulator:
     def close(self) -> None:
         """Close all envs."""
         self.envs.close()
+
+
+def rests_aside(row: RowLayout, episodes: Sequence[Episode]) -> bool:
+    """Return whether the MPC's episodes end beside its targets, on average to one side.
+
+    One that knows disturbances follows what a plant does; another knows its model alone.
+    """
+    problem = row.problem
+    layout = problem.layout
+    if layout.n_disturbances or len(episodes) < 2:
+        return False
+    C = problem.tracking.C
+    C = C if len(C) else np.eye(problem.model.n_states)[np.diag(problem.Q) > 0]
+    ends = row.shown(np.array([each.thetas[-1] for each in episodes]))
+    wanted = ends[:, layout.reference][:, : len(C)] if layout.n_references else 0.0
+    left = (ends[:, layout.state] @ C.T - wanted) / (np.abs(C) @ problem.theta_half[layout.state])
+    error = 3 * left.std(axis=0, ddof=1) / np.sqrt(len(left))
+    return bool(np.any(np.abs(left.mean(axis=0)) > np.maximum(ASIDE, error)))
 
 
 def require_repeated(problem: LinearMPC, env: Source | EnvPool, seed: int, cost: float) -> None:

@@ -45,6 +45,8 @@ def test_the_table_shows_losses_as_well_as_gains() -> None:
     after.costs[:] = 9.0, 27.0
     text = comparison_table("costs", before, after)
     assert all(each in text for each in ("-1.00", "+7.00", "change       +20.00 %", "+46.67 %"))
+    assert "observations have" not in text
+    assert "observations have 1 and 2 entries" in comparison_table("", before, episodes(2, size=2))
 
 
 def test_few_episodes_are_lines_in_plant_units() -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from sb3_yann.control import OnlineLaw, OnlineLawWarning
 from sb3_yann.control.explicit import budget, solve
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.mpc import linear_mpc
+from sb3_yann_envs import problems
 
 
 def test_a_simulation_is_the_law_on_its_model() -> None:
@@ -122,6 +124,15 @@ def test_shares_are_those_of_the_box() -> None:
     assert f"{share:.1f} % are feasible" in mpc.report()
     everywhere = input_bounds_only().report(samples=20)
     assert "100.0 % are feasible" in everywhere
+
+
+def test_how_far_the_explicit_law_is_from_the_online_one_beyond_the_box_is_said() -> None:
+    words = "Where there is no region, up to 10 % beyond the box, the explicit law"
+    assert words not in input_bounds_only().report(samples=50)
+    said = problems.clipped_pendulum().report(samples=200)
+    assert words in said
+    most = float(re.search(r"range, by (\d+) % at most", said)[1])
+    assert 5 < most <= 100
 
 
 def test_an_invariant_terminal_set_shows_as_a_closed_loop_that_stays_feasible() -> None:
