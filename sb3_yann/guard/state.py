@@ -39,7 +39,8 @@ class Evidence:
     which hard ones come first. ``passed`` are accepted checkpoints that new starts have confirmed,
     the latest last; ``rejections`` come in a row. ``confirmed`` are the final starts that the
     accepted policy has passed, and its scores there. Policies are confirmed on ``new`` starts until
-    one loses there; the next one has the seed ``next_seed``.
+    one loses there; the next one has the seed ``next_seed``. ``reference`` are the costs on all
+    known starts but the hard ones of the last accepted policy that has played them, else the MPC's.
     """
 
     accepted: ActorCheckpoint
@@ -51,21 +52,26 @@ class Evidence:
     rejections: int = 0
     confirmed: tuple[Starts, Scores] | None = None
     new: Starts | None = None
+    reference: Array | None = None
 
     def mean_cost(self, scores: Scores | None) -> float:
         """Return a policy's mean cost over all known starts but the hard ones; nan without scores.
 
-        From those that it has played: the MPC's mean cost, times what it costs of the MPC's there.
+        From those that it has played: what the accepted policy costs on all, or the reference,
+        times what it costs of that there.
         """
-        mpc = self.starts.mpc.costs[self.starts.n_hard :]
         if scores is None or len(scores.costs) <= self.starts.n_hard:
             return math.nan
+        mpc = self.starts.mpc.costs[self.starts.n_hard :]
+        known = self.scores.costs[self.starts.n_hard :]
+        if len(known) < len(mpc):
+            known = mpc if self.reference is None else self.reference
         costs = scores.costs[self.starts.n_hard :]
-        own = mpc[: len(costs)]
-        if len(costs) == len(mpc) or not np.abs(own).sum():
+        own = known[: len(costs)]
+        if len(costs) == len(known) or not np.abs(own).sum():
             return float(costs.mean())
         more = (costs - own).sum() / np.abs(own).sum()
-        return float(mpc.mean() + more * np.abs(mpc).mean())
+        return float(known.mean() + more * np.abs(known).mean())
 
     def n_played(self, scores: Scores | None) -> int:
         """Return on how many known starts but the hard ones a policy has played."""
@@ -88,7 +94,10 @@ class Evidence:
         changed = self.accepted.changed_regions(candidate)
         if self.accepted.is_confined_as(candidate) and np.any(changed & ~visited):
             candidate = self.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
-        return replace(self, accepted=candidate, scores=scores, confirmed=None)
+        known = self.n_played(scores) == self.n_played(self.starts.mpc)
+        reference = scores.costs[self.starts.n_hard :] if known else self.reference
+        found = replace(self, accepted=candidate, scores=scores, reference=reference)
+        return replace(found, confirmed=None)
 
     def earlier(self) -> Iterator[tuple[ActorCheckpoint, Scores]]:
         """Yield the accepted policy and earlier ones, the latest first, with their known scores."""
@@ -123,9 +132,9 @@ class Decision:
     candidate_cost, accepted_cost, mpc_cost : float
         Mean cost of the candidate, the policy accepted now and the MPC, over the first
         ``n_eval_episodes``: the same in each decision. The hard starts that joined them are left
-        out. One that was decided on before it had played all has the MPC's mean, times what it
-        costs of the MPC's where it has played. That of a candidate that could not be played is
-        nan; the reason says why.
+        out. One that was decided on before it had played all has the mean of the last accepted one
+        that did, or of the MPC, times what it costs of that where it has played. That of a
+        candidate that could not be played is nan; the reason says why.
     played : tuple of int
         On how many of these starts the candidate, the accepted policy and the MPC have played.
     timestep, episode : int
