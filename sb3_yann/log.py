@@ -327,6 +327,7 @@ class Log:
         )
         if not len(table):
             raise ValueError(f"{path} has no rows below its header.")
+        _warn_of_marks(path, wanted, table)
         unread = [each for each in header if each not in wanted]
         if unread and episode is None and time is None:
             warn(
@@ -374,6 +375,7 @@ SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
 """In a unit of time."""
 
 
+NO_READING = -999, -9999, -99999, 999, 9999, 99999
 OFTEN_READ = 2 / 3
 """Share of the samples below which isolated readings make a state one that is read now and then."""
 
@@ -452,6 +454,21 @@ def _name_and_unit(header: str) -> tuple[str, str]:
     """Return the name and the unit of a column: ``T [K]`` is T in K."""
     name, bracket, unit = header.strip().removesuffix("]").rpartition(" [")
     return (name.strip(), unit.strip()) if bracket and header.endswith("]") else (header, "")
+
+
+def _warn_of_marks(path: object, names: Sequence[str], table: Array) -> None:
+    """Warn where a column holds what historians write for no reading, far from all else."""
+    for name, column in zip(names, table.T, strict=True):
+        marks = np.isin(column, NO_READING)
+        rest = column[~marks & np.isfinite(column)]
+        if not (marks.any() and len(rest)):
+            continue
+        far = np.abs(column[marks] - np.median(rest)) > 10 * np.ptp(rest)
+        if far.any():
+            warn(
+                f"{path}: {name} is {column[marks][far][0]:g} in {np.count_nonzero(far)} rows, far "
+                "from all others. If that stands for no reading, leave these cells empty."
+            )
 
 
 def _number(path: object, row: int, content: dict[str, str], name: str) -> float:

@@ -125,6 +125,13 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, time="t")
 
 
+def test_a_mark_for_no_reading_is_named(write) -> None:
+    given = {"states": ["T"], "inputs": ["valve"], "dt": 10, "episode": "run"}
+    with pytest.warns(UserWarning, match="T is -9999 in 2 rows, far from all others"):
+        Log.from_csv(write(CSV.replace(",24,", ",-9999,").replace(",27,", ",-9999,")), **given)
+    Log.from_csv(write(CSV.replace(",24,", ",999,").replace(",27,", ",900,")), **given)  # no mark
+
+
 def test_set_points_and_loads_of_a_csv_file_reach_the_twin(write) -> None:
     model = LinearModel([[0.9]], [[0.5]], 1, [12], [3], E=[[0.1]], d_ss=[1])
     mpc = LinearMPC(
