@@ -120,8 +120,8 @@ def decide_at_end(
 ) -> tuple[Evidence, Decision | None]:
     """Confirm what is accepted on the final new starts; return the evidence, and a refusal.
 
-    Where it loses, its parts and the latest earlier checkpoints are tried, else the MPC is
-    accepted. All that are tried share the probability of an error.
+    Where it loses, its parts and earlier checkpoints are tried, the best on known starts first,
+    else the MPC is accepted. All that are tried share the probability of an error.
     """
     tried = evidence.accepted
     rule = settings.rule
@@ -147,11 +147,14 @@ def decide_at_end(
         after, _ = _with_hard_starts(after, trial.starts, scores)
     mpc = after = replace(after, accepted=after.mpc, scores=after.starts.mpc)
     parts = [each for each, _ in _parts(mpc.mpc, tried, scores, of_mpc, rule)]
-    for number, policy in enumerate([*parts, *reversed(mpc.passed)], start=2):
+    others = list[tuple[float, Evidence]]()
+    for policy in (*parts, *reversed(mpc.passed)):
         known, its_scores, found = try_on_known(mpc, policy, play, settings)
-        if its_scores is None or not found.accepted:
-            continue
-        part, found = _on_all_known(known.with_visited(policy, its_scores), play)
+        if its_scores is not None and found.accepted:
+            others.append((known.mean_cost(its_scores), known.with_visited(policy, its_scores)))
+    others.sort(key=lambda each: each[0])
+    for number, (_, other) in enumerate(others, start=2):
+        part, found = _on_all_known(other, play)
         if not found.accepted:
             continue
         level = level_of_look(rule.significance, number)

@@ -94,6 +94,32 @@ def test_a_policy_accepted_by_few_known_starts_must_pass_on_all_of_them_at_the_e
     assert f"start {known[-1]} costs" in guard.decisions[1].reason
 
 
+class Narrow(Slide):
+    """Starts on the right; on the final ones inputs far from the MPC's cost much."""
+
+    def __init__(self) -> None:
+        super().__init__(low=2.0, high=4.0)
+
+    def reset(self, *, seed=None, options=None):
+        self.final = seed is not None and seed >= FIRST + 15
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        far = max(0.0, abs(float(action[0] - LAW(self.x)[0])) - 0.4)
+        seen, reward, *rest = super().step(action)
+        return seen, reward - 20 * far * self.final, *rest
+
+
+def test_at_the_end_the_best_of_parts_and_earlier_policies_takes_the_place() -> None:
+    options = {"n_new_starts": 5, "n_final_starts": 10, "rule": WHOLE | {"backtrack": True}}
+    acts = [partial(correct, region=RIGHT, value=each) for each in (0.3, 0.5)]
+    model, guard = tried(*acts, env=Narrow, **options)
+    assert verdicts(guard)[:2] == ["accepted", "accepted"]
+    assert "an earlier policy is restored" in guard.decisions[-1].reason
+    value = last_layer(model.policy)[REGION[RIGHT], :, -1]
+    np.testing.assert_allclose(value.detach(), 0.3)  # half of the correction is 0.25
+
+
 def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_lose() -> None:
     model, guard = tried(spoil_left, env=OftenRight, n_new_starts=20)
     decision = guard.decisions[0]
