@@ -2,10 +2,11 @@
 
 Two regressions tell. Where the MPC made the log, an input regressed on what the law gives has slope
 one and offset zero: then it is proven, whatever the plant's gain. Any other slope of a log that the
-law explains is a fault of the log. Where the law does not explain an input, only the plant can
-speak: the next states, regressed on states and inputs, show in which row, direction and size it
-acts. A plant whose gain is not the model's looks like an input in other units; a gain beyond
-0.6 and 1.7 times the model's must be confirmed by whoever knows the plant.
+law explains is a fault of the log, where the model predicts better without it. Where the law does
+not explain an input, only the plant can speak: the next states, regressed on states and inputs,
+show in which row, direction and size it acts. A plant whose gain is not the model's looks like an
+input in other units; a gain beyond 0.6 and 1.7 times the model's must be confirmed by whoever knows
+the plant.
 """
 
 from __future__ import annotations

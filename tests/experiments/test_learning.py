@@ -39,9 +39,9 @@ def outcome(costs, violations=((0, 0), (0, 0)), accepted=True, seconds=1.0) -> O
 BASE = [10.0, 30.0]
 PLANT_RUNS = {
     Run("pH", PLANNED, 0, 0): outcome([BASE, [10.0, 20.0]]),  # a quarter less
-    Run("pH", IMPROVED, 40, 0): outcome([BASE, [8.0, 24.0]], seconds=3),
-    Run("pH", IMPROVED, 41, 0): outcome([BASE, [14.0, 10.0]], [[0, 0], [2, 1]], seconds=5),
-    Run("pH", IMPROVED, 42, 0): outcome([BASE, BASE], [[1, 0], [1, 0]], False, 9),
+    Run("pH", IMPROVED, 0, 0): outcome([BASE, [8.0, 24.0]], seconds=3),
+    Run("pH", IMPROVED, 1, 0): outcome([BASE, [14.0, 10.0]], [[0, 0], [2, 1]], seconds=5),
+    Run("pH", IMPROVED, 2, 0): outcome([BASE, BASE], [[1, 0], [1, 0]], False, 9),
 }
 LOG_RUNS = {
     Run(FROM_A_LOG, PLANNED, 0, 0): outcome([BASE, [9.0, 29.0]]),
@@ -124,7 +124,7 @@ def test_a_run_compares_with_the_mpc_on_the_same_episodes(monkeypatch) -> None:
 
 def test_the_picture_pairs_costs_with_the_mpc_that_has_no_observer(tmp_path) -> None:
     tried = {
-        Run("pH", IMPROVED, 40, 0): outcome([BASE, [8.0, 24.0]]),
+        Run("pH", IMPROVED, 0, 0): outcome([BASE, [8.0, 24.0]]),
         Run("pH", OBSERVER, 0, 0): outcome([BASE, [9.0, 15.0]]),
     }
     shares = {name: (list(costs), mean) for name, (costs, mean) in _shares(tried, "pH").items()}

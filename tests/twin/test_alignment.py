@@ -146,9 +146,17 @@ def room() -> LinearMPC:
 
 
 def heated(
-    gain: float, dither: float, open_loop: bool = False, steps: int = 40, hold: int = 4
+    gain: float,
+    dither: float,
+    open_loop: bool = False,
+    steps: int = 40,
+    hold: int = 4,
+    share: float = 1.0,
 ) -> list:
-    """Return episodes of a room whose heater has so many times the model's gain."""
+    """Return episodes of a room whose heater has so many times the model's gain.
+
+    Its controller takes a share of the law.
+    """
     rng = np.random.default_rng(5)
     law = room().explicit()
     found = []
@@ -159,7 +167,7 @@ def heated(
         for k in range(steps):
             drawn = rng.normal(size=1)
             held = drawn if k % hold == 0 else held
-            wanted = 0.5 * held if open_loop else law(states[-1]) + dither * drawn
+            wanted = 0.5 * held if open_loop else share * law(states[-1]) + dither * drawn
             inputs.append(np.clip(wanted, -2, 2))
             states.append(room().model.A @ states[-1] + gain * room().model.B @ inputs[-1])
         found.append((np.array(states), np.array(inputs)))
@@ -181,6 +189,13 @@ def test_inputs_times_a_factor_are_not_those_of_the_mpc(factor, dither) -> None:
     twin = heated_twin([(x, factor * u) for x, u in heated(1.0, dither)])
     assert "times what the MPC gives" in twin.report()
     assert not twin.trusted
+
+
+@pytest.mark.parametrize(("share", "dither"), [(0.55, 0.2), (0.8, 0.2), (1.5, 0.4)])
+def test_a_multiple_of_the_law_that_moves_the_plant_as_the_model_says_is_in_its_units(
+    share, dither
+) -> None:
+    assert heated_twin(heated(1.0, dither, share=share)).trusted
 
 
 def test_a_state_with_another_zero_and_scale_is_not_the_one_that_the_mpc_saw() -> None:
