@@ -272,7 +272,8 @@ class LinearMPC(MPCProblem):
             As of `LinearMPC`.
         **options
             ``x_ss``, ``u_ss``, ``dt``, ``set_state``, ``get_state`` and ``scale`` are those of
-            `LinearModel.from_env`; all others those of `LinearMPC`, as the plant shows them.
+            `LinearModel.from_env`, ``state_names``, ``input_names``, ``units`` and ``time_unit``
+            those of `LinearModel.named`; all others those of `LinearMPC`, as the plant shows them.
 
         Examples
         --------
@@ -282,7 +283,10 @@ class LinearMPC(MPCProblem):
         """
         names = ("x_ss", "u_ss", "dt", "set_state", "get_state", "scale")
         of_model = {name: options.pop(name) for name in names if name in options}
+        labels = ("state_names", "input_names", "units", "time_unit")
+        of_names = {name: options.pop(name) for name in labels if name in options}
         model = LinearModel.from_env(env, **of_model)
+        model = model.named(**of_names) if of_names else model
         with borrow(env) as borrowed:
             shown = borrowed.env.observation_space
             action = borrowed.env.action_space

@@ -65,7 +65,9 @@ def heater() -> Plant:
 
 
 def test_the_bounds_are_those_of_the_spaces_as_the_plant_shows_them() -> None:
-    mpc = LinearMPC.from_env(heater, Q=[[1]], R=[[0.01]], horizon=3, dt=60.0, x_ss=[350], u_ss=[40])
+    given = {"dt": 60.0, "x_ss": [350], "u_ss": [40], "state_names": ["T"], "time_unit": "s"}
+    mpc = LinearMPC.from_env(heater, Q=[[1]], R=[[0.01]], horizon=3, **given)
+    assert (mpc.model.state_names, mpc.model.time_unit) == (("T",), "s")
     np.testing.assert_allclose([mpc.model.A[0, 0], mpc.model.B[0, 0]], [0.9, 0.05], atol=1e-6)
     by_hand = LinearMPC(
         mpc.model, Q=[[1]], R=[[0.01]], horizon=3, u_min=20, u_max=60, theta_min=300,
