@@ -51,8 +51,8 @@ PRICE = 40.0
 MPC; twice as often after each look with an objection."""
 NEAR = 0.02
 """Share of what plans gain that a policy may lack when its fits end; a fit that brings less than
-half of it, to a policy that gains half of what they do, is the last; so is a step of the descent
-that brings less than half of it."""
+half of it, to a policy that gains half of what they do, is the last; so is a step of the descent,
+where no more is lacking."""
 RETURNS = 1000  # states whose returns the critic is fitted to
 RETURN_STEPS = 100  # steps of a return; the MPC's value counts after them
 CRITIC_BATCH = 256  # rows in a step of Adam on the critic
@@ -188,6 +188,10 @@ class Teacher:
         guessed = self.mpc.costs + np.nan_to_num(self.best)[nearest] - mpc[nearest]
         return np.where(self.known, self.best, guessed)
 
+    def is_near(self, costs: Array) -> bool:
+        """Return whether costs (k,) save nearly what plans do."""
+        return self.saved(costs) >= (1 - NEAR) * self.saved(self.attainable)
+
     def teach(self, layer: LawLayer, updates: int) -> None:
         """Fit a layer to all that was shown."""
         weighed = [each for key, each in self.taught.items() for _ in range(self.weights[key[0]])]
@@ -256,7 +260,7 @@ def imitate(
             most = score
             promised = saved
             best = copy.deepcopy(layer.state_dict())
-        done = teacher.saved(played.costs) >= (1 - NEAR) * teacher.saved(teacher.attainable)
+        done = teacher.is_near(played.costs)
         vain = since < fit and most >= NEARLY * teacher.gain
         over = (done and not objection) or fit == FITS - 1 or vain
         descends = over and teacher.scenarios.members is None
@@ -304,7 +308,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
             most = rank
             saved = teacher.saved(played.costs, teacher.usual)
             best = copy.deepcopy(layer.state_dict())
-        slow = passes and 0 < rank[1] - score < NEAR / 2 * score
+        slow = passes and teacher.is_near(played.costs) and 0 < rank[1] - score < NEAR / 2 * score
         if rank[1] > score:
             score = rank[1]
             objects = not passes
