@@ -189,8 +189,9 @@ class Teacher:
         return np.where(self.known, self.best, guessed)
 
     def is_near(self, costs: Array) -> bool:
-        """Return whether costs (k,) save nearly what plans do."""
-        return self.saved(costs) >= (1 - NEAR) * self.saved(self.attainable)
+        """Return whether costs (k,) save nearly what plans do; not where nothing was planned."""
+        planned = bool(self.known.any())
+        return planned and self.saved(costs) >= (1 - NEAR) * self.saved(self.attainable)
 
     def teach(self, layer: LawLayer, updates: int) -> None:
         """Fit a layer to all that was shown."""
