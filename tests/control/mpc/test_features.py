@@ -88,32 +88,6 @@ def test_a_preview_of_what_stays_is_no_preview(weights: dict[str, Any]) -> None:
     )
 
 
-def _bellman(mpc: LinearMPC, gamma: float) -> float:
-    """Return the largest residual of the value near where the law rests, relative to costs."""
-    own = mpc.deviations
-    law = mpc.law("online")
-    value = mpc.value_terms(gamma)
-    A, B = own.prediction
-    theta = own.theta_rest
-    for _ in range(3000):
-        theta = A @ theta + B @ law(theta)
-    rng = np.random.default_rng(1)
-    points = theta + 1e-4 * rng.uniform(-1, 1, (40, mpc.n_theta)) * own.theta_half
-    limits = own.layout.limits
-    points[:, limits] = np.clip(points, own.theta_min, own.theta_max)[:, limits]
-    u = law(points)
-    following = points @ A.T + u @ B.T
-    stage = own.stage_cost(points, u)
-    residual = value.at(points) - stage - gamma * value.at(following)
-    return float(np.abs(residual).max() / max(np.abs(value.at(points)).max(), 1e-12))
-
-
-@pytest.mark.parametrize("features", [*((name,) for name in FEATURES), FEATURES])
-def test_the_value_satisfies_bellmans_equation(features: tuple[str, ...]) -> None:
-    for seed in (3, 5):
-        assert _bellman(draw(np.random.default_rng(seed), features), 0.95) < 1e-6
-
-
 def test_a_price_moves_where_the_law_rests_and_has_no_value_without_a_discount() -> None:
     mpc = cart(price=LinearCost(x=[0.4, 0]), horizon=10)
     rest = mpc.simulate([0.0, 0.0], 60)[0][-1]
