@@ -8,7 +8,6 @@ import torch as th
 from torch.nn import functional as F
 
 from sb3_yann.networks import RowAdam, ZeroOutputNetwork, zero_output
-from weights import first_layer, later_layers
 
 ACTIVATIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
     "tanh": th.tanh,
@@ -99,34 +98,6 @@ def test_every_entry_has_moved_after_the_second_update(
     assert bool(moved[-1][..., -1]) is not pinned
     moved[-1][..., -1] = True
     assert all(bool(entries.all()) for entries in moved)
-
-
-def test_each_network_of_a_stack_learns_from_its_own_rows_only() -> None:
-    net = ZeroOutputNetwork(2, 1, (8, 8), pinned=pins(False, False, False))
-    before = copy.deepcopy(net)
-    x = square()
-    index = 2 * th.randint(2, (256,))  # the networks 0 and 2
-    train(net, th.optim.Adam(net.parameters(), 1e-2), 20, x, curved(x), index)
-    for a, b in zip(net.parameters(), before.parameters(), strict=True):
-        assert th.equal(a[1], b[1])
-        assert not th.equal(a[0], b[0])
-        assert not th.equal(a[2], b[2])
-
-
-def test_stack_computes_what_its_networks_compute_alone() -> None:
-    stack = ZeroOutputNetwork(2, 1, (8, 8), pinned=pins(True, False, True)).double()
-    for parameter in stack.parameters():
-        th.nn.init.normal_(parameter)
-    x = square(dtype=th.float64)
-    index = th.randint(3, (256,))
-    for i in range(3):
-        alone = ZeroOutputNetwork(2, 1, (8, 8), pinned=stack.pinned[i].bool()).double()
-        with th.no_grad():
-            first_layer(alone).copy_(first_layer(stack)[i : i + 1])
-            for mine, theirs in zip(later_layers(alone), later_layers(stack), strict=True):
-                mine.weight.copy_(theirs.weight[i : i + 1])
-        rows = index == i
-        th.testing.assert_close(stack(x, index)[rows], alone(x[rows]), rtol=1e-12, atol=1e-12)
 
 
 # --- the pinned output -------------------------------------------------------------------------
