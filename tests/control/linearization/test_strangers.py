@@ -11,7 +11,6 @@ from scipy.integrate import solve_ivp
 
 from sample_plants import Plant, Settable
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.control.linearization import Jacobian, jacobian
 from sb3_yann.wrappers import TruncateAtTimeLimit
 from sb3_yann_envs import cstr
 
@@ -235,40 +234,3 @@ def test_of_several_steady_states_one_that_the_input_holds_is_taken() -> None:
     model = LinearModel.from_dynamics(reactor, [NAN, 3], [NAN], 0.5)
     np.testing.assert_allclose([*model.x_ss, *model.u_ss], [8.5, 3, 0.375], rtol=1e-6)
     assert "There are others, [0.0, 3.0, 0.0]" in model.notes[0]
-
-
-EPS = np.finfo(float).eps
-ONE = np.ones(1)
-
-
-def of(f: Any, at: float = 0.0, longest: float = 0.1, noise: float = EPS) -> Jacobian:
-    """Return the derivative of a function of one number."""
-    return jacobian(lambda z: np.atleast_1d(f(z[0])), at * ONE, longest * ONE, noise * ONE, ["z"])
-
-
-@pytest.mark.parametrize(("k", "smooth"), [(0.0049, True), (0.0052, False), (-0.0052, False)])
-def test_slopes_that_differ_by_a_hundredth_of_the_steepest_are_a_kink(k, smooth) -> None:
-    """Of z + k |z|: they differ by 2 k, and the steepest is 1 + k."""
-    if smooth:
-        of(lambda z: z + k * abs(z))
-    else:
-        with pytest.raises(ValueError, match=r"along z, its slopes to the two sides differ"):
-            of(lambda z: z + k * abs(z))
-
-
-def test_a_point_in_float32_is_differenced_between_what_is_evaluated() -> None:
-    def single(z: np.ndarray) -> np.ndarray:
-        return z.astype(np.float32).astype(np.float64)
-
-    found = jacobian(lambda z: z**2, 1.1 * ONE, 1e-2 * ONE, EPS * ONE, ["z"], single)
-    assert found.value[0, 0] == pytest.approx(2 * float(np.float32(1.1)), rel=1e-6)
-    with pytest.raises(ValueError, match="no finite value"):  # steps that rounding swallows
-        jacobian(lambda z: z**2, 1.1 * ONE, 1e-8 * ONE, EPS * ONE, ["z"], single)
-
-
-def test_steps_at_whose_ends_there_is_no_value_are_left_out() -> None:
-    found = of(lambda z: np.sqrt(z) if z > 0.9 else np.nan, at=1.0, longest=0.3)
-    assert found.value[0, 0] == pytest.approx(0.5, rel=1e-10)
-    assert np.isnan(found.change[0])
-    with pytest.raises(ValueError, match="no finite value on one of its sides"):
-        of(lambda z: z if z >= 1 else np.nan, at=1.0)

@@ -155,6 +155,7 @@ def test_tank_that_is_nearly_empty_is_linearized_with_shorter_steps() -> None:
     rest = [2e-3 * np.sqrt(level)]
     model = LinearModel.from_dynamics(lambda x, u: u - 2e-3 * np.sqrt(x), [level], rest, 0.1)
     np.testing.assert_allclose(model.A, np.exp(-0.1 * 1e-3 / np.sqrt(level)), rtol=1e-9)
+    assert "along x[0]: it has no value there" in model.notes[0]
 
 
 NAMES: dict[str, Any] = {

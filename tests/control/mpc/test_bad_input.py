@@ -45,6 +45,7 @@ BAD_DYNAMICS: list[tuple[dict[str, Any], Message]] = [
     ({"x_ss": [np.inf, 0]}, r"x_ss has .* expected a vector of finite numbers, or NaN"),
     ({"u_ss": 0.0}, r"u_ss has shape \(\) .* expected a vector"),
     ({"x_ss": []}, r"x_ss has shape \(0,\) .* finite numbers, .* one at least"),
+    ({"f": lambda x, u: np.where(x < 0, NAN, u - x)}, "no finite value on one of its sides"),
     ({"f": lambda x, u: [1, 0]}, "is no steady state.*NaN to have them solved"),
     ({"f": 3}, TypeError("f = 3 must be a function")),
     ({"dt": 0}, "dt = 0 must be a finite number above 0"),
