@@ -87,20 +87,6 @@ def test_episodes_that_are_shorter_than_a_window_are_left_out_of_windows_only() 
     assert all(np.isfinite(part).all() for part in weights(tuple(both)))
 
 
-def test_a_plant_that_its_linear_model_describes_leaves_nothing_to_learn() -> None:
-    exact = []
-    for each in episodes(3):
-        thetas = [each.thetas[0]]
-        for u in each.actions:
-            thetas.append(problem().predict(thetas[-1], u))
-        exact.append(Episode(np.array(thetas), each.actions))
-    box = Coordinates.of(RowLayout(problem()), exact)
-    (found,) = fit_ensemble(box, [exact], seed=0, updates=50)
-    z, y = map(np.concatenate, zip(*map(box.regression, exact), strict=True))
-    assert np.abs(y).max() < 1e-12
-    assert np.abs(found.predict(z)).max() < 1e-8
-
-
 def test_with_an_observer_it_is_fitted_to_what_the_plant_did() -> None:
     twin = observed()
     box = twin.dynamics.coordinates

@@ -158,13 +158,6 @@ def test_balls_corners_and_facets_are_those_of_linear_programs(seed: int) -> Non
         assert rest.min() == pytest.approx(width, rel=1e-5)
 
 
-@pytest.mark.usefixtures("search")
-def test_an_empty_polyhedron_has_no_radius() -> None:
-    A = np.vstack([np.eye(2), -np.eye(2)])
-    _, radius = largest_ball(A, np.array([1.0, -2.0, 1.0, 1.0]))
-    assert radius == pytest.approx(-0.5)
-
-
 # ---- An explicit solution that is wrong never leaves `explicit()`: the error names a theta ----
 
 

@@ -30,12 +30,6 @@ def test_so_is_the_explicit_law(pole, horizon) -> None:
     assert compared and max(online, explicit) < 1e-8
 
 
-def test_a_stable_plant_is_condensed_in_its_inputs() -> None:
-    mpc = LinearMPC(LinearModel([[0.9]], [[1.0]], dt=1), Q=[[1]], R=[[1]], horizon=40, **BOX)
-    assert mpc.condensed().feedback is None
-    assert problem(1.9, 20).condensed().feedback is not None
-
-
 NO_COST = Terminal(cost=np.zeros((2, 2)))
 SPECIAL: dict[str, tuple[Any, Any, dict[str, Any]]] = {
     "discounted": ([[1.8, 0.3], [0, 1.1]], [[0], [1]], {"gamma": 0.9}),
