@@ -58,10 +58,6 @@ def test_the_steady_state_is_the_published_one() -> None:
     assert cstr.FEED_TEMPERATURE == pytest.approx(452.48303, abs=5e-6)
 
 
-def test_the_dynamics_vanish_at_the_steady_state() -> None:
-    np.testing.assert_allclose(cstr.dynamics(cstr.X_SS, cstr.U_SS), 0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize("u", [-55.0, 0.0, 55.0])
 @pytest.mark.parametrize(
     "state",

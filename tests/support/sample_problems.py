@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from sb3_yann import LinearModel, LinearMPC, Terminal
 from sb3_yann.control import PiecewiseAffine
-from sb3_yann_envs import cstr as reactor
 from sb3_yann_envs import problems
 
 Array = NDArray[np.float64]
@@ -79,16 +79,7 @@ def _random_plant() -> LinearMPC:
 
 def _reactor_states_bounded() -> LinearMPC:
     mpc = problems.cstr()
-    return LinearMPC(
-        mpc.model,
-        Q=reactor.Q,
-        R=reactor.R,
-        horizon=2,
-        u_min=mpc.u_min,
-        u_max=mpc.u_max,
-        x_min=mpc.theta_min,
-        x_max=mpc.theta_max,
-    )
+    return replace(mpc, x_min=mpc.theta_min, x_max=mpc.theta_max)
 
 
 def _slow_modes(n: int) -> LinearModel:
