@@ -375,7 +375,7 @@ SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
 """In a unit of time."""
 
 
-NO_READING = -999, -9999, -99999, 999, 9999, 99999
+NO_READING = -999, -9999, -99999, 999, 9999, 99999  # in place of one, as historians write it
 OFTEN_READ = 2 / 3
 """Share of the samples below which isolated readings make a state one that is read now and then."""
 

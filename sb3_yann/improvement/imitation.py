@@ -309,7 +309,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
             most = rank
             saved = teacher.saved(played.costs, teacher.usual)
             best = copy.deepcopy(layer.state_dict())
-        slow = passes and teacher.is_near(played.costs) and 0 < rank[1] - score < NEAR / 2 * score
+        slow = passes and 0 < rank[1] - score < NEAR / 2 * score and teacher.is_near(played.costs)
         if rank[1] > score:
             score = rank[1]
             objects = not passes

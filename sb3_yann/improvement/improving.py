@@ -635,8 +635,9 @@ class _Work:
             simulator.close()
         change = self.checks[-1].change if accepted else 0.0
         where = "the simulator", simulator.name, simulator.played, simulator.steps
-        found = Improvement(tuple(self.checks), change, accepted, before, *where, note=note)
-        return replace(found, rests_aside=simulator.rests_aside)
+        checks = tuple(self.checks)
+        aside = simulator.rests_aside
+        return Improvement(checks, change, accepted, before, *where, note=note, rests_aside=aside)
 
     def _taught(
         self, simulator: Simulator, lost: list[Any], number: int

@@ -161,7 +161,7 @@ class PlantTwin(LearntModel):
         units_confirmed : bool, default False
             Whether somebody has checked the log's units. A plant whose gain is below 0.6 or above
             1.7 times the model's looks like an input in other units, and a controller that is a
-            multiple of the law like another zero or scale, where the model predicts no worse with
+            multiple of the law like another zero or scale, where the model predicts better with
             that: such a log is not trusted unless you say so. A header with another unit than the
             model's is an error. Where the MPC made the log its inputs are proven, and nothing needs
             saying.
