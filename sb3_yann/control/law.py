@@ -258,8 +258,9 @@ class PiecewiseAffine(PlantLaw):
     """The law ``u = gains[i] theta + offsets[i]`` for theta in region i, total and bounded.
 
     The region at theta is the one whose smallest slack ``b - A theta`` is largest, the first of
-    them on a tie: a region that holds theta, or the one that theta violates least. Where the MPC
-    has no solution, ``infeasible`` decides:
+    them on a tie: a region that holds theta, or the one that theta violates least. Half-spaces of
+    the box do not count, see `open_rows`. Beyond the box, and where the MPC has no solution,
+    ``infeasible`` decides:
 
     - ``"nearest_region"``: the affine law of that region, clipped to the input bounds.
     - ``"zero_input"``: no deviation of the input, clipped to the bounds, as in Braniff & Tian. It
@@ -280,8 +281,8 @@ class PiecewiseAffine(PlantLaw):
         The box for which the law was solved; a network scales its inputs by it.
     infeasible : {"nearest_region", "zero_input"}
     disjoint : bool, default False
-        That no two regions share an interior, which is not checked. The search then ends at the
-        first region that holds theta.
+        That no two regions share an interior in the box, which is not checked. There the search
+        ends at the first region that holds theta.
     neighbors : ndarray of int, shape (q,), optional
         The region beyond each half-space, -1 where none is known. Disjoint regions that are many
         are then found by a walk along a line. Empty where there is no region known.
@@ -424,20 +425,60 @@ class PiecewiseAffine(PlantLaw):
         bounded = bool(np.all(np.isfinite([self.theta_min, self.theta_max])))
         return self.n_regions > 4 and self.disjoint and self.neighbors.size > 0 and bounded
 
+    @property
+    def open_rows(self) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which half-spaces (q,) end a region beyond the box too, with A and b.
+
+        The box is where regions are looked for. What is optimal inside is so beyond, up to the
+        region's own half-spaces; those of the box do not tell which of two regions goes on. The
+        first row of a region with no others is ``0 theta <= 1``.
+        """
+        q = np.arange(len(self.A))
+        entry = np.argmax(np.abs(self.A), axis=1)
+        factor = self.A[q, entry]
+        end = np.where(factor > 0, self.theta_max[entry], self.theta_min[entry])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = np.abs(self.b / factor - end)
+        half = (self.theta_max - self.theta_min)[entry] / 2
+        own = (np.count_nonzero(self.A, axis=1) > 1) | ~(off < 1e-9 * half)
+        endless = self.starts[~np.logical_or.reduceat(own, self.starts)]
+        A, b = self.A.copy(), self.b.copy()
+        own[endless], A[endless], b[endless] = True, 0.0, 1.0
+        return own, A, b
+
+    @property
+    def box(self) -> Array:
+        """Middle and 1 / half-width of each entry of theta (2, n), 0 where it has no bound.
+
+        ``1 - abs(theta - middle) / half-width`` says how far inside a theta lies.
+        """
+        bounded = np.isfinite(self.theta_min) & np.isfinite(self.theta_max)
+        low, high = np.where(bounded, (self.theta_min, self.theta_max), [[0.0], [np.inf]])
+        return np.stack([np.where(bounded, (low + high) / 2, 0.0), 2 / (high - low)])
+
+    @property
+    def open_regions(self) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
+        """A, b, starts and neighbors of the regions, without what ends at the box alone."""
+        own, A, b = self.open_rows
+        starts: NDArray[np.int64] = np.cumsum(own)[self.starts] - own[self.starts]
+        return A[own], b[own], starts, self.neighbors[own[: len(self.neighbors)]]
+
     @cached_property
     def packed(self) -> tuple[Array, NDArray[np.int64]]:
         """The law as two arrays for compiled code, see `_kernels.law.pack`."""
         from sb3_yann.control._kernels.law import pack
 
+        A, b, starts, neighbors = self.open_regions
         return pack(
             self.gains,
             self.offsets,
-            np.column_stack([self.A, self.b]),
-            self.starts,
+            np.column_stack([A, b]),
+            starts,
             np.stack([self.u_min, self.u_max]),
+            self.box,
             (self.tolerance, self.tie_tolerance),
             (self.infeasible == "zero_input", self.disjoint),
-            (self.neighbors, *self.start_of_walk()) if self.walks else None,
+            (neighbors, *self.start_of_walk()) if self.walks else None,
         )
 
     def start_of_walk(self) -> tuple[int, Array]:

@@ -48,7 +48,9 @@ def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
         drawn = drawn.astype(np.float32).astype(np.float64)
     obs = insensitive(controller, drawn, precision)[:n_points]
     room = room_of(data, precision)
-    if not len(obs):
+    # Beyond the box inputs may rest at their bounds, whatever is lost of a reading.
+    steady = [np.any(controller.in_domain(each)) for each in (drawn, obs)]
+    if not len(obs) or steady == [True, False]:
         raise ValueError(
             f"In {precision} a rounding of a reading moves the output by more than {room:g} of its "
             "range, at all points tried: readings are large beside what they move by. Pass "

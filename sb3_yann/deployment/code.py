@@ -81,7 +81,8 @@ def controller_tables(
 
     Those of a search by a walk are last; without it, all regions are asked.
     """
-    same = "A b gains offsets obs_matrix obs_offset obs_rest seen_rest obs_min obs_max action_shift"
+    same = "A b box_middle box_per_half gains offsets obs_matrix obs_offset obs_rest seen_rest"
+    same += " obs_min obs_max action_shift"
     numbers: Tables = {name: data[name] for name in same.split()}
     numbers["action_scale"] = action_scale(data, precision)
     numbers["input_min"], numbers["input_max"] = data["bounds"]

@@ -446,7 +446,8 @@ class Controller:
             largest = slack.max(1)
             nearly = largest - tie * (1 + np.abs(largest))
             region[i : i + rows] = (slack >= nearly[:, None]).argmax(1)
-            inside[i : i + rows] = largest >= -tolerance
+            off = np.abs(theta[i : i + rows] - data["box_middle"]) * data["box_per_half"]
+            inside[i : i + rows] = np.minimum(largest, 1 - off.max(1)) >= -tolerance
         return region, inside
 
     def _networks(self, x: Array, used: NDArray[np.int64]) -> Array:

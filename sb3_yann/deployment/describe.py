@@ -413,13 +413,14 @@ def _with_regions(law: Any) -> tuple[PiecewiseAffine, dict[str, Any]]:
 def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
     """Return a law for inputs in [-1, 1], or as they are where they have no bounds."""
     finite, middle, half = _input_range(law)
+    A, b, starts, neighbors = law.open_regions
     arrays: dict[str, Any] = {
         "gains": law.gains / half[:, None],
         "offsets": (law.offsets - middle) / half,
         "bounds": np.array([(law.u_min - middle) / half, (law.u_max - middle) / half]),
-        "A": law.A,
-        "b": law.b,
-        "starts": law.starts,
+        "A": A,
+        "b": b,
+        "starts": starts,
         "zero_input": np.bool_(law.infeasible == "zero_input"),
         "disjoint": np.bool_(law.disjoint),
         "tolerances": np.array([law.tolerance, law.tie_tolerance]),
@@ -429,6 +430,8 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
                 np.where(np.isfinite(law.theta_max), law.theta_max, 1.0),
             ]
         ),
+        "box_middle": law.box[0],
+        "box_per_half": law.box[1],
         "per_input": 1 / half,
         "middle": middle / half,
     }
@@ -439,8 +442,8 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
     arrays |= {"neighbors": np.empty(0, np.int64), "walk_slack": np.empty(0), "walk_from": 0}
     if law.walks:
         region, point = law.start_of_walk()
-        arrays |= {"neighbors": law.neighbors, "walk_from": np.int64(region)}
-        arrays["walk_slack"] = law.b - law.A @ point
+        arrays |= {"neighbors": neighbors, "walk_from": np.int64(region)}
+        arrays["walk_slack"] = b - A @ point
     return arrays
 
 

@@ -183,7 +183,12 @@ def _locate(
     nearly = op("Sub", largest, op("Mul", room, constant(tolerances["tie"])))
     ties = graph.number(op("Not", op("Less", slack, nearly)))
     region = op("ArgMax", ties, axis=1, keepdims=0)
-    return region, op("Not", op("Less", largest, constant(-tolerances["tolerance"])))
+    off = op("Abs", op("Sub", theta, constant(data["box_middle"][None])))
+    off = op(
+        "ReduceMax", op("Mul", off, constant(data["box_per_half"][None])), axes=[1], keepdims=1
+    )
+    least = op("Min", largest, op("Sub", constant(1.0), off))
+    return region, op("Not", op("Less", least, constant(-tolerances["tolerance"])))
 
 
 def _correction(graph: _Graph, data: ControllerArrays, theta: str, region: str) -> str:

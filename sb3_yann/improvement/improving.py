@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
-from sb3_yann.compare import RULE
+from sb3_yann.compare import RULE, TOO_LITTLE
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import missing_observer
 from sb3_yann.deployment.exporting import Exported, export
@@ -694,6 +694,9 @@ class _Work:
                 note = ""
             elif least == best:
                 note = found.reason or "no gain in the simulator"
+                if found.safe and found.change - promised < 2 * best:
+                    # Ten starts may hold none that gains: the confirmation has others.
+                    weights, note = self.weights(), ""
             kept = useful and found.accepted and -found.logged >= PROMISED * teacher.gain
             known = -found.logged >= PROMISED * promised  # else the model has to learn more
             if kept or (number and stalls and known):
@@ -714,6 +717,8 @@ class _Work:
             if found.accepted:
                 self.accept(model)
                 return True
+            if TOO_LITTLE in found.reason:  # nothing was lost that could be taught
+                break
             if attempt < TRIES - 1:
                 model, teacher = self._taught(simulator, trial.lost, self.rounds + attempt)
                 imitate(self.layer, teacher, self.updates, self.say.detail)

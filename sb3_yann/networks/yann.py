@@ -345,7 +345,10 @@ class YannLayer(LawLayer):
         slack = th.unflatten(slack, 1, (-1, len(self.gains))).amin(1)
         largest = slack.amax(-1)
         nearly = largest - self.base_law.tie_tolerance * (1 + largest.abs())
-        return (slack >= nearly[:, None]).byte().argmax(-1), largest >= -self.base_law.tolerance
+        middle, per_half = self.half_space_A.new_tensor(self.base_law.box)
+        room = 1 - ((theta.double() - middle).abs() * per_half).amax(-1)
+        inside = th.minimum(largest, room) >= -self.base_law.tolerance
+        return (slack >= nearly[:, None]).byte().argmax(-1), inside
 
     def _correction(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         region, inside = self.locate(theta)
@@ -381,13 +384,15 @@ def _law_in_actions(law: PiecewiseAffine) -> dict[str, Array]:
     """
     middle = (law.u_max + law.u_min) / 2
     half_range = (law.u_max - law.u_min) / 2
-    # Regions with fewer than q_max are filled up with half-spaces that never bind.
+    # Regions with fewer than q_max are filled up with half-spaces that never bind, as the box's do.
     counts = np.diff([*law.starts, law.n_halfspaces])
     A = np.zeros((law.n_theta, counts.max(), law.n_regions))
     b = np.full((counts.max(), law.n_regions), np.inf)
+    own, rows, ends = law.open_rows
+    ends = np.where(own, ends, np.inf)
     for i, (start, count) in enumerate(zip(law.starts, counts, strict=True)):
-        A[:, :count, i] = law.A[start : start + count].T
-        b[:count, i] = law.b[start : start + count]
+        A[:, :count, i] = rows[start : start + count].T
+        b[:count, i] = ends[start : start + count]
     return {
         "gains": law.gains / half_range[:, None],
         "offsets": (law.offsets - middle) / half_range,

@@ -28,6 +28,7 @@ from sb3_yann import (
     improve,
 )
 from sb3_yann.audit.reward import CostMismatchWarning
+from sb3_yann.compare import TOO_LITTLE
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import Check, Improvement, confirmation, imitation
 from sb3_yann.improvement.imitation import Teacher, fit_layer
@@ -160,6 +161,30 @@ def test_whatever_is_taught_nothing_worse_is_accepted(monkeypatch, share) -> Non
     before = bits(model)
     found = improve(model, Spring, **FEW)
     assert not found.accepted and found.reason and bits(model) == before
+
+
+def test_ten_starts_that_show_no_gain_leave_it_to_the_confirmation(monkeypatch) -> None:
+    check = module.SimulatorTrial.check
+
+    def none_gains(trial, *given, final):
+        found, rest = check(trial, *given, final=final)
+        return found if final else replace(found, change=1e-3, accepted=False), rest
+
+    monkeypatch.setattr(module.SimulatorTrial, "check", none_gains)
+    assert improve(problem(), Spring, **FEW).accepted
+
+
+def test_too_little_a_gain_is_confirmed_once(monkeypatch) -> None:
+    asked = []
+
+    def little(*given):
+        found, trial = confirmation.confirm(*given)
+        asked.append(found)
+        return replace(found, accepted=False, reason=f"-.07 %: {TOO_LITTLE}"), trial
+
+    monkeypatch.setattr(module, "confirm", little)
+    assert not improve(problem(), Spring, **FEW).accepted
+    assert len(asked) == 1
 
 
 def test_what_was_learnt_before_is_kept_or_bettered() -> None:

@@ -25,16 +25,18 @@ def pack(
     rows: Array,
     starts: Integers,
     bounds: Array,
+    box: Array,
     tolerances: tuple[float, float],
     flags: tuple[bool, bool],
     walk: tuple[Integers, int, Array] | None = None,
 ) -> tuple[Array, Integers]:
     """Return a law as one array of floats and one of whole numbers, for the functions below.
 
-    ``rows`` are [A b] (q, n + 1) of all regions, ``bounds`` u_min and u_max (2, m). ``tolerances``
-    tell how far outside counts as inside and which slacks tie, ``flags`` whether the input is zero
-    outside and whether no regions overlap. The regions are scanned, or a ``walk`` goes from region
-    to region: the one beyond each row, where it begins, and at which point (n,).
+    ``rows`` are [A b] (q, n + 1) of all regions, ``bounds`` u_min and u_max (2, m), ``box`` its
+    middle and 1 / half-widths (2, n). ``tolerances`` tell how far outside counts as inside and
+    which slacks tie, ``flags`` whether the input is zero outside and whether no regions overlap in
+    the box. Regions are scanned, or in the box a ``walk`` goes from one to the next: the region
+    beyond each row, where it begins, and at which point (n,).
     """
     (p, m, n) = gains.shape
     q = len(rows)
@@ -45,7 +47,7 @@ def pack(
         neighbors, first, inside = walk
         header[-1] = 1 + first
         at_start = rows[:, -1] - rows[:, :-1] @ inside
-    floats = (np.array(tolerances), rows, gains, offsets, bounds, at_start)
+    floats = (np.array(tolerances), rows, gains, offsets, bounds, box, at_start)
     whole = (header, starts, [q], neighbors)
     packed = np.hstack([np.ravel(each) for each in whole]).astype(np.int64)
     return np.hstack([np.ravel(each) for each in floats]), packed
@@ -53,7 +55,7 @@ def pack(
 
 @compiled()
 def _places(whole: Integers) -> tuple[int, int, int, int]:
-    """Return where gains, offsets, bounds and what comes after them begin in the floats."""
+    """Return where gains, offsets, bounds and the box begin in the floats."""
     gains = ROWS + whole[3] * (whole[0] + 1)
     offsets = gains + whole[2] * whole[1] * whole[0]
     bounds = offsets + whole[2] * whole[1]
@@ -84,6 +86,7 @@ def _best(
     theta: Array,
     at: int,
     known: float,
+    disjoint: bool,
 ) -> tuple[int, float]:
     """Return the first region whose smallest slack ties with the largest, and the largest.
 
@@ -91,7 +94,6 @@ def _best(
     disjoint ones the first that surely holds theta ends the search.
     """
     n = whole[0]
-    disjoint = whole[5] == 1
     best = 0
     largest = -np.inf
     low = known - floats[1] * (1 + abs(known))
@@ -130,7 +132,7 @@ def _best(
 def walk_to(floats: Array, whole: Integers, theta: Array, at: int) -> int:
     """Return the region where a line from the start of the walk ends, or where it gets lost."""
     n = whole[0]
-    at_start = _places(whole)[3]
+    at_start = _places(whole)[3] + 2 * n
     neighbors = HEADER + whole[2] + 1
     region: int = whole[6] - 1
     reached = 0.0
@@ -162,21 +164,28 @@ def _choose(
     """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite.
 
     Region ``near``, if that is not negative, is asked first: of disjoint ones no other is as good.
+    Beyond the box, where they may overlap, all are compared, and it counts how far beyond.
     """
-    for j in range(whole[0]):
+    n = whole[0]
+    box = _places(whole)[3]
+    room = np.inf
+    for j in range(n):
         if not np.isfinite(theta[at, j]):
             return -1, np.nan
-    if near >= 0 and whole[5] == 1:
+        room = min(room, 1 - abs(theta[at, j] - floats[box + j]) * floats[box + n + j])
+    disjoint = whole[5] == 1 and room >= -floats[0]
+    if near >= 0 and disjoint:
         inside = _slack(floats, whole, near, theta, at, SURELY_INSIDE)
         if inside >= SURELY_INSIDE:
             return near, inside
     known = -np.inf
-    if whole[6] > 0:
+    if whole[6] > 0 and disjoint:
         region = walk_to(floats, whole, theta, at)
         known = _slack(floats, whole, region, theta, at, -np.inf)
         if known >= SURELY_INSIDE:
             return region, known
-    return _best(floats, whole, theta, at, known)
+    region, inside = _best(floats, whole, theta, at, known, disjoint)
+    return region, min(inside, room)
 
 
 @compiled()

@@ -47,7 +47,7 @@ static real slack_of_region(int region, const real theta[N_THETA], real low)
 static real nearly(real slack) { return slack - TIE * (ONE + FABS(slack)); }
 
 /* The first region that ties with the best. `known` is the slack of some region. */
-static int scan(const real theta[N_THETA], real known, real *inside)
+static int scan(const real theta[N_THETA], real known, int disjoint, real *inside)
 {
     int best = 0;
     real largest = -INFINITY;
@@ -57,7 +57,7 @@ static int scan(const real theta[N_THETA], real known, real *inside)
         if (slack < low) {
             continue;
         }
-        if (DISJOINT && slack >= SURELY_INSIDE) {
+        if (disjoint && slack >= SURELY_INSIDE) {
             *inside = slack;
             return i;
         }
@@ -112,15 +112,25 @@ static int walk(const real theta[N_THETA])
 static int locate(const real theta[N_THETA], real *inside)
 {
     real known = -INFINITY;
+    real room = ONE; /* how far inside the box */
+    for (int j = 0; j < N_THETA; j++) {
+        const real left = ONE - FABS(theta[j] - box_middle[j]) * box_per_half[j];
+        room = left < room ? left : room;
+    }
+    const int disjoint = DISJOINT && room >= -TOLERANCE; /* beyond it regions may overlap */
 #if SEARCH_BY_WALK
-    const int found = walk(theta);
-    known = slack_of_region(found, theta, -INFINITY);
-    if (known >= SURELY_INSIDE) {
-        *inside = known;
-        return found;
+    if (disjoint) {
+        const int found = walk(theta);
+        known = slack_of_region(found, theta, -INFINITY);
+        if (known >= SURELY_INSIDE) {
+            *inside = known;
+            return found;
+        }
     }
 #endif
-    return scan(theta, known, inside);
+    const int region = scan(theta, known, disjoint, inside);
+    *inside = room < *inside ? room : *inside;
+    return region;
 }
 
 /* ---- Networks: exactly zero before they have learnt ---- */

@@ -60,7 +60,7 @@ def test_shapes_follow_those_of_theta(batch: tuple[int, ...]) -> None:
 
 
 def test_nearest_is_the_clipped_law_of_the_region_violated_least() -> None:
-    law = law_of("benchmark")
+    law = law_of("terminal set")
     points = far_points(law)
     infeasible = points[~law.in_domain(points)]
     assert len(infeasible) > 100
@@ -69,15 +69,36 @@ def test_nearest_is_the_clipped_law_of_the_region_violated_least() -> None:
     np.testing.assert_array_equal(law(infeasible), np.clip(affine, -1, 1))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("asymmetric input bounds", 0.0), ("zero input not allowed", 0.2)]
-)
-def test_zero_is_no_input_outside_or_the_bound_nearest_to_it(name: str, value: float) -> None:
-    law = law_of(name, "zero_input")
+@pytest.mark.parametrize(("u_min", "value"), [(-0.2, 0.0), (0.2, 0.2)])
+def test_zero_is_no_input_outside_or_the_bound_nearest_to_it(u_min: float, value: float) -> None:
+    law = law_of("asymmetric input bounds", "zero_input")
+    law = dataclasses.replace(law, u_min=np.array([u_min]))
     points = far_points(law)
     infeasible = points[~law.in_domain(points)]
     assert len(infeasible) > 100
     np.testing.assert_array_equal(law(infeasible), value)
+
+
+@pytest.mark.parametrize(
+    "name", ["benchmark", "reactor", "four states, two inputs", "zero input not allowed"]
+)
+def test_beyond_the_box_regions_go_on_as_the_online_law_does(name: str) -> None:
+    law = law_of(name)
+    rng = np.random.default_rng(0)
+    beyond = law.theta_max + 0.3 * rng.uniform(size=(500, law.n_theta)) * law.theta_max
+    beyond = beyond * rng.choice([-1.0, 0.3, 1.0], size=beyond.shape)
+    assert np.mean(np.any((beyond < law.theta_min) | (beyond > law.theta_max), axis=1)) > 0.5
+    off = np.abs(law(beyond) - solved(name).online()(beyond))
+    assert np.mean(off.max(axis=1) < 1e-9) > 0.99
+    assert off.max() < 0.01
+    assert not law.in_domain(law.theta_max * 1.01)  # nothing was proved there
+
+
+def test_a_region_that_ends_at_the_box_alone_holds_everywhere() -> None:
+    law = law_of("nothing bounded")
+    far = far_points(law)
+    assert law.n_regions == 1
+    np.testing.assert_allclose(law(far), far @ law.gains[0].T)
 
 
 def arrays_with(**changes: Any) -> Callable[[Path], None]:
