@@ -41,7 +41,10 @@ class Shuffled(Sampled):
     starts = (-3, 3)
     steps = 20
 
-    def __init__(self, order: list[int], noise: float = 0.0, gain: float = 1.0) -> None:
+    def __init__(
+        self, order: list[int], noise: float = 0.0, gain: float = 1.0, load: float = 0.0
+    ) -> None:
+        self.load = load
         self.order = order
         self.noise = noise
         self.gain = gain
@@ -50,7 +53,7 @@ class Shuffled(Sampled):
         return MPC.stage_cost(self.x, u)
 
     def moved(self, u):
-        return MODEL.step(self.x, self.gain * u)
+        return MODEL.step(self.x, self.gain * u) + [self.load, 0, 0]
 
     def shown(self) -> np.ndarray:
         return self.x[self.order] + self.noise * self.np_random.normal(size=3)
@@ -78,6 +81,16 @@ def test_another_order_is_told_with_what_to_show(order: list[int]) -> None:
             Shuffled(order), lambda x: x[back], Shuffled.observation_space
         )
     )
+
+
+def test_another_order_is_told_where_the_plant_rests_beside_its_model() -> None:
+    as_meant, swapped = Shuffled([0, 1, 2], load=1.0), Shuffled([1, 0, 2], load=1.0)
+    as_meant.steps = swapped.steps = 60
+    (message,) = told(swapped)
+    assert "in the order ['b', 'a', 'c']" in message
+    # Both errors are large, and one is by far larger.
+    assert "errs by 469 % of a step, and by 2987 % as it is" in message
+    assert not told(as_meant)
 
 
 TANKS = LinearModel(
