@@ -366,7 +366,7 @@ class Commissioning:
         found = improve(self.model, twin, rounds=self.rounds, updates=self.updates, seed=seed)
         before = found.before
         if found.accepted or (before is not None and before.accepted and not state.is_kept):
-            return wider, "accepted", f"{said}{100 * found.change:+.2f} % in the twin."
+            return wider, "accepted", f"{said}{found.change_in_words}."
         self._become(self._acting, state.max_correction)
         return state, verdict, f"{said}{found.reason}"
 

@@ -406,7 +406,10 @@ class PiecewiseAffine(PlantLaw):
         return np.asarray(self.gains[self.locate(theta)])
 
     def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
-        """Tell whether the MPC has a solution at theta, for each row of a batch."""
+        """Tell whether the box holds theta, in deviations, and the MPC has a solution there.
+
+        One answer for each row of a batch.
+        """
         return np.asarray(self._located(theta)[1] >= -self.tolerance)
 
     def _located(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
@@ -442,8 +445,11 @@ class PiecewiseAffine(PlantLaw):
         half = (self.theta_max - self.theta_min)[entry] / 2
         own = (np.count_nonzero(self.A, axis=1) > 1) | ~(off < 1e-9 * half)
         endless = self.starts[~np.logical_or.reduceat(own, self.starts)]
-        A, b = self.A.copy(), self.b.copy()
-        own[endless], A[endless], b[endless] = True, 0.0, 1.0
+        A = self.A.copy()
+        b = self.b.copy()
+        own[endless] = True
+        A[endless] = 0.0
+        b[endless] = 1.0
         return own, A, b
 
     @property

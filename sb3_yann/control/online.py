@@ -155,7 +155,7 @@ class OnlineLaw(PlantLaw):
         return inputs if points.ndim == 2 else inputs[0]
 
     def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
-        """Tell whether the MPC has a solution at theta, for each row of a batch."""
+        """Tell whether the MPC has a solution at theta, in deviations, for each row of a batch."""
         points, rows = self._points(theta)
         return self._answers(rows)[1].reshape(points.shape[:-1])
 

@@ -148,7 +148,7 @@ class Cost:
         q = len(data["b"])
         n_obs = data["obs_matrix"].shape[1]
         widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]
-        search = 2 * q * n + (q * n if data["neighbors"].size else 0)
+        search = n + 2 * q * n + (q * n if data["neighbors"].size else 0)
         products = sum(a * b for a, b in zip([n, *widths], widths, strict=False))
         hidden = sum(widths[:-1])
         program = 0

@@ -39,7 +39,7 @@ class Exported:
     --------
     >>> from sb3_yann_envs import problems
     >>> export(problems.cstr().explicit(), "reactor.npz").cost.multiplications
-    694
+    218
     """
 
     paths: tuple[Path, ...]

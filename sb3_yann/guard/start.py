@@ -89,8 +89,9 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
             raise ValueError(
                 f"The MPC played two episodes of the guard's env {name} from the seed {seed}, "
                 f"at costs of {first:g} and {second:g}. Episodes are compared in pairs: all that "
-                "is random in the env must come from self.np_random. If it draws from numpy's "
-                "global generator, wrap it in sb3_yann.wrappers.SeededGlobals."
+                "is random in the env must come from self.np_random, and no wrapper may remember "
+                "earlier episodes, as NormalizeReward does. If it draws from numpy's global "
+                "generator, wrap it in sb3_yann.wrappers.SeededGlobals."
             )
     if len(seeds) > 1 and _all_alike(mpc):
         warn(

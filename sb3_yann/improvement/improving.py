@@ -696,7 +696,8 @@ class _Work:
                 note = found.reason or "no gain in the simulator"
                 if found.safe and found.change - promised < 2 * best:
                     # Ten starts may hold none that gains: the confirmation has others.
-                    weights, note = self.weights(), ""
+                    weights = self.weights()
+                    note = ""
             kept = useful and found.accepted and -found.logged >= PROMISED * teacher.gain
             known = -found.logged >= PROMISED * promised  # else the model has to learn more
             if kept or (number and stalls and known):

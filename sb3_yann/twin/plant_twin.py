@@ -43,6 +43,7 @@ from sb3_yann.twin.selection import (
     without_each_fold,
 )
 from sb3_yann.twin.trust import (
+    ALONE,
     Trust,
     UntrustedTwinError,
     costs_of_each,
@@ -279,7 +280,11 @@ class PlantTwin(LearntModel):
         """
         share = np.where(self.trust.moves > 0, self.trust.excitation, np.inf)
         loosest = labels_of(self.problem.model)[1][int(np.argmin(share))]
-        return forecast(self.judges, self.episodes, self.starts, act, loosest)
+        found = forecast(self.judges, self.episodes, self.starts, act, loosest)
+        if np.min(share) < ALONE and "held steps" not in found.cure:  # more of the same is no help
+            cure = f"log held steps of {loosest}: its gain rests on the given B"
+            found = found._replace(cure=cure)
+        return found
 
     def env(self) -> TwinEnv:
         """Return a Gymnasium env with the twin's dynamics and the plant's spaces.

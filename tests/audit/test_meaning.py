@@ -53,7 +53,7 @@ class Shuffled(Sampled):
         return MPC.stage_cost(self.x, u)
 
     def moved(self, u):
-        return MODEL.step(self.x, self.gain * u) + [self.load, 0, 0]
+        return MODEL.step(self.x, self.gain * u) + np.array([self.load, 0, 0])
 
     def shown(self) -> np.ndarray:
         return self.x[self.order] + self.noise * self.np_random.normal(size=3)

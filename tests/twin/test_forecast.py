@@ -105,6 +105,13 @@ def test_where_it_may_cost_more_it_is_said_what_would_settle_it() -> None:
     assert said.endswith("perhaps because of a lag or a load that lasts, the change is -1 to +2 %")
 
 
+def test_more_rows_of_the_mpc_alone_are_no_advice() -> None:
+    found = twin(Lagging(0.0, 0.6))
+    assert found.trust.excitation[0] < 0.02  # the input follows the MPC
+    cure = found.forecast(lambda x: np.clip(0.9 * law_of(MPC)(x), -1, 1)).cure
+    assert cure.startswith("log held steps of u[0]")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("lag", "gain"), [(0.4, 0.4), (0.3, 0.5)])
 def test_a_twin_that_knows_no_lag_promises_nothing_that_the_plant_does_not_keep(
