@@ -225,8 +225,8 @@ class Improvement:
         """Return what leads on after a refusal."""
         _, settled, cure = self.reason.rstrip(".").partition("to settle it, ")
         if settled:
-            return f"keep the MPC and {cure}; then fit the twin anew"
-        if "too little to teach" in self.note:
+            return f"keep the MPC and {cure.partition(';')[0]}; then fit the twin anew"
+        if "too little to teach" in self.reason:
             return "keep the MPC: there is little to gain"
         if "Ctrl-C" in self.note:
             return "keep the MPC, or start again"
@@ -591,7 +591,9 @@ class _Work:
         if high < 0:
             return found
         said = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
-        return replace(found, accepted=False, reason=f"{said}: to settle it, {cure}")
+        little = max(-low, high) < RULE.least_gain
+        leads_on = "too little to teach" if little else f"to settle it, {cure}"
+        return replace(found, accepted=False, reason=f"{said}: {leads_on}")
 
     def with_simulator(
         self, env: Source | VecEnv, max_steps: int | None, seen: AffineObservation | None

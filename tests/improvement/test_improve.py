@@ -570,6 +570,11 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
             "keep the MPC: there is little to gain",
         ),
         ("the twin", "2 starts with violations", "log more episodes, of other starts"),
+        (
+            "the twin",
+            "to settle it, log held steps of u[0]; with errors that last, the change is 0 to +1 %",
+            "keep the MPC and log held steps of u[0]; then fit the twin anew",
+        ),
         ("the simulator", "max_steps = 9 are too few to go on", "give more max_steps, or keep"),
         ("the simulator", "max_steps = 9: wrap the env in a TimeLimit", "end episodes by a Time"),
         ("the simulator", "2 starts with violations", "improve(..., n_starts=80, updates=8000)"),
