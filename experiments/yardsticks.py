@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -321,7 +320,7 @@ def _plain(
         seen,
         action_noise=NormalActionNoise(zero, zero + noise) if noise > 0 else None,
         seed=seed,
-        **{**deepcopy(_SETTINGS), **settings},  # algorithms write into policy_kwargs
+        **{**copy.deepcopy(_SETTINGS), **settings},  # algorithms write into policy_kwargs
     )
     return Learner(model, Controller(model, features))
 

@@ -365,14 +365,20 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
     require_theta_order(env, problem)
 
 
-def require_theta_shown(problem: LinearMPC, theta: Array) -> None:
+def require_theta_shown(problem: LinearMPC, theta: Array, starts: Array) -> None:
     """Raise where theta (steps, n_theta), in deviations, was made of what are deviations already.
 
-    Nor may references and measured disturbances lie beyond their box in nearly all steps.
+    So it is where the states of ``starts`` (episodes, n_theta) alone say it: a law that takes one
+    number for another drives the plant off. Nor may references and measured disturbances lie beyond
+    their box in nearly all steps.
     """
     shown = problem.units.to_plant(theta)
-    if words := problem.shown_as_deviation(shown):
-        raise ValueError(f"The env is not that of the MPC. {words}")
+    begins = problem.units.to_plant(starts)
+    others = slice(problem.model.n_states, None)  # which may be read later
+    begins[:, others] = problem.theta_ss[others]
+    for rows in (shown, begins):
+        if words := problem.shown_as_deviation(rows):
+            raise ValueError(f"The env is not that of the MPC. {words}")
     room = 1e-3 * problem.theta_half
     most = 0.9  # share of the rows that must speak for it
     beyond = (shown < problem.theta_min - room) | (shown > problem.theta_max + room)

@@ -19,6 +19,7 @@ from sb3_yann._validation import (
     check_bool,
     check_bounds,
     check_choice,
+    half_widths,
     to_float,
 )
 from sb3_yann.control.model.linear_model import LinearModel
@@ -442,7 +443,7 @@ class PiecewiseAffine(PlantLaw):
         end = np.where(factor > 0, self.theta_max[entry], self.theta_min[entry])
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.abs(self.b / factor - end)
-        half = (self.theta_max - self.theta_min)[entry] / 2
+        half = half_widths(self.theta_min, self.theta_max)[entry]
         own = (np.count_nonzero(self.A, axis=1) > 1) | ~(off < 1e-9 * half)
         endless = self.starts[~np.logical_or.reduceat(own, self.starts)]
         A = self.A.copy()

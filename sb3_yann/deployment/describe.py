@@ -430,11 +430,10 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
                 np.where(np.isfinite(law.theta_max), law.theta_max, 1.0),
             ]
         ),
-        "box_middle": law.box[0],
-        "box_per_half": law.box[1],
         "per_input": 1 / half,
         "middle": middle / half,
     }
+    arrays["box_middle"], arrays["box_per_half"] = law.box
     far = MAX_THETA * np.abs(arrays["box"]).max(0)
     arrays["ends"] = np.array([law.clamp(-far), law.clamp(far)])
     arrays["bounds"][:, finite] = [[-1.0], [1.0]]  # to the bit

@@ -194,13 +194,13 @@ class Simulator:
         """
         problem = self.problem
         played = self.play(of_law(problem), seeds)
-        # As episodes begin: a law that takes one number for another drives the plant off.
-        require_theta_shown(problem, np.array([each[0] for each, _ in played.pairs]))
+        starts = np.array([each[0] for each, _ in played.pairs])
+        require_theta_shown(problem, played.steps()[0], starts)
         require_repeated(problem, self.envs, seeds[0], played.costs[0])
         if not checked:
             return played
         warn_of_order(problem, *played.steps())
-        warn_of_box(problem, np.array([each[0] for each, _ in played.pairs]))
+        warn_of_box(problem, starts)
         with self.envs.acquire(1) as (one,):
             warn_of_signs(problem, one, seeds, played)
         if not self.unaware:

@@ -101,6 +101,14 @@ def test_a_region_that_ends_at_the_box_alone_holds_everywhere() -> None:
     np.testing.assert_allclose(law(far), far @ law.gains[0].T)
 
 
+def test_a_facet_is_no_end_of_a_box_that_is_open_on_one_side() -> None:
+    law = PiecewiseAffine(
+        gains=[[[-1.0]], [[1.0]]], offsets=[[0.0], [0.0]], A=[[1.0], [-1.0]], b=[2.0, -2.0],
+        starts=[0, 1], u_min=[-9.0], u_max=[9.0], theta_min=[-np.inf], theta_max=[5.0],
+    )  # fmt: skip
+    np.testing.assert_array_equal(law([[1.0], [3.0], [-4.0]]), [[-1.0], [3.0], [4.0]])
+
+
 def arrays_with(**changes: Any) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         law = law_of("pendulum")
