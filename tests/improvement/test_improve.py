@@ -32,6 +32,7 @@ from sb3_yann.compare import TOO_LITTLE
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import Check, Improvement, confirmation, imitation
 from sb3_yann.improvement.imitation import Teacher, fit_layer
+from sb3_yann.twin.forecast import Forecast
 from sb3_yann.wrappers import SetPoint
 from twin_samples import Calm, observed_env, offset_free_problem, problem
 from weights import is_mpc
@@ -442,6 +443,14 @@ def test_in_plant_units_it_finds_the_same(source) -> None:
         found = improve(model_of(Elsewhere), Elsewhere, **FEW)
     assert plain.accepted and found.accepted
     assert found.change == pytest.approx(plain.change, rel=0.05)
+
+
+def test_a_log_that_holds_nothing_worth_having_asks_for_no_more_of_it(monkeypatch) -> None:
+    narrow = Forecast(0.0, -1e-4, 2e-4, "log about 5 episodes more")
+    monkeypatch.setattr(PlantTwin, "forecast", lambda *_: narrow)
+    found = improve(problem(), twin_of(), **FEW)
+    assert found.reason.endswith("by -0.01 to +0.02 %: too little to teach.")
+    assert found.report().splitlines()[-1].endswith("keep the MPC: there is little to gain")
 
 
 def test_what_no_check_lets_through_changes_nothing(monkeypatch) -> None:
