@@ -88,7 +88,6 @@ def test_another_order_is_told_where_the_plant_rests_beside_its_model() -> None:
     as_meant.steps = swapped.steps = 60
     (message,) = told(swapped)
     assert "in the order ['b', 'a', 'c']" in message
-    # Both errors are large, and one is by far larger.
     assert "errs by 469 % of a step, and by 2987 % as it is" in message
     assert not told(as_meant)
 
