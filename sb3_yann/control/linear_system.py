@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_yann._validation import Array, ReadOnlyArrays, is_text
+from sb3_yann._validation import Array, ReadOnlyArrays, check_type, is_text
 from sb3_yann.control.gains import Gains
 
 LARGEST_EXPONENT = 709.0
@@ -142,12 +142,6 @@ def _require_text(what: str, given: Sequence[str]) -> None:
             )
 
 
-def require_different(labels: Sequence[str]) -> None:
-    """Raise ValueError if a name stands for a state and for an input."""
-    if both := sorted({each for each in labels if labels.count(each) > 1}):
-        raise ValueError(f"{both} name a state and an input: each needs a name of its own.")
-
-
 def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
     """Return the unit of each state and input, "" where there is none.
 
@@ -168,9 +162,7 @@ def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
 
 def as_unit(what: str, given: str) -> str:
     """Return one unit, which may be empty."""
-    if not isinstance(given, str):
-        raise TypeError(f"{what} = {given!r} must be a str, such as 's'.")
-    _require_text(what, [given])
+    _require_text(what, [check_type(what, given, str, "a str, such as 's'")])
     return given
 
 

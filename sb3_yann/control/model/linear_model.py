@@ -28,7 +28,6 @@ from sb3_yann.control.linear_system import (
     completed,
     names,
     past_inputs,
-    require_different,
     with_units,
     zero_order_hold,
 )
@@ -130,32 +129,24 @@ class LinearModel(LinearSystem):
         moved = check_vector("drift", drift, n)
         if gains is not None:
             check_array("gains.values", gains.values, B.shape)
-        named = (
-            as_names("state_names", state_names, n),
-            as_names("input_names", input_names, u.size),
-        )
-        labels = [*(named[0] or names((n,))), *(named[1] or names((0, u.size)))]
-        require_different(labels)
-        step = check_positive("dt", dt)
-        kept = as_units(units, labels)
-        seen = check_indices("estimated", estimated, E.shape[1])
-        shown = None if C is None else check_array("C", C, ("q", n))
+        states = as_names("state_names", state_names, n)
+        inputs = as_names("input_names", input_names, u.size)
+        labels = [*(states or names((n,))), *(inputs or names((0, u.size)))]
+        if both := sorted({each for each in labels if labels.count(each) > 1}):
+            raise ValueError(f"{both} name a state and an input: each needs a name of its own.")
+        point = check_positive("dt", dt), x, u, E, d
         super().__init__(
             A,
             B,
-            step,
-            x,
-            u,
-            E,
-            d,
+            *point,
             notes=tuple(notes),
             drift=moved,
             gains=gains,
-            state_names=named[0],
-            input_names=named[1],
-            units=kept,
-            estimated=seen,
-            C=shown,
+            state_names=states,
+            input_names=inputs,
+            units=as_units(units, labels),
+            estimated=check_indices("estimated", estimated, E.shape[1]),
+            C=None if C is None else check_array("C", C, ("q", n)),
             time_unit=as_unit("time_unit", time_unit),
         )
 
@@ -176,14 +167,8 @@ class LinearModel(LinearSystem):
 
         Parameters
         ----------
-        A, B, E : array_like, shapes (n, n), (n, m) and (n, d)
-            Matrices in continuous time; E is optional.
-        dt : float
-            Sampling time.
-        x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
-            The operating point, zeros by default.
-        C : array_like, shape (q, n), optional
-            The outputs that sensors show.
+        A, B, dt, x_ss, u_ss, E, d_ss, C
+            As of :class:`LinearModel`, with A, B and E in continuous time.
 
         Examples
         --------
@@ -306,11 +291,7 @@ class LinearModel(LinearSystem):
 
         Parameters
         ----------
-        states, actions : array_like, shapes (T+1, n) and (T, m), or sequences of such
-            States before every action and after the last, and the inputs as they were executed.
-        dt : float
-            Sampling time.
-        disturbances, time : array_like, optional
+        states, actions, dt, disturbances, time
             As of :meth:`sb3_yann.Log.from_arrays`.
         **options
             As of :func:`sb3_yann.identify`, which also returns standard errors.
@@ -354,11 +335,7 @@ class LinearModel(LinearSystem):
         """
         if past := past_inputs(self):
             state_names, units = completed(self, past, state_names, input_names, units)
-        given: dict[str, Any] = {
-            "state_names": state_names,
-            "input_names": input_names,
-            "units": units,
-        }
+        given = {"state_names": state_names, "input_names": input_names, "units": units}
         if time_unit is not None:
             given["time_unit"] = time_unit
         found = type(self)(**{**vars(self), **given})
@@ -378,11 +355,9 @@ class LinearModel(LinearSystem):
         return describe(self)
 
     def __hash__(self) -> int:
-        """Return a hash that equal models share."""
         return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))
 
     def __repr__(self) -> str:
-        """Name the states, the inputs and the operating point."""
         states, inputs = with_units(self)
         sizes = f"states={states}, inputs={inputs}, disturbances={self.n_disturbances}"
         if self.estimated:

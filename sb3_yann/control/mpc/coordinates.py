@@ -167,15 +167,6 @@ def _after(part: slice, size: int) -> slice:
     return slice(part.stop, part.stop + size)
 
 
-def constant_box(layout: ThetaLayout, r: Bounds, d: Bounds) -> list[Bounds]:
-    """Return the boxes of r and d with their previews."""
-    loads = layout.n_disturbances - layout.n_estimated
-    ahead_r, ahead_d = layout.previews
-    found = [(np.tile(r[0], ahead_r + 1), np.tile(r[1], ahead_r + 1))]
-    low, high = (np.concatenate([np.tile(s[:loads], ahead_d + 1), s[loads:]]) for s in d)
-    return [*found, (low, high)]
-
-
 def theta_box(
     layout: ThetaLayout,
     given: tuple[Given, Given],
@@ -185,8 +176,8 @@ def theta_box(
     """Return the box of theta.
 
     ``given`` are theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
-    ``states`` (n,) stand in for them. ``others`` are the boxes of r, d, bounds and the previous
-    input, from which those given must not differ.
+    ``states`` (n,) stand in for them. ``others`` are the boxes of r and d without their previews,
+    of bounds and of the previous input, from which those given must not differ.
     """
     n = layout.n_states
     parts = []
@@ -194,7 +185,8 @@ def theta_box(
         part = fallback if value is None else to_float("theta", value)
         parts.append(part[:n] if part.shape == (layout.size,) else part)
     pieces = [check_bounds("theta", parts[0], parts[1], n), *others]
-    low, high = (np.concatenate(side) for side in zip(*pieces, strict=True))
+    settled = np.argmax(layout.lift, axis=1)
+    low, high = (np.concatenate(side)[settled] for side in zip(*pieces, strict=True))
     low, high = check_bounds("theta", low, high, layout.size)
     for name, value, stored in zip(("theta_min", "theta_max"), given, (low, high), strict=True):
         _require_same_rest(name, value, stored, layout)

@@ -28,15 +28,10 @@ HalfSpaces = tuple[ArrayLike, ArrayLike]
 def _loose(name: str, lower: Given, upper: Given) -> Bounds:
     """Return bounds that fit each other, of a size that is still open."""
     below, above = check.sides_of(name)
-    low = _as_side(below, -np.inf if lower is None else lower)
-    high = _as_side(above, np.inf if upper is None else upper)
+    low = to_float(below, -np.inf if lower is None else lower)
+    high = to_float(above, np.inf if upper is None else upper)
     check_bounds(name, low, high, max(low.size, high.size))
     return low, high
-
-
-def _as_side(name: str, value: ArrayLike) -> Array:
-    """Return a bound; one that is stored somewhere is the same array."""
-    return np.asarray(value) if check.is_kept(value) else to_float(name, value)
 
 
 def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> Bounds:
@@ -218,11 +213,6 @@ class RateLimits(ReadOnlyArrays):
             )
         weight = _square("R_du", np.zeros((0, 0)) if R_du is None else R_du)
         self._store(du_min=low, du_max=high, R_du=weight)
-
-    @property
-    def bounded(self) -> bool:
-        """Whether the change of an input is bounded."""
-        return bool(np.any(np.isfinite(np.append(self.du_min, self.du_max))))
 
     def sized(self, n_inputs: int) -> RateLimits:
         """Return it with bounds of shape (m,) and a weight of shape (m, m)."""

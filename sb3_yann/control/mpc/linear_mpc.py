@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sb3_yann import _validation as check
 from sb3_yann._validation import (
@@ -32,7 +32,7 @@ from sb3_yann.control.model.identify import Identified
 from sb3_yann.control.model.identify_outputs import IdentifiedOutputs
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.condensing import condense
-from sb3_yann.control.mpc.coordinates import constant_box, theta_box
+from sb3_yann.control.mpc.coordinates import theta_box
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
     LinearCost,
@@ -50,10 +50,7 @@ from sb3_yann.control.mpc.invariant_sets import KeptSet, completed, hard_rows, k
 from sb3_yann.control.mpc.problem import (
     MPCProblem,
     Value,
-    is_reachable,
-    layout_of,
     state_action_value,
-    steady_state,
     value,
 )
 from sb3_yann.control.mpc.report import report
@@ -208,46 +205,32 @@ class LinearMPC(MPCProblem):
         outputs = _as_group("outputs", outputs, OutputBounds).sized(n, model.state_names)
         mixed = _as_group("mixed", mixed, MixedBounds).sized(n, m)
         y = (outputs.y_min, outputs.y_max)
-        du = (rate.du_min, rate.du_max)
         soft = _as_group("soft", soft, SoftBounds).sized(x, y, mixed.soft)
         price = _as_group("price", price, LinearCost).sized(n, m)
         terminal = _as_group("terminal", terminal, Terminal)
-        limits = {"x": x, "u": u, "y": y, "du": du, "mixed": (mixed.low, mixed.high)}
-        parametric_bounds = parametric_names(parametric_bounds, limits)
-        extra: dict[str, Any] = {
-            "mixed": mixed,
-            "price": price,
-            "parametric_bounds": parametric_bounds,
-            "control_horizon": _as_control_horizon(control_horizon, horizon),
-        }
+        moves = _as_control_horizon(control_horizon, horizon)
         _require_preview_within(model, horizon, tracking.preview, d.preview)
-        layout = layout_of(model, tracking, rate, d.preview, parametric_bounds)
-        rest = constant_box(layout, (tracking.r_min, tracking.r_max), (d.d_min, d.d_max))
-        rest += [parametric_box(parametric_bounds, limits)]
+        problem = MPCProblem(
+            model, Q, R, horizon, *x, *u, *x, gamma, infeasible,
+            tracking, d, rate, outputs, soft, terminal, mixed, price, control_horizon=moves,
+        )  # fmt: skip
+        names = parametric_names(parametric_bounds, problem.limits)
+        problem = replace(problem, parametric_bounds=names)
+        layout = problem.layout
+        rest = [(tracking.r_min, tracking.r_max), (d.d_min, d.d_max)]
+        rest += [parametric_box(names, problem.limits)]
         rest += [u] if layout.n_previous else []
-        fallback = _softened_box(x, soft.x)
-        theta = theta_box(layout, (theta_min, theta_max), fallback, rest)
-        states = theta[0][:n], theta[1][:n]
-        ranges = {
-            "x": (*x, model.x_ss),
-            "theta": (*states, model.x_ss),
-            "u": (*u, model.u_ss),
-            "d": (d.d_min, d.d_max, model.d_ss),
-            "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
-            "y": (*y, outputs.C @ model.x_ss),
-        }
-        _warn_of_misread_bounds(model, ranges, layout.has_constants)
+        low, high = theta_box(layout, (theta_min, theta_max), _softened_box(x, soft.x), rest)
+        problem = replace(problem, theta_min=low, theta_max=high)
+        states = low[:n], high[:n]
+        _warn_of_misread_bounds(problem)
         _warn_of_unused_softness(soft.x, x, states)
         _warn_of_unreachable(tracking, x, states)
         _warn_of_drift(model, *states)
-        checked = (
-            model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
-            tracking, d, rate, outputs, soft,
-        )  # fmt: skip
-        ends = completed(MPCProblem(*checked, terminal, **extra))
+        problem = replace(problem, terminal=completed(problem))
         if soft.penalty is None:
-            _choose_penalty(MPCProblem(*checked, ends, **extra).deviations)
-        super().__init__(*checked, ends, **extra)
+            _choose_penalty(problem.deviations)
+        super().__init__(**{each.name: getattr(problem, each.name) for each in fields(problem)})
         if not np.any(model.B):
             raise ValueError(
                 "B of the model is zero: no input does anything, so there is nothing to control. "
@@ -281,10 +264,13 @@ class LinearMPC(MPCProblem):
         >>> mpc.u_max.tolist(), mpc.theta_max.round(2).tolist()
         ([2.0], [3.14, 8.0])
         """
-        names = ("x_ss", "u_ss", "dt", "set_state", "get_state", "scale")
-        of_model = {name: options.pop(name) for name in names if name in options}
-        labels = ("state_names", "input_names", "units", "time_unit")
-        of_names = {name: options.pop(name) for name in labels if name in options}
+        of_model, of_names = (
+            {name: options.pop(name) for name in names.split() if name in options}
+            for names in (
+                "x_ss u_ss dt set_state get_state scale",
+                "state_names input_names units time_unit",
+            )
+        )
         model = LinearModel.from_env(env, **of_model)
         model = model.named(**of_names) if of_names else model
         with borrow(env) as borrowed:
@@ -329,27 +315,6 @@ class LinearMPC(MPCProblem):
             inputs[k] = law(thetas[k])
             thetas[k + 1] = A @ thetas[k] + B @ inputs[k]
         return self.units.to_plant(thetas), self.units.input_to_plant(inputs)
-
-    def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:
-        """Tell whether the steady state for r (p,) and d (d,) lies within the bounds of x, u and y.
-
-        Both may be batches; None is the operating point. Soft bounds count too.
-        """
-        return is_reachable(self, r, d)
-
-    def steady_state(self, r: Given = None, d: Given = None) -> tuple[Array, Array]:
-        """Return x_s (n,) and u_s (m,) for the reference r (p,) and disturbance d (d,).
-
-        Where several steady states have ``C x_s = r``, the one with the smallest
-        ``x_s'Q x_s + u_s'R u_s``.
-
-        Raises
-        ------
-        ValueError
-            If it lies beyond a bound of x, u or y: the law then rests elsewhere, within the bounds,
-            and the stage cost counts from this point all the same.
-        """
-        return steady_state(self, r, d)
 
     def stage_cost(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the stage cost, without penalties, at theta (..., n_theta) and u (..., m).
@@ -659,14 +624,24 @@ def _warn_of_unreachable(tracking: Tracking, bounds: Bounds, box: Bounds) -> Non
         )
 
 
-def _warn_of_misread_bounds(
-    model: LinearModel, ranges: Mapping[str, tuple[Array, Array, Array]], has_constants: bool
-) -> None:
+def _warn_of_misread_bounds(problem: MPCProblem) -> None:
     """Warn of bounds that seem to be deviations, or in which the law cannot rest.
 
-    Ranges are lower and upper bounds, and the operating point between them, by name: "x", "theta"
-    of the states, "u", and others. References and disturbances are other places to rest at.
+    References and disturbances are other places to rest at.
     """
+    model = problem.model
+    tracking = problem.tracking
+    d = problem.disturbances
+    states = problem.layout.state
+    has_constants = problem.layout.has_constants
+    ranges = {
+        "x": (*problem.limits["x"], model.x_ss),
+        "theta": (problem.theta_min[states], problem.theta_max[states], model.x_ss),
+        "u": (*problem.limits["u"], model.u_ss),
+        "d": (d.d_min, d.d_max, model.d_ss),
+        "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
+        "y": (*problem.limits["y"], problem.outputs.C @ model.x_ss),
+    }
     left_out = {name: (low > point) | (high < point) for name, (low, high, point) in ranges.items()}
     for name, (lower, upper, points) in ranges.items():
         for i in np.flatnonzero(left_out[name] & (lower < 0) & (upper > 0))[:1]:

@@ -91,13 +91,22 @@ class MPCProblem(ReadOnlyArrays):
     @property
     def has_rate_bounds(self) -> bool:
         """Whether the change of an input is bounded."""
-        return self.rate.bounded
+        return bool(np.any(np.isfinite([self.rate.du_min, self.rate.du_max])))
 
     @cached_property
     def layout(self) -> ThetaLayout:
         """What theta holds."""
+        model = self.model
         ahead = self.disturbances.preview
-        return layout_of(self.model, self.tracking, self.rate, ahead, self.parametric_bounds)
+        return ThetaLayout(
+            model.n_states,
+            len(self.tracking.C),
+            model.n_disturbances,
+            n_previous=model.n_inputs if np.any(self.rate.R_du) or self.has_rate_bounds else 0,
+            n_estimated=len(model.estimated) if ahead else 0,
+            previews=(self.tracking.preview, ahead),
+            bounds=self.parametric_bounds,
+        )
 
     @cached_property
     def blocks(self) -> tuple[int, ...]:
@@ -320,6 +329,53 @@ class MPCProblem(ReadOnlyArrays):
         x_unit = np.where(np.isfinite(x_unit), x_unit, 1.0)
         return steady_states(self.model, self.tracking.C, self.Q, self.R, x_unit, self.u_half)
 
+    def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:
+        """Tell whether the steady state for r (p,) and d (d,) lies within the bounds of x, u and y.
+
+        Both may be batches; None is the operating point. Soft bounds count too.
+        """
+        return np.asarray(np.all(margins(self, r, d) >= 0, axis=-1))
+
+    def steady_state(self, r: Given = None, d: Given = None) -> tuple[Array, Array]:
+        """Return x_s (n,) and u_s (m,) for the reference r (p,) and disturbance d (d,).
+
+        Where several steady states have ``C x_s = r``, the one with the smallest
+        ``x_s'Q x_s + u_s'R u_s``.
+
+        Raises
+        ------
+        ValueError
+            If it lies beyond a bound of x, u or y: the law then rests elsewhere, within the bounds,
+            and the stage cost counts from this point all the same.
+        """
+        constant = _constants(self, r, d)
+        if constant.ndim != 1:
+            raise ValueError(
+                f"r and d make {len(constant)} points, and steady_state takes one: r (p,) and d "
+                "(d,)."
+            )
+        room = margins(self, r, d)
+        x = self.units.to_plant(self.steady_states.x @ constant)
+        u = self.units.input_to_plant(self.steady_states.u @ constant)
+        if np.any(room < 0):
+            sizes = {kind: len(self.limits[kind][0]) for kind in BOUNDED_KINDS}
+            names = [(name, f"[{i}]") for name, size in sizes.items() for i in range(size)]
+            sides = [
+                f"{a}{i} {side} {a}_{end}{i}"
+                for side, end in ((">", "max"), ("<", "min"))
+                for a, i in names
+            ]
+            broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
+            p = len(self.tracking.C)
+            shown = constant + self.theta_ss[self.layout.now]
+            raise ValueError(
+                f"The reference r = {shown[:p].tolist()} with d = {shown[p:].tolist()} is not "
+                f"reachable: its steady state is x_s = {x.tolist()}, u_s = {u.tolist()}, and "
+                f"{broken}. Ask is_reachable(r, d) first, or choose a reference nearer to the "
+                "operating point."
+            )
+        return x, u
+
     @cached_property
     def error_system(self) -> ErrorSystem:
         """The coordinates about the steady state in which the cost is quadratic."""
@@ -343,11 +399,9 @@ class MPCProblem(ReadOnlyArrays):
         return found
 
     def __hash__(self) -> int:
-        """Return a hash that equal problems share."""
         return hash((self.model, self.horizon, self.Q.tobytes(), self.R.tobytes()))
 
     def __repr__(self) -> str:
-        """Name the sizes, the bounds and what else there is."""
         sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
         if self.control_horizon is not None:
@@ -373,36 +427,9 @@ def _bounds_in_words(name: str, lower: Array, upper: Array) -> str:
     )
 
 
-def layout_of(
-    model: LinearModel,
-    tracking: Tracking,
-    rate: RateLimits,
-    load_preview: int = 0,
-    bounds: tuple[str, ...] = (),
-) -> ThetaLayout:
-    """Return what theta holds in a problem with these parts.
-
-    ``load_preview`` is that of the measured disturbances, and ``bounds`` change at run time.
-    """
-    return ThetaLayout(
-        model.n_states,
-        len(tracking.C),
-        model.n_disturbances,
-        n_previous=model.n_inputs if np.any(rate.R_du) or rate.bounded else 0,
-        n_estimated=len(model.estimated) if load_preview else 0,
-        previews=(tracking.preview, load_preview),
-        bounds=bounds,
-    )
-
-
 TOLERANCE = 1e-9
 """How far beyond a bound a steady state still counts as within, relative to the bound."""
 BOUNDED_KINDS = "x", "u", "y", "mixed"
-
-
-def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
-    """Tell whether the steady state lies within the bounds, see :meth:`LinearMPC.is_reachable`."""
-    return np.asarray(np.all(margins(problem, r, d) >= 0, axis=-1))
 
 
 def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
@@ -417,35 +444,6 @@ def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
     room = np.concatenate([high - value, value - low], axis=-1)
     bound = np.abs(np.concatenate([high, low]))
     return np.asarray(room + TOLERANCE * np.where(np.isfinite(bound), bound, 0.0))
-
-
-def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]:
-    """Return x_s and u_s, see :meth:`LinearMPC.steady_state`."""
-    constant = _constants(problem, r, d)
-    if constant.ndim != 1:
-        raise ValueError(
-            f"r and d make {len(constant)} points, and steady_state takes one: r (p,) and d (d,)."
-        )
-    room = margins(problem, r, d)
-    x = problem.units.to_plant(problem.steady_states.x @ constant)
-    u = problem.units.input_to_plant(problem.steady_states.u @ constant)
-    if np.any(room < 0):
-        sizes = {kind: len(problem.limits[kind][0]) for kind in BOUNDED_KINDS}
-        names = [(name, f"[{i}]") for name, size in sizes.items() for i in range(size)]
-        sides = [
-            f"{a}{i} {side} {a}_{end}{i}"
-            for side, end in ((">", "max"), ("<", "min"))
-            for a, i in names
-        ]
-        broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
-        p = len(problem.tracking.C)
-        shown = constant + problem.theta_ss[problem.layout.now]
-        raise ValueError(
-            f"The reference r = {shown[:p].tolist()} with d = {shown[p:].tolist()} is not "
-            f"reachable: its steady state is x_s = {x.tolist()}, u_s = {u.tolist()}, and {broken}. "
-            "Ask is_reachable(r, d) first, or choose a reference nearer to the operating point."
-        )
-    return x, u
 
 
 def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:

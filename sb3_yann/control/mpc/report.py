@@ -12,7 +12,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.linear_system import labels_of, labels_of_outputs
 from sb3_yann.control.mpc.condensing import condense
-from sb3_yann.control.mpc.problem import MPCProblem, is_reachable
+from sb3_yann.control.mpc.problem import MPCProblem
 from sb3_yann.control.online import Law, OnlineLaw
 
 LOOP_STEPS = 50  # of a closed loop on the model
@@ -108,7 +108,7 @@ def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> It
     if len(problem.tracking.C):
         parts = problem.layout
         now = np.split(points[:, parts.now], [parts.n_references], axis=1)
-        share = _percent(is_reachable(problem, *now).sum(), len(points))
+        share = _percent(problem.is_reachable(*now).sum(), len(points))
         yield f"  {share} have a reachable steady state, at other set-points some cost stays;"
     kept = _stay_feasible(problem, law, feasible).sum() if len(feasible) else 0
     kept_share = f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible"
