@@ -391,14 +391,15 @@ def _fit(
     updates: int,
 ) -> None:
     """Take steps of Adam on the loss of actions (rows, m) at theta (rows, n_theta)."""
-    kind = RowAdam if layer.row_gradients else th.optim.Adam
+    kind = RowAdam if layer.row_gradients else partial(th.optim.Adam, fused=True)
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
+    act = layer.on_rows(at)
     what = "the policy learns: steps of Adam"
     for k in bar(what, range(updates if len(at) else 0), timed=True):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()
-        loss = loss_of(layer(at[chosen]), to[chosen])
+        loss = loss_of(act(chosen), to[chosen])
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     optimizer.zero_grad()

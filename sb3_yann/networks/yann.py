@@ -117,10 +117,7 @@ class LawLayer(nn.Module):
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
         network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
         if theta.device.type == "cpu" and not theta.requires_grad and network.compiles:
-            from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
-
-            own = network.weights(), network.pinned_array
-            return layer_on_cpu(self._for_loops, theta, self.constants, *own, self.row_gradients)
+            return self._compiled(theta, self._for_loops)
         theta = clamp_theta(theta, self.clamped)
         law, correction = self._correction(theta)
         if self.reach is not None:
@@ -140,6 +137,25 @@ class LawLayer(nn.Module):
         given = law.detach(), theta.detach(), adds, rows, bounds, self.constants[3]
         kept: th.Tensor = _Kept.apply(output, *given)  # type: ignore[no-untyped-call]
         return kept
+
+    def _compiled(self, theta: th.Tensor, pack: Callable[[Array], Any]) -> th.Tensor:
+        from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
+
+        network: Any = self._modules["network"]
+        own = network.weights(), network.pinned_array
+        return layer_on_cpu(pack, theta, self.constants, *own, self.row_gradients)
+
+    def on_rows(self, theta: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
+        """Return the layer as a function of indices of rows of theta, whose law is found once."""
+        if theta.device.type != "cpu" or not self.network.compiles:
+            return lambda rows: self(theta[rows])
+        floats, whole, inputs, points = self._for_loops(theta.double().numpy())
+
+        def at(rows: th.Tensor) -> th.Tensor:
+            packed = floats, whole, inputs[rows], points[rows]
+            return self._compiled(theta[rows], lambda _: packed)
+
+        return at
 
     @th.no_grad()
     def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -251,13 +251,16 @@ def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("kind", [YannLayer, SharedYannLayer])
-def test_a_frozen_layer_acts_as_the_layer_and_refuses_another_width(kind: Any) -> None:
+def test_a_frozen_layer_and_one_on_rows_act_as_the_layer(kind: Any) -> None:
     layer = kind(problem().explicit(), (8, 8), max_correction=0.3)
     shake(layer, 0.3)
     layer.confine(0.3 * problem().theta_min, 0.4 * problem().theta_max)
     theta = np.random.default_rng(0).uniform(-3, 3, (50, 2))
     theta[7] = np.inf
     with th.no_grad():
-        np.testing.assert_array_equal(layer.frozen()(theta), layer(th.as_tensor(theta)).numpy())
+        acts = layer(th.as_tensor(theta)).numpy()
+        np.testing.assert_array_equal(layer.frozen()(theta), acts)
+        some = th.tensor([7, 3, 40])
+        np.testing.assert_allclose(layer.on_rows(th.as_tensor(theta))(some), acts[some], atol=1e-6)
     with pytest.raises(ValueError, match=r"theta has shape \(4, 3\), expected \(batch, 2\)"):
         layer.frozen()(np.zeros((4, 3)))

@@ -109,6 +109,15 @@ def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, ou
 
 
 @compiled()
+def _layer_of_all(x: Single, matrix: Single, zero: Single, out: Single) -> None:
+    """Write what :func:`hidden_layer` does for all rows of x, which go through one matrix."""
+    np.dot(x, matrix[:-1], out)
+    for row in range(len(out)):
+        for a in range(out.shape[1]):
+            out[row, a] = tanh(out[row, a] + matrix[-1, a]) - zero[a]
+
+
+@compiled()
 def prepared(used: Integers, nodes: Single, second: Single, pinned: Single) -> Any:
     """Return the two hidden layers of the networks in use, transposed, and what each is at zero."""
     matrices1 = transposed(first_layers(nodes, used), np.arange(len(used)))
@@ -150,11 +159,16 @@ def network(
     m = last.shape[1]
     h2 = last.shape[2] - 1
     matrices1, matrices2, zero1, zero2 = ready
+    alone = len(pinned) == 1
+    if alone:  # two thirds of the time that row by row takes
+        _layer_of_all(x, matrices1[0], zero1[0], hidden1)
+        _layer_of_all(hidden1, matrices2[0], zero2[0], hidden2)
     for row in range(batch):
         s = slot[row]
         i = used[s]
-        hidden_layer(x, row, matrices1, s, zero1, hidden1)
-        hidden_layer(hidden1, row, matrices2, s, zero2, hidden2)
+        if not alone:
+            hidden_layer(x, row, matrices1, s, zero1, hidden1)
+            hidden_layer(hidden1, row, matrices2, s, zero2, hidden2)
         for k in range(m):
             total = (np.float32(1) - pinned[i]) * last[i, k, h2]
             for j in range(h2):
@@ -196,6 +210,28 @@ def _hidden_backward(
 
 
 @compiled(fastmath=True)
+def _all_backward(
+    back: Single, x: Single, out: Single, zero: Single, pinned: float, by_matrix: Single
+) -> Single:
+    """Write the gradient by a matrix as :func:`_hidden_backward` does, that all rows go through.
+
+    Return that by what is in tanh, (batch, outputs).
+    """
+    one = np.float32(1)
+    inputs = x.shape[1]
+    through = np.empty(out.shape, np.float32)
+    by_bias = np.zeros(out.shape[1], np.float32)
+    for row in range(len(out)):
+        for a in range(out.shape[1]):
+            b = zero[a]
+            through[row, a] = back[row, a] * (one - (out[row, a] + b) * (out[row, a] + b))
+            by_bias[a] += through[row, a] - pinned * back[row, a] * (one - b * b)
+    by_matrix[:, inputs] = by_bias
+    by_matrix[:, :inputs] = np.dot(through.T, x)
+    return through
+
+
+@compiled(fastmath=True)
 def network_backward(
     back: Single,
     x: Single,
@@ -230,7 +266,8 @@ def network_backward(
     first = first_layers(nodes, used)
     matrices1 = transposed(first, np.arange(len(used)))
     zero1 = at_zero(matrices1, used, pinned)
-    zero2 = at_zero(transposed(second, used), used, pinned)
+    matrices2 = transposed(second, used)
+    zero2 = at_zero(matrices2, used, pinned)
     for row in range(batch):
         s = slot[row]
         i = used[s]
@@ -242,8 +279,14 @@ def network_backward(
                 by_last[at, c, j] += g * hidden2[row, j]
             by_last[at, c, h2] += g * (np.float32(1) - pinned[i])
         own = pinned[i]
+        if len(pinned) == 1:
+            continue
         _hidden_backward(by_2, hidden1, hidden2, row, zero2, own, s, second, i, by_second, at, by_1)
         _hidden_backward(by_1, x, hidden1, row, zero1, own, s, first, s, by_first, at, by_x)
+    if len(pinned) == 1:
+        through = _all_backward(by_2, hidden1, hidden2, zero2[0], pinned[0], by_second[0])
+        np.dot(through, matrices2[0, :-1].T, by_1)
+        _all_backward(by_1, x, hidden1, zero1[0], pinned[0], by_first[0])
     for node in range(k):  # they enter the same sum
         for s in range(by_first.shape[0]):
             for a in range(by_first.shape[1]):
