@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import Array, check_int, check_range, check_type
+from sb3_yann._validation import Array
 from sb3_yann.control.law import PiecewiseAffine
 
 
@@ -27,8 +27,6 @@ class PaperYann(nn.Module):
         p regions, q half-spaces.
     width : int
         Nodes h for each region and layer.
-    scale : float, default 0.01
-        Initial weights are uniform in [-scale, scale].
 
     Examples
     --------
@@ -37,11 +35,8 @@ class PaperYann(nn.Module):
     torch.Size([2, 1])
     """
 
-    def __init__(self, law: PiecewiseAffine, width: int, scale: float = 0.01) -> None:
+    def __init__(self, law: PiecewiseAffine, width: int) -> None:
         super().__init__()
-        check_type("law", law, PiecewiseAffine, "a PiecewiseAffine, such as LinearMPC.explicit()")
-        width = check_int("width", width, 0, "It counts nodes.")
-        scale = check_range("scale", scale, 0, np.inf, "[)")
         p = law.n_regions
         m = law.n_inputs
         n = law.n_theta
@@ -79,13 +74,13 @@ class PaperYann(nn.Module):
         order[: 2 * half] = np.roll(order[: 2 * half], half)  # an odd node is left to itself
         partner = (np.arange(p)[:, None] * width + order).ravel()
         self.register_buffer("partner", th.as_tensor(partner), persistent=False)
-        first = th.empty(p, width, n + 1).uniform_(-scale, scale)
+        first = th.empty(p, width, n + 1).uniform_(-0.01, 0.01)
         first[:, half : 2 * half] = -first[:, :half]
         first[:, 2 * half :] = 0
         first = first.reshape(p * width, n + 1)
         self.first_weight = nn.Parameter(first[:, :-1].clone())
         self.first_bias = nn.Parameter(first[:, -1].clone())
-        self.second_weight = nn.Parameter(th.empty(p * width, p * width).uniform_(-scale, scale))
+        self.second_weight = nn.Parameter(th.empty(p * width, p * width).uniform_(-0.01, 0.01))
 
     partner: th.Tensor
 

@@ -13,13 +13,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import (
-    Array,
-    check_array,
-    check_bounds,
-    check_positive,
-    check_positive_vector,
-)
+from sb3_yann._validation import Array, check_positive
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
 PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
@@ -46,12 +40,6 @@ class Ranges:
     theta_half: Array
     u_min: Array
     u_max: Array
-
-    def __post_init__(self) -> None:
-        check_positive_vector("theta_half", self.theta_half, len(self.theta_half))
-        check_bounds("u", self.u_min, self.u_max, len(self.u_min))
-        for name in ("u_min", "u_max"):
-            check_array(name, getattr(self, name), ("m",))  # finite
 
     @property
     def u_half(self) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_yann._validation import Array, check_int, check_range
+from sb3_yann._validation import Array
 
 Activation = Callable[[th.Tensor], th.Tensor]
 FEW = 32
@@ -26,17 +25,9 @@ FEW = 32
 class PairedLinear(nn.Module):
     """``x -> W_1 x + b_1 + W_2 x + b_2`` for a pair of nodes of opposite sign: zero at first."""
 
-    def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        n_stacked: int = 1,
-        scale: float = 0.01,
-    ) -> None:
+    def __init__(self, drawn: th.Tensor) -> None:
         super().__init__()
-        first = _drawn((n_stacked, 1), in_features, out_features, scale)
-        self.nodes = nn.Parameter(th.cat([first, -first], 1))
+        self.nodes = nn.Parameter(th.stack([drawn, -drawn], 1))
 
     def matrix(self) -> th.Tensor:
         """Return weights and, as the last column, biases: (n_stacked, out_features, n + 1)."""
@@ -46,24 +37,14 @@ class PairedLinear(nn.Module):
 class StackedLinear(nn.Module):
     """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names."""
 
-    def __init__(
-        self, in_features: int, out_features: int, *, n_stacked: int = 1, scale: float = 0.01
-    ) -> None:
+    def __init__(self, drawn: th.Tensor) -> None:
         super().__init__()
-        weight = _drawn((n_stacked,), in_features, out_features, scale)
-        weight[..., -1] = 0  # Theorem 2: the biases of later layers start at zero
-        self.weight = nn.Parameter(weight)
+        drawn[..., -1] = 0  # Theorem 2: the biases of later layers start at zero
+        self.weight = nn.Parameter(drawn)
 
     def matrix(self) -> th.Tensor:
         """Return weights and, as the last column, biases: (n_stacked, out_features, n + 1)."""
         return self.weight
-
-
-def _drawn(stack: tuple[int, ...], in_features: int, out_features: int, scale: float) -> th.Tensor:
-    """Return random weights and, as the last column, biases: (*stack, out_features, n + 1)."""
-    shape = check_int("out_features", out_features), check_int("in_features", in_features) + 1
-    scale = check_range("scale", scale, 0, np.inf, "[)")
-    return th.empty(*stack, *shape).uniform_(-scale, scale)
 
 
 class Rows:
@@ -127,8 +108,6 @@ class ZeroOutputNetwork(nn.Module):
     pinned : Tensor of bool, shape (n_stacked,), optional
         Networks whose output at 0 stays 0; the number of entries is the size of the stack. The
         default is one network that is not pinned.
-    scale : float, default 0.01
-        Initial weights are uniform in [-scale, scale].
 
     Examples
     --------
@@ -147,12 +126,8 @@ class ZeroOutputNetwork(nn.Module):
         *,
         activation: Activation = th.tanh,
         pinned: th.Tensor | None = None,
-        scale: float = 0.01,
     ) -> None:
         super().__init__()
-        if np.ndim(hidden) != 1 or len(hidden) not in (1, 2):
-            raise ValueError(f"hidden = {hidden!r} must name one or two widths, such as (16, 16).")
-        hidden = tuple(check_int("hidden", each) for each in hidden)
         with th.enable_grad():
             zero = th.zeros((), requires_grad=True)
             at_zero = activation(zero)
@@ -166,10 +141,12 @@ class ZeroOutputNetwork(nn.Module):
             activation = partial(_alive_at_zero, activation)
         pinned = th.zeros(1, dtype=th.bool) if pinned is None else pinned
         self.activation = activation
-        stack: dict[str, Any] = {"n_stacked": len(pinned), "scale": scale}
-        self.first = PairedLinear(in_features, hidden[0], **stack)
-        widths = (*hidden, out_features)
-        self.rest = nn.ModuleList(StackedLinear(a, b, **stack) for a, b in pairwise(widths))
+        inputs = (in_features, *hidden)
+        outputs = (*hidden, out_features)
+        sizes = zip(outputs, inputs, strict=True)
+        first, *rest = (th.empty(len(pinned), m, n + 1).uniform_(-0.01, 0.01) for m, n in sizes)
+        self.first = PairedLinear(first)
+        self.rest = nn.ModuleList(map(StackedLinear, rest))
         self.register_buffer("pinned", pinned.float()[:, None])
         names_of_tanh = (th.tanh, nn.functional.tanh)
         is_tanh = isinstance(activation, nn.Tanh) or activation in names_of_tanh
@@ -181,13 +158,11 @@ class ZeroOutputNetwork(nn.Module):
 
     def weights(self) -> tuple[nn.Parameter, ...]:
         """Return the parameters, layer by layer."""
+        # From the modules' own tables: an attribute of a module takes a microsecond to find.
         modules: Any = self._modules
-        first = modules["first"]
         rest = modules["rest"]._modules.values()
-        try:  # from the modules' own tables: an attribute of a module takes a microsecond to find
-            return (first._parameters["nodes"], *[each._parameters["weight"] for each in rest])
-        except KeyError:  # made of others, by torch.nn.utils.parametrize
-            return (first.nodes, *[each.weight for each in rest])
+        nodes = modules["first"]._parameters["nodes"]
+        return (nodes, *[each._parameters["weight"] for each in rest])
 
     @property
     def compiles(self) -> bool:
@@ -279,17 +254,12 @@ class RowAdam(th.optim.Optimizer):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
     @th.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+    def step(self) -> None:  # type: ignore[override]
         """Do one step for the rows that have a gradient."""
-        loss = None
-        if closure is not None:
-            with th.enable_grad():
-                loss = closure()
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
                     self._step(parameter, *_rows(parameter.grad), group)
-        return loss
 
     def _step(
         self, parameter: th.Tensor, rows: th.Tensor, gradient: th.Tensor, group: dict[str, Any]

@@ -8,7 +8,7 @@ import torch as th
 
 from sample_laws import box_points, critic_of, law_of
 from sb3_yann.networks import AfterstateValue, YannLayer
-from weights import later_layers, network_of, shake
+from weights import network_of, shake
 
 NAMES = ["pendulum", "reactor", "two inputs", "asymmetric bounds"]
 
@@ -150,25 +150,6 @@ def test_a_value_notices_a_change_of_its_model() -> None:
     ours.model.A.mul_(1.1)
     ours.gamma = 0.5
     assert_close(ours(points), by_torch(ours)(points))
-
-
-class Double(th.nn.Module):
-    def forward(self, weight: th.Tensor) -> th.Tensor:
-        return 2 * weight
-
-
-@pytest.mark.parametrize("name", ["layer", "value"])
-def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None:
-    module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
-    shake(module, 0.1)
-    th.nn.utils.parametrize.register_parametrization(later_layers(module)[-1], "weight", Double())
-    theta = box_points(law_of("reactor"), 50)
-    points = th.cat([theta, th.linspace(-1, 1, 50)[:, None]], 1)[:, :n]
-    ours = module(points)
-    theirs = (plain := by_torch(module))(points)
-    assert_close(ours, theirs)
-    for one, other in zip(gradients(ours, module), gradients(theirs, plain), strict=True):
-        assert_close(one, other, 1e-4)
 
 
 def test_autocast_runs_the_operations_of_torch() -> None:

@@ -17,10 +17,7 @@ from sample_laws import (
     solved,
     to_action,
 )
-from sb3_yann.networks import (
-    QuadraticStateActionValue,
-    Ranges,
-)
+from sb3_yann.networks import QuadraticStateActionValue
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
@@ -176,17 +173,3 @@ def test_model_that_is_given_says_where_the_value_is_taken() -> None:
 def test_a_prediction_model_is_tried_when_it_is_given(model, message) -> None:
     with pytest.raises(ValueError, match=message):
         critic_of("pendulum", model=model)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ((np.zeros(2), -np.ones(1), np.ones(1)), "theta_half"),
-        ((np.ones((2, 1)), -np.ones(1), np.ones(1)), "theta_half has shape"),
-        ((np.ones(2), np.ones(1), np.ones(1)), "u_min must lie below u_max"),
-        ((np.ones(2), -np.ones(1), np.ones(2)), "u_max has shape"),
-    ],
-)
-def test_ranges_that_scale_nothing_are_refused(given, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Ranges(*given)

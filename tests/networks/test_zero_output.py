@@ -122,7 +122,7 @@ def test_pinned_output_at_zero_stays_exactly_zero(activation: str, hidden: tuple
         assert th.all(output[1::2] != 0)
 
 
-# --- bad input, copies -------------------------------------------------------------------------
+# --- bad input ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("activation", [th.sigmoid, F.softplus, th.cos, th.nn.Sigmoid()])
@@ -131,24 +131,6 @@ def test_activation_that_is_not_zero_at_zero_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=r"activation\(0\) = (0\.5|0\.693147|1), but .*torch.tanh"):
         ZeroOutputNetwork(2, 1, activation=activation)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"in_features": 0}, "in_features = 0 must be a whole number of at least 1"),
-        ({"out_features": 1.5}, "out_features = 1.5 must be a whole number"),
-        ({"hidden": ()}, r"hidden = \(\) must name one or two widths, such as"),
-        ({"hidden": (4, 4, 4)}, r"hidden = \(4, 4, 4\) must name one or two widths"),
-        ({"hidden": -1}, "hidden = -1 must name one or two widths"),
-        ({"hidden": (0,)}, "hidden = 0 must be a whole number of at least 1"),
-        ({"hidden": (8, -1)}, "hidden = -1 must be a whole number of at least 1"),
-        ({"scale": -1}, "scale = -1 must be a finite number of at least 0"),
-    ],
-)
-def test_bad_argument_of_a_network_is_named(changes, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        ZeroOutputNetwork(**{"in_features": 2, "out_features": 1} | changes)
 
 
 # --- large stacks ------------------------------------------------------------------------------

@@ -55,7 +55,7 @@ def _forms(
     W, AB, M : ndarray, shapes (n + m, n + m), (n, n + m) and (n, n)
     scaling : ndarray, shape (n + 2 m,)
         Factors of z for the network; half the ranges of the inputs; their middles.
-    nodes : ndarray, shape (1, k, h1, n + 1)
+    nodes : ndarray, shape (1, 2, h1, n + 1)
     pinned : ndarray, shape (1,)
     total, y, z, x, hidden : ndarray
         What is written; total and z are zero before.
@@ -187,7 +187,6 @@ def _forms_backward(
     batch = len(y)
     n = len(M)
     m = len(W) - len(M)
-    k = nodes.shape[1]
     h = nodes.shape[2]
     one = np.float32(1)
     matrices, zeros = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
@@ -223,7 +222,7 @@ def _forms_backward(
                 by_points[row, j] += by_z * AB[i, j]
         for j in range(n, n + m):
             by_points[row, j] *= scaling[j]
-    for node in range(k):  # they enter the same sum
+    for node in range(2):  # they enter the same sum
         for a in range(h):
             for j in range(n + 1):
                 by_nodes[0, node, a, j] = by_matrix[j, a]

@@ -20,11 +20,7 @@ WEIGHT_TYPES = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], f
 
 def to_numpy(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
     """Return what compiled code takes for a tensor, without its gradient: the same memory if so."""
-    try:
-        array = tensor.numpy(force=True)
-    except TypeError:  # bfloat16, which numpy does not have
-        array = tensor.double().numpy(force=True)
-    return np.ascontiguousarray(array, dtype)
+    return np.ascontiguousarray(tensor.numpy(force=True), dtype)
 
 
 @compiled()  # not a fast one: s(b) - s(b) must be zero wherever the two are computed
@@ -48,20 +44,15 @@ def tanh(x: Any) -> Any:
 
 @compiled()
 def first_layers(nodes: Single, used: Integers) -> Single:
-    """Return the sums over the nodes, (slots, h1, n + 1); opposite nodes are added first."""
-    k, rows, columns = nodes.shape[1:]
-    sums = np.zeros((len(used), rows, columns), np.float32)
+    """Return the sums of the pairs of nodes, (slots, h1, n + 1)."""
+    rows, columns = nodes.shape[2:]
+    sums = np.empty((len(used), rows, columns), np.float32)
     # Entry by entry: arrays that are added as a whole take numba five times as long to compile.
     for s in range(len(used)):
         own = nodes[used[s]]
-        for pair in range(k // 2):
-            for a in range(rows):
-                for j in range(columns):
-                    sums[s, a, j] += own[pair, a, j] + own[k // 2 + pair, a, j]
-        if k % 2:
-            for a in range(rows):
-                for j in range(columns):
-                    sums[s, a, j] += own[k - 1, a, j]
+        for a in range(rows):
+            for j in range(columns):
+                sums[s, a, j] = own[0, a, j] + own[1, a, j]
     return sums
 
 
@@ -147,8 +138,8 @@ def network(
     slot : ndarray of int, shape (batch,)
         Where in ``used`` each row's network is.
     ready : tuple of ndarray
-        From :func:`prepared`, for nodes (p, k, h1, n + 1), of which the k are summed, and for
-        second layers (p, h2, h1 + 1).
+        From :func:`prepared`, for pairs of nodes (p, 2, h1, n + 1) and second layers (p, h2, h1 +
+        1).
     last : ndarray, shape (p, m, h2 + 1)
     pinned : ndarray, shape (p,)
         1 where the network stays zero at the origin, else 0.
@@ -254,7 +245,6 @@ def network_backward(
     (batch, m) is the gradient by the output; the others are as in :func:`network`.
     """
     batch, n = x.shape
-    k = nodes.shape[1]
     m = last.shape[1]
     h1 = second.shape[2] - 1
     h2 = last.shape[2] - 1
@@ -287,8 +277,8 @@ def network_backward(
         through = _all_backward(by_2, hidden1, hidden2, zero2[0], pinned[0], by_second[0])
         np.dot(through, matrices2[0, :-1].T, by_1)
         _all_backward(by_1, x, hidden1, zero1[0], pinned[0], by_first[0])
-    for node in range(k):  # they enter the same sum
-        for s in range(by_first.shape[0]):
+    for s in range(by_first.shape[0]):
+        for node in range(2):  # they enter the same sum
             for a in range(by_first.shape[1]):
                 for j in range(by_first.shape[2]):
                     by_nodes[s, node, a, j] = by_first[s, a, j]
