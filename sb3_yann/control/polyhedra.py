@@ -13,15 +13,14 @@ from sb3_yann._validation import Array
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal.
+    """Where ``A theta <= b``, rows of unit length, ``U = law [theta; 1]`` (v, n + 1) is optimal.
 
     The rows of ``active_set`` hold with equality, in ascending order. ``inside`` is a point well
     inside, if known. ``across`` are the active sets beyond each row, None where none is known.
     """
 
     active_set: tuple[int, ...]
-    gain: Array
-    offset: Array
+    law: Array
     A: Array
     b: Array
     inside: Array | None = None

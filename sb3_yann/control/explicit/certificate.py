@@ -74,15 +74,22 @@ class Certificate:
         """
         if not self.regions:
             self._fail("no region was found", self.center * 0)
-        self._collect()
-        self.balls = [region.ball() for region in self.regions]
+        regions = self.regions
+        self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
+        self.A = np.concatenate([region.A for region in regions])
+        self.b = np.concatenate([region.b for region in regions])
+        self.laws = np.array([self.to_inputs @ region.law for region in regions])
+        self.starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
+        self.balls = [region.ball() for region in regions]
         # Two looks at each region.
         self.timer.stage("regions checked", "and not all were checked", 2 * len(self.balls))
         for i, (middle, _) in enumerate(self.balls):
-            if not self._is_right(i, middle):
+            self.timer.tick(self.qp_effort)
+            U = self.program.solve(middle)
+            if U is None or self._error(np.array([i]), middle[None], U[None])[0] > LAW_TOL:
                 self._fail(f"the law of region {i} is not optimal inside it", middle)
             self.timer.advance()
-        refined = list(self.regions)
+        refined = list(regions)
         for i, conditions in self._conditions():
             refined[i] = self._checked(i, conditions)
             self.timer.advance()
@@ -90,33 +97,16 @@ class Certificate:
         self._require_no_doubles()
         return refined
 
-    def _collect(self) -> None:
-        """Stack the half-spaces and laws of the regions."""
-        regions = self.regions
-        self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
-        self.A = np.concatenate([region.A for region in regions])
-        self.b = np.concatenate([region.b for region in regions])
-        self.gains = np.array([self.to_inputs @ region.gain for region in regions])
-        self.offsets = np.array([self.to_inputs @ region.offset for region in regions])
-        self.starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
-
-    def _is_right(self, i: int, point: Array) -> bool:
-        """Tell whether a QP at a point has the law of region i for an answer."""
-        self.timer.tick(self.qp_effort)
-        U = self.program.solve(point)
-        return U is not None and self._error(np.array([i]), point[None], U[None])[0] <= LAW_TOL
-
     def _error(self, regions: NDArray[np.intp], points: Array, inputs: Array) -> Array:
         """Return how far laws are from the answers of a QP at points, beyond what the QP is.
 
         Constraints that hold to 1e-11 move its answer by so much times the slope of the law.
         """
-        gains = self.gains[regions]
-        first = inputs @ self.to_inputs.T
-        law = np.einsum("kvn,kn->kv", gains, points) + self.offsets[regions]
-        return np.asarray(
-            np.abs(law - first).max(axis=1) - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1)
-        )
+        laws = self.laws[regions]
+        gains = laws[..., :-1]
+        off = np.einsum("kvn,kn->kv", gains, points) + laws[..., -1] - inputs @ self.to_inputs.T
+        slope = np.abs(gains).sum(axis=2).max(axis=1)
+        return np.asarray(np.abs(off).max(axis=1) - 1e-10 * slope)
 
     def _conditions(self) -> Iterator[tuple[int, Optimality]]:
         """Yield the KKT conditions of each region."""
@@ -124,10 +114,9 @@ class Certificate:
         v, n = self.program.F.shape
         rows = len(self.program.w)
 
-        def numbers(size: int) -> float:
-            return (v + size) * (v + size + rows + n + 1)
-
-        for size, members in batches(map(len, sets), numbers):
+        for size, members in batches(
+            map(len, sets), lambda size: (v + size) * (v + size + rows + n + 1)
+        ):
             effort = effort_of_conditions(rows + n, v + size, v + size)
             self.timer.tick(len(members) * effort)
             found = optimality(self.program, [sets[k] for k in members])
@@ -137,7 +126,7 @@ class Certificate:
         """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
         region = self.regions[i]
         exact = self.to_inputs @ kkt.law
-        error = np.abs(exact - np.column_stack([self.gains[i], self.offsets[i]])).max()
+        error = np.abs(exact - self.laws[i]).max()
         if error > LAW_TOL * (1 + np.abs(exact).max()):
             self._fail(f"the law of region {i} is not optimal inside it", self.balls[i][0])
         own = np.column_stack([region.A, region.b])
@@ -153,7 +142,7 @@ class Certificate:
             b = np.append(region.b, kkt.rows[missing, -1])
             region = replace(region, A=A, b=b, across=across)
         if np.abs(kkt.law[:, :-1]).max() > 1e3:  # the walk's QR factors leave it off by 1e-13
-            region = replace(region, gain=kkt.law[:, :-1], offset=kkt.law[:, -1])
+            region = replace(region, law=kkt.law)
         return region
 
     def _missing(self, i: int, known: NDArray[np.bool_], kkt: Optimality) -> NDArray[np.intp]:
@@ -245,21 +234,17 @@ class Certificate:
             wrong = at[held[at] & (error > LAW_TOL)]
             if len(wrong):
                 self._fail(f"the law of region {i} violates the KKT conditions", points[wrong[0]])
-        for k in np.flatnonzero(~held):
-            self._require_held(points[k], inputs[k])
-
-    def _require_held(self, point: Array, U: Array) -> None:
-        """Raise unless the nearest region holds a point, and has the right law there."""
-        slacks = self._slacks(point)
-        nearest = int(np.argmax(slacks))
-        if slacks[nearest] < -INSIDE_TOL:
-            self._fail("no region covers a feasible parameter", point)
-        if self._error(np.array([nearest]), point[None], U[None])[0] > LAW_TOL:
-            self._fail(f"the law of region {nearest} violates the KKT conditions", point)
+        for k in np.flatnonzero(~held):  # the nearest region holds it, and has the right law
+            slacks = self._slacks(points[k])
+            nearest = int(np.argmax(slacks))
+            if slacks[nearest] < -INSIDE_TOL:
+                self._fail("no region covers a feasible parameter", points[k])
+            if self._error(np.array([nearest]), points[k, None], inputs[k, None])[0] > LAW_TOL:
+                self._fail(f"the law of region {nearest} violates the KKT conditions", points[k])
 
     def _require_no_doubles(self) -> None:
         """Raise if a region lies in another: both have then the same law, whatever their sets."""
-        laws = np.array([np.append(region.gain.ravel(), region.offset) for region in self.regions])
+        laws = np.array([region.law.ravel() for region in self.regions])
         keys = laws @ np.random.default_rng(0).normal(size=laws.shape[1])
         order = np.argsort(keys)
         near = np.flatnonzero(np.diff(keys[order]) < LAW_TOL * (1 + np.abs(keys[order][:-1])))

@@ -99,8 +99,7 @@ class _Walk:
         return [
             Region(
                 active_set=rows[active],
-                gain=one.law[:, :-1],
-                offset=one.law[:, -1],
+                law=one.law,
                 A=one.A,
                 b=one.b,
                 inside=one.inside,
@@ -140,20 +139,17 @@ class _Walk:
                 following.update(*map(one.across, range(len(one.labels))))
             ahead = sorted(following - self.visited)
             if not ahead:  # the facets across which these sets have no region
-                left = [(pair, self._across(*pair)) for pair in facets if self._is_open(*pair)]
+                left = [(pair, self._across(*pair)) for pair in facets]
                 ahead = sorted({active for _, active in left if active is not None})
                 facets = [pair for pair, active in left if active is not None]
 
-    def _is_open(self, one: CandidateRegion, row: int) -> bool:
-        """Tell whether it is not known what lies across a facet."""
-        if one.labels[row] == OUTER:
-            return False
+    def _across(self, one: CandidateRegion, row: int) -> int | None:
+        """Return the active set across a facet, None if it is known, or none is feasible there."""
         across = one.across(row)
         known = any(active in self.found for active in across)
-        return not known or not self.conditions.degenerate.isdisjoint(across)
-
-    def _across(self, one: CandidateRegion, row: int) -> int | None:
-        """Return the active set across a facet, None if none is new or feasible there."""
+        sure = known and self.conditions.degenerate.isdisjoint(across)
+        if sure or one.labels[row] == OUTER:
+            return None
         self.timer.tick(effort_of_lp(*one.A.shape))
         middle, distance = largest_ball(one.A, one.b, row)
         if distance <= THINNEST:  # the row only touches the region
@@ -273,11 +269,8 @@ class Conditions:
         """Yield the regions with an interior among those of some active sets."""
         rows, v = self.N.shape
         width = v + self.outer_A.shape[1] + 1
-
-        def numbers(size: int) -> float:
-            return (rows + v) * (size + width)
-
-        for size, members in batches((active.bit_count() for active in wave), numbers):
+        sizes = (active.bit_count() for active in wave)
+        for size, members in batches(sizes, lambda size: (rows + v) * (size + width)):
             if size <= v:
                 self.timer.tick(len(members) * effort_of_conditions(rows, v, size))
                 yield from self._regions([wave[i] for i in members], size)

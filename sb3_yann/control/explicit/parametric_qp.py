@@ -138,7 +138,7 @@ class ParametricQP:
         size = np.mean(np.diag(self.H) * reach**2)
         G = self.G * reach
         S = self.S * half
-        length = _row_norms(np.hstack([G, S]))
+        length = row_norms(np.hstack([G, S]))
         return replace(
             self,
             H=self.H * np.outer(reach, reach) / size,
@@ -172,7 +172,7 @@ def moderated(program: ParametricQP) -> ParametricQP:
     H[inputs:, inputs:] = np.diag(np.minimum(np.diag(H)[inputs:] * largest**2, most))
     c[inputs:] = np.minimum(c[inputs:] * largest, most)
     G[:, inputs:] *= largest
-    length = _row_norms(np.hstack([G, program.S]))
+    length = row_norms(np.hstack([G, program.S]))
     S = program.S / length[:, None]
     return replace(program, H=H, c=c, G=G / length[:, None], S=S, w=program.w / length)
 
@@ -217,15 +217,11 @@ class Optimality:
         A constraint that becomes active and depends on the others takes the place of one that it
         contains with a positive factor. If there is no such one, it contradicts them (Farkas).
         """
-        flipped = self._bits ^ (1 << int(self.labels[row]))
+        flipped = as_bits(self.active) ^ (1 << int(self.labels[row]))
         if not self.depends[row]:
             return (flipped,)
         leaves = np.flatnonzero(self.factors[row] > DEPENDENT)
         return tuple(flipped ^ (1 << self.active[each]) for each in leaves)
-
-    @cached_property
-    def _bits(self) -> int:
-        return as_bits(self.active)
 
 
 def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> list[Optimality]:
@@ -236,40 +232,10 @@ def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> lis
     """
     n = program.F.shape[1]
     active = np.array(members, dtype=int).reshape(len(members), len(members[0]))
-    laws, rows, noise, factors, depends = kkt_solution(program, active)
-    # [S w] of 0 <= S theta + w as [A b] of A theta <= b. A gradient is rounding if it is smaller
-    # than 1e-11 of what it is a sum of.
-    length = np.linalg.norm(rows[:, :, :n], axis=2)
-    constant = length <= 1e-11 * noise
-    length[constant] = np.maximum(noise[constant], 1e-300)
-    rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
-    rows[constant, :n] = 0.0
-    reach = np.abs(rows[:, :, :n]).sum(axis=2)
-    binding = rows[:, :, n] < reach
-    return [
-        Optimality(
-            active=members[i],
-            law=laws[i],
-            rows=rows[i, held],
-            labels=np.flatnonzero(held),
-            factors=factors[i, held],
-            depends=depends[i, held],
-        )
-        for i, held in enumerate(binding)
-    ]
-
-
-def kkt_solution(
-    program: ParametricQP, active: NDArray[np.intp]
-) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Return laws, slacks or multipliers as [S w], the size of their terms, factors and depends.
-
-    All are for active sets (count, size), as in :class:`Optimality`.
-    """
-    v, n = program.F.shape
+    v = len(program.c)
     count, size = active.shape
     # In unit length, however little U a constraint holds.
-    length = _row_norms(program.G)
+    length = row_norms(program.G)
     G = program.G / length[:, None]
     limit = np.column_stack([program.S, program.w]) / length[:, None]
     K = np.zeros((count, v + size, v + size))
@@ -293,7 +259,26 @@ def kkt_solution(
     depends[each, active] = False
     rows[each, active] = multipliers
     noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
-    return np.asarray(laws), np.asarray(rows), np.asarray(noise), factors, np.asarray(depends)
+    # [S w] of 0 <= S theta + w as [A b] of A theta <= b. A gradient is rounding if it is smaller
+    # than 1e-11 of what it is a sum of.
+    length = np.linalg.norm(rows[:, :, :n], axis=2)
+    constant = length <= 1e-11 * noise
+    length[constant] = np.maximum(noise[constant], 1e-300)
+    rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
+    rows[constant, :n] = 0.0
+    reach = np.abs(rows[:, :, :n]).sum(axis=2)
+    binding = rows[:, :, n] < reach
+    return [
+        Optimality(
+            active=members[i],
+            law=laws[i],
+            rows=rows[i, held],
+            labels=np.flatnonzero(held),
+            factors=factors[i, held],
+            depends=depends[i, held],
+        )
+        for i, held in enumerate(binding)
+    ]
 
 
 def as_bits(active_set: Iterable[int]) -> int:
@@ -307,7 +292,7 @@ def members_of(active: int) -> tuple[int, ...]:
 
 
 def batches(
-    sizes: Iterable[int], numbers: Callable[[int], float] = lambda size: 1.0
+    sizes: Iterable[int], numbers: Callable[[int], float]
 ) -> Iterator[tuple[int, list[int]]]:
     """Yield each size, ascending, with the indices that have it, at most 256 at a time.
 
@@ -327,10 +312,10 @@ def row_units(G: Array) -> Array:
 
     DAQP takes a row that is shorter than about 1e-6 for one that does not bind.
     """
-    return np.asarray(2.0 ** -np.round(np.log2(_row_norms(G))))
+    return np.asarray(2.0 ** -np.round(np.log2(row_norms(G))))
 
 
-def _row_norms(rows: Array) -> Array:
+def row_norms(rows: Array) -> Array:
     """Return the lengths of rows, 1 for zero rows."""
     length = np.linalg.norm(rows, axis=1)
     length[length == 0] = 1.0

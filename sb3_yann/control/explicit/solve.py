@@ -18,7 +18,7 @@ from sb3_yann._validation import Array, check_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
 from sb3_yann.control.explicit.facet_walk import walk
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, moderated
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, moderated, row_norms
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
 
@@ -28,8 +28,8 @@ def solve_explicit(
     u_min: Array,
     u_max: Array,
     infeasible: str,
-    solver: str = "walk",
-    timer: BudgetTimer | None = None,
+    solver: str,
+    timer: BudgetTimer,
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
@@ -45,7 +45,6 @@ def solve_explicit(
             "x_max), and where theta holds them, r_min and r_max, d_min and d_max, u_min and u_max."
         )
     require_sane_sizes(program, u_min, u_max)
-    timer = timer or BudgetTimer(SolveBudget())
     timer.tick()
     try:
         units = ProgramUnits(program, u_min, u_max, timer)
@@ -122,12 +121,12 @@ class ProgramUnits:
     def law(self, regions: list[Region], infeasible: str) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""
         m = len(self.u_min)
-        if self.equalities is not None:
-            regions = [self.equalities.with_all_of_U(region) for region in regions]
-        reach = self.reach[:m]
-        gains = np.stack([reach[:, None] * region.gain[:m] / self.half for region in regions])
-        offsets = np.stack([reach * region.offset[:m] for region in regions])
-        offsets = offsets - gains @ self.center
+        laws = [region.law for region in regions]
+        if self.equalities is not None:  # of all of U in place of what is left of it
+            laws = [self.equalities.free @ law + self.equalities.law for law in laws]
+        inputs = np.stack([self.reach[:m, None] * law[:m] for law in laws])
+        gains = inputs[..., :-1] / self.half
+        offsets = inputs[..., -1] - gains @ self.center
         if self.program.feedback is not None:
             gains = gains + self.program.feedback
         A = np.concatenate([region.A / self.half for region in regions])
@@ -184,8 +183,7 @@ class Equalities:
         noise = 1e-11 * (1 + size * np.linalg.norm(self.law))
         S[np.linalg.norm(S, axis=1) <= noise] = 0.0
         w[~np.any(G, axis=1) & ~np.any(S, axis=1) & (np.abs(w) <= noise)] = 0.0
-        length = np.linalg.norm(np.hstack([G, S]), axis=1)
-        length[length == 0] = 1.0
+        length = row_norms(np.hstack([G, S]))
         return replace(
             program,
             H=self.free.T @ program.H @ self.free if np.any(self.free) else np.eye(1),
@@ -194,14 +192,6 @@ class Equalities:
             G=G / length[:, None],
             S=S / length[:, None],
             w=w / length,
-        )
-
-    def with_all_of_U(self, region: Region) -> Region:
-        """Return a region with the law of U in place of that of y."""
-        return replace(
-            region,
-            gain=self.free @ region.gain + self.law[:, :-1],
-            offset=self.free @ region.offset + self.law[:, -1],
         )
 
 
@@ -349,7 +339,7 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     if not np.any(program.G):  # nothing binds U, which ppopt does not take
         timer.count()
         law = -np.linalg.solve(program.H, np.column_stack([program.F, program.c])).astype(float)
-        return [Region((), law[:, :-1], law[:, -1], *program.theta_rows())]
+        return [Region((), law, *program.theta_rows())]
 
     # Rows without U bound theta: with them in the constraints ppopt's active sets degenerate.
     moving = np.any(program.G, axis=1) | ~np.any(program.S, axis=1)
@@ -380,8 +370,7 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     return [
         Region(
             tuple(sorted(int(rows[k]) for k in one.active_set)),
-            one.A,
-            one.b.ravel(),
+            np.column_stack([one.A, one.b]),
             one.E.astype(float),  # with one parameter they are whole numbers
             one.f.ravel().astype(float),
         )

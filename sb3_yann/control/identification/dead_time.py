@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
@@ -145,21 +144,6 @@ def memory_labels(delays: Sequence[int], inputs: Sequence[str]) -> list[str]:
     ]
 
 
-def with_memory_point(
-    x_ss: ArrayLike | None, u_ss: ArrayLike | None, delays: Sequence[int]
-) -> ArrayLike | None:
-    """Return a given steady state (n,) with the inputs that rest there appended."""
-    if x_ss is None or not any(delays):
-        return x_ss
-    if u_ss is None:
-        raise ValueError(
-            "x_ss is given without u_ss, but with dead time the inputs on their way are states "
-            "too: pass both, or neither."
-        )
-    whole: Array = np.concatenate([np.ravel(x_ss), np.repeat(np.ravel(u_ss), delays)])
-    return whole
-
-
 def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Array, Array]:
     """Return A and B with the rows of the past inputs, which shift, set to what they are.
 
@@ -167,16 +151,12 @@ def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Arr
     """
     A = A.copy()
     B = B.copy()
-    row = n
-    for j, delay in enumerate(delays):
-        A[row : row + delay] = 0.0
-        B[row : row + delay] = 0.0
-        for lag in range(delay):
-            if lag:
-                A[row + lag, row + lag - 1] = 1.0
-            else:
-                B[row, j] = 1.0
-        row += delay
+    A[n:] = np.eye(len(A), k=-1)[n:]
+    B[n:] = 0.0
+    late = [j for j, delay in enumerate(delays) if delay]
+    first = n + np.cumsum([0, *(delays[j] for j in late)])[:-1]
+    A[first] = 0.0
+    B[first, late] = 1.0
     return A, B
 
 

@@ -17,7 +17,6 @@ from sb3_yann.control.identification.dead_time import (
     input_notes,
     memory_labels,
     with_memory,
-    with_memory_point,
 )
 from sb3_yann.control.identification.least_squares import (
     EXTRAPOLATED,
@@ -58,12 +57,17 @@ def fit_log(
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
     episodes = list(log.episodes)
     sizes = log.sizes
-    measured = sizes[2] > 0
     require_moving(episodes, sizes)
     episodes, sizes, delays = _delayed(episodes, sizes, delay)
-    x_ss = with_memory_point(x_ss, u_ss, delays)
     n, m, d = sizes
-    if d_ss is not None and not measured:
+    if x_ss is not None and any(delays):
+        if u_ss is None:
+            raise ValueError(
+                "x_ss is given without u_ss, but with dead time the inputs on their way are states "
+                "too: pass both, or neither."
+            )
+        x_ss = np.concatenate([np.ravel(x_ss), np.repeat(np.ravel(u_ss), delays)])
+    if d_ss is not None and not d:
         raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
     point = {"x_ss": (x_ss, n), "u_ss": (u_ss, m), "d_ss": (d_ss, d)}
     given = [
@@ -78,13 +82,26 @@ def fit_log(
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, LONG_PREDICTION))
-    system = system_of(found, sizes, given, log.dt, delays)
-    system = replace(_with_exact_memory(system, delays, sizes[0]), time_unit=log.time_unit)
+    system = replace(system_of(found, sizes, given, log.dt, delays), time_unit=log.time_unit)
+    memory = list[str]()
+    if any(delays):
+        own = n - sum(delays)
+        A, B = exact_memory(system.A, system.B, delays, own)
+        E = system.E.copy()
+        E[own:] = 0.0
+        past = memory_labels(delays, names((0, m)))
+        system = replace(system, A=A, B=B, E=E, state_names=(*names((own,)), *past))
+        rest = ", ".join(f"{each:.6g}" for each in system.u_ss)
+        memory.append(
+            f"Dead time: inputs act for {delays} samples. The states from x[{own}] on are the "
+            f"inputs on their way, {', '.join(past)}. Show them to a policy: "
+            f"sb3_yann.wrappers.PastInputs(env, {delays}, initial=[{rest}])."
+        )
     late = [] if any(delays) else input_notes(found, episodes, sizes)
     if late:
         warn(log.in_names(" ".join(late)))
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
-    notes = [*system.notes, *_memory_notes(delays, sizes, system.u_ss), *quality, *shrunk, *late]
+    notes = [*system.notes, *memory, *quality, *shrunk, *late]
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
     system = replace(system, notes=tuple(map(log.in_names, notes)))
@@ -162,32 +179,6 @@ def _delayed(
             f"delay = {delay!r}, but no episode has more than {max(delays)} steps: record longer."
         )
     return extended, (n + sum(delays), m, d), delays
-
-
-def _with_exact_memory(system: LinearSystem, delays: list[int], n: int) -> LinearSystem:
-    """Return the system with the rows of past inputs as they are, rather than as fitted."""
-    if not any(delays):
-        return system
-    A, B = exact_memory(system.A, system.B, delays, n - sum(delays))
-    E = system.E.copy()
-    E[n - sum(delays) :] = 0.0
-    memory = memory_labels(delays, names((0, len(delays))))
-    labels = (*names((n - sum(delays),)), *memory)
-    return replace(system, A=A, B=B, E=E, state_names=labels)
-
-
-def _memory_notes(delays: list[int], sizes: tuple[int, int, int], u_ss: Array) -> list[str]:
-    """Return a note on the dead time that the model holds."""
-    if not any(delays):
-        return []
-    n = sizes[0] - sum(delays)
-    inputs = names((0, sizes[1]))
-    labels = ", ".join(memory_labels(delays, inputs))
-    return [
-        f"Dead time: inputs act for {delays} samples. The states from x[{n}] on are the inputs on "
-        f"their way, {labels}. Show them to a policy: sb3_yann.wrappers.PastInputs(env, {delays}, "
-        f"initial=[{', '.join(f'{each:.6g}' for each in u_ss)}])."
-    ]
 
 
 REPEATED_SHARE = 0.05

@@ -232,14 +232,12 @@ class Past:
             spread = K @ noise @ K.T + found.covariance
             cross = K @ noise[:, some]
             at = np.ix_(some, some)
-            K[:, some] = kalman_gain(A, C[some], (spread + spread.T) / 2, own[at], cross)
+            spread = (spread + spread.T) / 2
+            C_some = C[some]
+            P = linalg.solve_discrete_are(A.T, C_some.T, spread, own[at], s=cross)
+            shown = A @ P @ C_some.T + cross
+            K[:, some] = np.linalg.solve(C_some @ P @ C_some.T + own[at], shown.T).T
         return Innovations(A, B, K, C, c, self.arx.reached, own, bool(self.rare.any()))
-
-
-def kalman_gain(A: Array, C: Array, spread: Array, noise: Array, cross: Array) -> Array:
-    """Return the gain (n, q) of the steady-state filter one step ahead."""
-    P = linalg.solve_discrete_are(A.T, C.T, spread, noise, s=cross)
-    return np.asarray(np.linalg.solve(C @ P @ C.T + noise, (A @ P @ C.T + cross).T).T)
 
 
 class Chunks:
@@ -288,10 +286,6 @@ class Chunks:
         with np.errstate(all="ignore"):
             left = self._simulate(model, weight)[0].reshape(self.y.shape)[inside]
             return mean_square(left @ np.linalg.inv(weight).T, self.read[inside] > 0)
-
-    def size(self, noise: Array) -> float:
-        """Return twice the negative log-likelihood of a sample, but for a constant."""
-        return log_determinant(noise, self.readings)
 
     def spread(self, model: Innovations) -> tuple[Array, Array]:
         """Return mean (n,) and covariance (n, n) of the states."""
@@ -379,7 +373,10 @@ def whitening(noise: Array, readings: Array) -> Array:
 
 
 def log_determinant(noise: Array, readings: Array) -> float:
-    """Return that of a covariance, each output as often as it is read."""
+    """Return that of a covariance, each output as often as it is read.
+
+    Of prediction errors it is twice the negative log-likelihood of a sample, but for a constant.
+    """
     share = readings / np.max(readings)
     try:
         return float(-2 * np.sum(share * np.log(np.diag(whitening(noise, readings)))))
@@ -421,13 +418,13 @@ def moved_by(model: Innovations, step: Array) -> Innovations:
     )
 
 
-def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
+def refined(model: Innovations, chunks: Chunks) -> Innovations:
     """Return the model of least determinant of its prediction errors' covariance near a model."""
     floor = FLOOR * np.eye(len(model.C))
     model = replace(model, noise=chunks.covariance(model) + floor)
-    size = chunks.size(model.noise)
+    size = log_determinant(model.noise, chunks.readings)
     damping = 1e-4
-    for _ in range(steps):
+    for _ in range(15):
         matrix, side = chunks.gauss_newton(model)
         scale = np.sqrt(np.diag(matrix)) + 1e-12 * np.sqrt(np.max(np.diag(matrix)))
         before = size
@@ -436,7 +433,8 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
             trial = moved_by(model, np.linalg.solve(scaled, side / scale) / scale)
             if chunks.forgets(trial):
                 noise = chunks.covariance(trial) + floor
-                now = chunks.size(noise) if np.all(np.isfinite(noise)) else np.inf
+                finite = np.all(np.isfinite(noise))
+                now = log_determinant(noise, chunks.readings) if finite else np.inf
                 if now < size:
                     model = replace(trial, noise=noise)
                     size = now

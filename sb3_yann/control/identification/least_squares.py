@@ -90,6 +90,7 @@ def regress(
     residuals = targets - reached - centered @ coefficients.T
     covariance = residuals.T @ residuals / (steps - unknowns)
     factors = np.linalg.norm(inverse, axis=1) / scale
+    real = np.sum(residuals**2, axis=0) > 1e-20 * np.sum(targets**2, axis=0)
     return Regression(
         coefficients=coefficients,
         standard_errors=np.sqrt(np.diag(covariance))[:, None] * factors,
@@ -99,7 +100,7 @@ def regress(
         factors=factors,
         correlation=(inverse / scale[:, None]) @ (inverse / scale[:, None]).T,
         covariance=covariance,
-        autocorrelation=_autocorrelation(residuals, episodes, targets),
+        autocorrelation=np.where(real, neighbors(residuals, episodes), 0.0),
         degrees_of_freedom=steps - unknowns,
         steps=steps,
         excitation=float(singular[-1] / singular[0]) if singular[0] > 0 else 0.0,
@@ -113,12 +114,6 @@ def _direction(weights: Array, scale: Array, labels: list[str]) -> str:
     factors = weights / scale
     small = np.abs(weights) <= SMALL * np.abs(weights[largest])
     return combination(np.where(small, 0.0, factors / factors[largest]), labels, 4)
-
-
-def _autocorrelation(residuals: Array, episodes: list[Episode], targets: Array) -> Array:
-    """Return the correlation of each state's residuals with those one step before."""
-    real = np.sum(residuals**2, axis=0) > 1e-20 * np.sum(targets**2, axis=0)
-    return np.asarray(np.where(real, neighbors(residuals, episodes), 0.0))
 
 
 def neighbors(residuals: Array, episodes: list[Episode]) -> Array:

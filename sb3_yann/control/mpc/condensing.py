@@ -118,7 +118,9 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
     must be that of the Riccati recursion, which loses none, to 1e-8 of the input range.
     """
     problem = problem.deviations
-    plain = _condensed(problem, None) if _growth(problem) <= GROWTH else None
+    with np.errstate(over="ignore"):
+        growth = np.float64(lqr.spectral_radius(problem.model.A)) ** problem.horizon
+    plain = _condensed(problem, None) if growth <= GROWTH else None
     if plain is not None and not _error(problem, plain[0]) > OFF / 100:
         return plain
     found = _condensed(problem, _stabilizing_feedback(problem))
@@ -135,12 +137,6 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
             "similar magnitudes."
         )
     return found
-
-
-def _growth(problem: MPCProblem) -> float:
-    """Return how many times as large the fastest mode of the model becomes over the horizon."""
-    with np.errstate(over="ignore"):
-        return float(np.float64(lqr.spectral_radius(problem.model.A)) ** problem.horizon)
 
 
 def _stabilizing_feedback(problem: MPCProblem) -> Array:

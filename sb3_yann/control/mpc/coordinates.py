@@ -245,7 +245,14 @@ def steady_states(
     size = np.maximum(np.abs(right).max(axis=0, initial=0.0), np.finfo(float).tiny)
     missed = np.abs(equations @ solution - right).max(axis=0, initial=0.0) > 1e-8 * size
     if np.any(missed):
-        raise ValueError(_why_none(model, C, missed, equations))
+        p = len(C)
+        which = [f"r[{i}]" if i < p else f"d[{i - p}]" for i in np.flatnonzero(missed)]
+        rank = int(np.linalg.matrix_rank(equations, tol=1e-10))
+        raise ValueError(
+            f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank "
+            f"{rank}, not {n + p}. Track fewer outputs, or other ones: at most as many as inputs "
+            f"({m}) can be tracked, each moved by an input at steady state."
+        )
 
     free = linalg.null_space(equations, rcond=1e-10)
     weight = linalg.block_diag(Q, R) * np.outer(unit, unit)
@@ -256,17 +263,6 @@ def steady_states(
     solution = solution - free @ inverse @ (free.T @ weight @ solution)
     solution = solution * unit[:, None]
     return SteadyStates(solution[:n], solution[n:])
-
-
-def _why_none(model: LinearModel, C: Array, missed: Array, equations: Array) -> str:
-    p = len(C)
-    which = [f"r[{i}]" if i < p else f"d[{i - p}]" for i in np.flatnonzero(missed)]
-    rank = int(np.linalg.matrix_rank(equations, tol=1e-10))
-    return (
-        f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank {rank}, "
-        f"not {model.n_states + p}. Track fewer outputs, or other ones: at most as many as inputs "
-        f"({model.n_inputs}) can be tracked, each moved by an input at steady state."
-    )
 
 
 @dataclass(frozen=True, eq=False)

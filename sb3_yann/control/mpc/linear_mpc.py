@@ -50,7 +50,6 @@ from sb3_yann.control.mpc.invariant_sets import KeptSet, completed, hard_rows, k
 from sb3_yann.control.mpc.problem import (
     MPCProblem,
     Value,
-    state_action_value,
     value,
 )
 from sb3_yann.control.mpc.report import report
@@ -220,7 +219,10 @@ class LinearMPC(MPCProblem):
         rest = [(tracking.r_min, tracking.r_max), (d.d_min, d.d_max)]
         rest += [parametric_box(names, problem.limits)]
         rest += [u] if layout.n_previous else []
-        low, high = theta_box(layout, (theta_min, theta_max), _softened_box(x, soft.x), rest)
+        width = x[1] - x[0]
+        beyond = np.where((soft.x > 0) & np.isfinite(width), BEYOND * width, 0.0)
+        box = x[0] - beyond, x[1] + beyond
+        low, high = theta_box(layout, (theta_min, theta_max), box, rest)
         problem = replace(problem, theta_min=low, theta_max=high)
         states = low[:n], high[:n]
         _warn_of_misread_bounds(problem)
@@ -378,8 +380,14 @@ class LinearMPC(MPCProblem):
 
     def state_action_terms(self, gamma: float) -> Value:
         """Return the terms of the same cost of ``[theta; u]``, as :meth:`value_terms` does."""
-        gamma = check.check_discount(gamma)
-        return state_action_value(self.deviations, self.law(), gamma)
+        after = self.value_terms(gamma)
+        own = self.deviations
+        AB = np.hstack(own.prediction)
+        return Value(
+            np.asarray(own.stage_matrix + gamma * AB.T @ after.P @ AB),
+            own.stage_slope + gamma * AB.T @ after.slope,
+            own.price.constant + gamma * after.constant,
+        )
 
     def explicit(
         self,
@@ -571,13 +579,6 @@ def _require_preview_within(model: LinearModel, horizon: int, reference: int, lo
         raise ValueError(
             "DisturbanceBounds.preview is of measured disturbances, and all are estimated."
         )
-
-
-def _softened_box(bounds: Bounds, softness: Array) -> Bounds:
-    """Return bounds moved out by `BEYOND` of their width where they are soft."""
-    width = bounds[1] - bounds[0]
-    beyond = np.where((softness > 0) & np.isfinite(width), BEYOND * width, 0.0)
-    return bounds[0] - beyond, bounds[1] + beyond
 
 
 def _warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:

@@ -493,17 +493,6 @@ def value(problem: MPCProblem, law: Law, gamma: float) -> Value:
     return Value(P, np.zeros(len(P)), 0.0)
 
 
-def state_action_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
-    """Return the same of ``[theta; u]``: the cost of u now, the law ever after."""
-    after = value(problem, law, gamma)
-    AB = np.hstack(problem.prediction)
-    return Value(
-        np.asarray(problem.stage_matrix + gamma * AB.T @ after.P @ AB),
-        problem.stage_slope + gamma * AB.T @ after.slope,
-        problem.price.constant + gamma * after.constant,
-    )
-
-
 def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
     """Return the value of the affine law at the point where the model rests under it.
 

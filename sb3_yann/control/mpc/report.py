@@ -32,8 +32,7 @@ def report(
     own = problem.deviations
     points = rng.uniform(own.theta_min, own.theta_max, (samples, problem.n_theta))
     feasible = points[law.in_domain(points)]
-    size = chain(_size(problem, law), _offset(problem))
-    parts = _parameters(problem), size, _shares(own, law, points, feasible)
+    parts = _parameters(problem), _size(problem, law), _shares(own, law, points, feasible)
     beyond = () if law is online else _beyond(own, law, online, points)
     more = beyond, _active(own, feasible), _values(problem, law, feasible)
     return "\n".join(chain(*parts, *more))
@@ -85,17 +84,10 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
         states = labels_of(problem.model)[0]
         outputs = labels_of_outputs(problem.outputs.C, problem.model.state_names)
         mixed = problem.mixed.soft
-        names = [
-            *states,
-            *outputs,
-            *(f"mixed[{i}]" for i in range(len(mixed))),
-        ]
+        names = [*states, *outputs, *(f"mixed[{i}]" for i in range(len(mixed)))]
         units = np.concatenate([problem.soft.x, problem.soft.y, mixed])
         soft = [names[i] for i in np.flatnonzero(units)]
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
-
-
-def _offset(problem: MPCProblem) -> Iterator[str]:
     if problem.layout.n_references and not problem.layout.n_disturbances:
         yield "There is no integral action: a plant that is not its model may rest beside its"
         yield "set-points. offset_free(mpc) has it, and may cost less or more on the way there:"

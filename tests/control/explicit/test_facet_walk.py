@@ -60,8 +60,7 @@ def assert_same_regions(mpc: LinearMPC) -> None:
     theirs = regions_of(mpc, "ppopt")
     assert [one.active_set for one in ours] == [one.active_set for one in theirs]
     for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(one.gain, other.gain, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(one.offset, other.offset, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(one.law, other.law, rtol=1e-9, atol=1e-9)
         assert max(reaches_beyond(one, other), reaches_beyond(other, one)) < 1e-8
         assert len(one.b) <= len(other.b)
 
@@ -181,7 +180,9 @@ def error_of(
 
 
 def with_changed_gain(regions: Regions, index: int, factor: float) -> Regions:
-    changed = dataclasses.replace(regions[index], gain=regions[index].gain * factor + factor - 1)
+    law = regions[index].law.copy()
+    law[:, :-1] = law[:, :-1] * factor + factor - 1
+    changed = dataclasses.replace(regions[index], law=law)
     return [*regions[:index], changed, *regions[index + 1 :]]
 
 
