@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,12 +32,12 @@ class LinearSystem(ReadOnlyArrays):
     notes: tuple[str, ...] = ()
     drift: Array | None = None
     gains: Gains | None = None
-    state_names: tuple[str, ...] = ()
-    input_names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
-    estimated: tuple[int, ...] = ()
+    state_names: tuple[str, ...] = field(default=(), compare=False)
+    input_names: tuple[str, ...] = field(default=(), compare=False)
+    units: tuple[str, ...] = field(default=(), compare=False)
+    estimated: tuple[int, ...] = field(default=(), compare=False)
     C: Array | None = None
-    time_unit: str = ""
+    time_unit: str = field(default="", compare=False)
 
     @property
     def step_length(self) -> str:

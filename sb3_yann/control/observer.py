@@ -163,7 +163,8 @@ class StateEstimator:
         now = np.array(y, np.float64)
         now = check_array("y", np.where(np.isnan(now), 0.0, now), (self.n_measured,))
         if u is None:
-            self.estimate = np.concatenate([self._smallest @ now, np.zeros(self.n_estimated)])
+            smallest = np.linalg.pinv(self.C) @ now
+            self.estimate = np.concatenate([smallest, np.zeros(self.n_estimated)])
         else:
             u = check_array("u", u, (self.model.n_inputs,))
             d = check_array("d", np.zeros(self.n_known) if d is None else d, (self.n_known,))
@@ -186,11 +187,6 @@ class StateEstimator:
     def expected(self, u: ArrayLike, d: ArrayLike | None = None) -> Array:
         """Return the outputs y (q,) that the estimate makes expect after u (m,) and measured d."""
         return np.asarray(self.C_aug @ self._after(u, d))
-
-    @cached_property
-    def _smallest(self) -> Array:
-        """The matrix (n, q) from outputs to the smallest state that gives them."""
-        return np.asarray(np.linalg.pinv(self.C))
 
     @cached_property
     def resting(self) -> Array:
@@ -246,13 +242,8 @@ class StateEstimator:
             ahead = A @ own + next_step
             moved = A - ahead @ C[seen]
             shared = ahead @ cross[:, seen].T
-            P = (
-                moved @ P @ moved.T
-                + W
-                + ahead @ V[np.ix_(seen, seen)] @ ahead.T
-                - shared
-                - shared.T
-            )
+            of_sensors = ahead @ V[np.ix_(seen, seen)] @ ahead.T
+            P = moved @ P @ moved.T + W + of_sensors - shared - shared.T
         return total / (period / self.every)
 
     def _radius(self, gain: Array) -> float:

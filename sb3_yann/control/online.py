@@ -56,14 +56,12 @@ class OnlineLaw(PlantLaw):
 
     Attributes
     ----------
-    H, F, c, G, w, S : ndarray
+    H, F, c, G, w, S, n_slacks, n_input_rows, feedback
         As in :class:`ParametricQP`.
     u_min, u_max : ndarray, shape (m,)
         Bounds of the input, infinite where there is none.
     theta_min, theta_max : ndarray, shape (n,)
         The box of theta; a network scales its inputs by it.
-    n_slacks, n_input_rows, feedback
-        Likewise.
     infeasible : {"nearest_region", "zero_input"}, default "nearest_region"
 
     Examples
@@ -417,13 +415,6 @@ class KnownPoints:
 
     Two keys of 64 bits stand for a row, so that two rows of a million share them with a chance of
     1e-26. A table that is full, of 2**20 places or some 40 MB for three inputs, forgets.
-
-    Examples
-    --------
-    >>> asked = []
-    >>> known = KnownPoints(lambda rows: asked.append(len(rows)) or 2 * rows, 1)
-    >>> known(np.array([[1.0]])), known(np.array([[1.0], [3.0]])).tolist(), asked
-    (array([[2.]]), [[2.0], [6.0]], [1, 1])
     """
 
     def __init__(

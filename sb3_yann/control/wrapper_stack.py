@@ -103,9 +103,7 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
             )
         is_wrapped = getattr(layer, "env_is_wrapped", None)
         if is_wrapped is not None and "envs" not in vars(layer) and "venv" not in vars(layer):
-            for kind in (
-                (KeepsStatistics,) if observation_given else (KeepsStatistics, ShowsOtherNumbers)
-            ):
+            for kind in (KeepsStatistics, *(() if observation_given else (ShowsOtherNumbers,))):
                 if any(is_wrapped(kind)):
                     raise ValueError(
                         f"A wrapper in the processes of {name} {kind.__doc__} The law takes the "
@@ -115,11 +113,8 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
 
 def _library_names(layer: Any) -> set[str]:
     """Return the names of a layer's classes that are a library's."""
-    return {each.__name__ for each in type(layer).__mro__ if _library(each) in WRAPPER_LIBRARIES}
-
-
-def _library(kind: type) -> str:
-    return kind.__module__.split(".")[0]
+    kinds = type(layer).__mro__
+    return {each.__name__ for each in kinds if each.__module__.split(".")[0] in WRAPPER_LIBRARIES}
 
 
 def _keeps_statistics(layer: Any) -> bool:

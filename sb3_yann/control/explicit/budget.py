@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
@@ -31,42 +30,36 @@ class ExplicitLimitError(RuntimeError):
         self.n_regions = n_regions
 
 
-@dataclass(frozen=True)
-class SolveBudget:
-    """How long a search may take: in seconds, regions, and effort, see :class:`BudgetTimer`.
-
-    None is no limit.
-    """
-
-    time_limit: float | None = None
-    region_limit: int | None = None
-    effort_limit: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.time_limit is not None:
-            check_positive("time_limit", self.time_limit, "It is in seconds; None is no limit.")
-        if self.region_limit is not None:
-            check_int("region_limit", self.region_limit, hint="None is no limit.")
-
-    def require(self, n_regions: int) -> None:
-        """Raise ExplicitLimitError if a law that is there has too many regions."""
-        if self.region_limit is not None and n_regions > self.region_limit:
-            raise ExplicitLimitError(
-                f"The law has {n_regions} regions, more than region_limit = {self.region_limit}. "
-                f"{_ADVICE}",
-                n_regions,
-            )
+def require_few(n_regions: int, region_limit: int | None) -> None:
+    """Raise ExplicitLimitError if a law that is there has too many regions."""
+    if region_limit is not None and n_regions > region_limit:
+        raise ExplicitLimitError(
+            f"The law has {n_regions} regions, more than region_limit = {region_limit}. {_ADVICE}",
+            n_regions,
+        )
 
 
 class BudgetTimer:
     """Counts regions and, from now on, the time of a search and its check; ends them at a limit.
 
+    Limits are in seconds, regions and effort; None is no limit.
     It also sums up effort: what each linear program, QP and factorization takes by its size, in
     seconds of a processor of 2024 with nothing else to do. That is the same on every machine.
     """
 
-    def __init__(self, budget: SolveBudget) -> None:
-        self.budget = budget
+    def __init__(
+        self,
+        time_limit: float | None = None,
+        region_limit: int | None = None,
+        effort_limit: float | None = None,
+    ) -> None:
+        if time_limit is not None:
+            check_positive("time_limit", time_limit, "It is in seconds; None is no limit.")
+        if region_limit is not None:
+            check_int("region_limit", region_limit, hint="None is no limit.")
+        self.time_limit = np.inf if time_limit is None else time_limit
+        self.region_limit = np.inf if region_limit is None else region_limit
+        self.effort_limit = np.inf if effort_limit is None else effort_limit
         self.effort = 0.0
         self.found = 0
         self._start = time.monotonic()
@@ -83,9 +76,8 @@ class BudgetTimer:
         """Count regions; raise ExplicitLimitError if these are too many, or the time is over."""
         self.found += more
         self._bar.update(more)
-        most = self.budget.region_limit
-        if most is not None and self.found > most:
-            self._stop(f"The law has more than region_limit = {most} regions")
+        if self.found > self.region_limit:
+            self._stop(f"The law has more than region_limit = {self.region_limit} regions")
         self.tick()
 
     def stage(self, name: str, done: str, steps: int) -> None:
@@ -102,17 +94,14 @@ class BudgetTimer:
     def tick(self, effort: float = 0.0) -> None:
         """Count effort ahead; raise ExplicitLimitError if it is too much, or time is over."""
         self.effort += effort
-        limit = self.budget.effort_limit
-        if limit is not None and self.effort > limit:
+        if self.effort > self.effort_limit:
             self._stop("The law takes more effort than about a second of a fast processor")
-        most = self.budget.time_limit
-        if most is not None and time.monotonic() - self._start > most:
-            self._stop(f"The law was not solved in time_limit = {most:g} s")
+        if time.monotonic() - self._start > self.time_limit:
+            self._stop(f"The law was not solved in time_limit = {self.time_limit:g} s")
 
     def left(self) -> float:
         """Return for how many seconds the search may go on, infinite without a limit."""
-        most = self.budget.time_limit
-        return np.inf if most is None else max(0.0, self._start + most - time.monotonic())
+        return max(0.0, self._start + self.time_limit - time.monotonic())
 
     def _stop(self, what: str) -> NoReturn:
         found = f"{self.found} regions were found in {time.monotonic() - self._start:.1f} s"

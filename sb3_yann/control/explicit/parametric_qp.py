@@ -30,13 +30,9 @@ class ParametricQP:
 
     Attributes
     ----------
-    H : ndarray, shape (v, v)
-        Positive definite.
-    F : ndarray, shape (v, n)
-    c : ndarray, shape (v,)
-    G : ndarray, shape (rows, v)
-    w : ndarray, shape (rows,)
-    S : ndarray, shape (rows, n)
+    H, F, c : ndarray, shapes (v, v), (v, n) and (v,)
+        H is positive definite.
+    G, w, S : ndarray, shapes (rows, v), (rows,) and (rows, n)
     theta_min, theta_max : ndarray, shape (n,)
     n_slacks : int, default 0
         How many of the last variables are slacks of soft constraints, and no inputs.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import linalg, optimize
 
 from sb3_yann._validation import Array, check_choice, half_widths
-from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
+from sb3_yann.control.explicit.budget import BudgetTimer, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
 from sb3_yann.control.explicit.facet_walk import walk
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, moderated, row_norms
@@ -112,7 +112,7 @@ class ProgramUnits:
         self.to_inputs = np.eye(m, len(program.c))
         self.equalities = None
         if not _has_interior_point(scaled):
-            self.equalities = _find_equalities(scaled, timer or BudgetTimer(SolveBudget()))
+            self.equalities = _find_equalities(scaled, timer or BudgetTimer())
         if self.equalities is not None:
             scaled = self.equalities.eliminated(scaled)
             self.to_inputs = self.to_inputs @ self.equalities.free
@@ -231,25 +231,6 @@ def _find_equalities(program: ParametricQP, timer: BudgetTimer) -> Equalities | 
     return Equalities(free, np.asarray(np.linalg.pinv(G, rcond=1e-9) @ limit), left)
 
 
-def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
-    """Return which part of each input's range an entry of theta asks for in its box, (m, n).
-
-    That is the largest of all steps where no constraint acts. It is 0 without a box of theta.
-    """
-    m = len(u_min)
-    unit = 1 / np.sqrt(np.diag(program.H))
-    H = unit[:, None] * program.H * unit
-    F = unit[:, None] * program.F
-    gains = -(unit[:, None] * np.linalg.lstsq(H, F, rcond=None)[0])
-    gains = gains[: len(program.c) - program.n_slacks]
-    if program.feedback is not None:  # later steps are what is added to it
-        gains = gains[:m] + program.feedback
-    gains = np.abs(gains).reshape(-1, m, program.F.shape[1]).max(axis=0)
-    width = program.theta_max / 2 - program.theta_min / 2
-    box = np.where(np.isfinite(width), width, 0.0)
-    return np.asarray(gains * box / half_widths(u_min, u_max)[:, None])
-
-
 def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> None:
     """Raise where weights, the box of theta or an input's range make rounding hide the rest.
 
@@ -257,18 +238,30 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Non
     found; asked for less than 1e-9 of it, constraints of states are too small beside it.
     """
     unit = 1 / np.sqrt(np.maximum(np.diag(program.H), 1e-300))
-    for H in (program.H, unit[:, None] * program.H * unit):  # both are factored
+    H = unit[:, None] * program.H * unit
+    for each in (program.H, H):  # both are factored
         try:
-            np.linalg.cholesky(H)
+            np.linalg.cholesky(each)
         except np.linalg.LinAlgError:
+            sizes = np.linalg.eigvalsh(each)
             raise ValueError(
                 "The weights Q, R and the terminal cost differ so much that the quadratic program "
                 f"has no unique solution to rounding: its Hessian has eigenvalues from "
-                f"{np.linalg.eigvalsh(H)[0]:.1e} to {np.linalg.eigvalsh(H)[-1]:.1e}, and all must "
-                "be positive. Pass a larger R, a shorter horizon, or states in other units."
+                f"{sizes[0]:.1e} to {sizes[-1]:.1e}, and all must be positive. Pass a larger R, a "
+                "shorter horizon, or states in other units."
             ) from None
+    # Which part of its range each input is asked for by each entry of theta in its box, (m, n): the
+    # largest of all steps where no constraint acts, 0 without a box or a range.
+    m = len(u_min)
+    gains = -(unit[:, None] * np.linalg.lstsq(H, unit[:, None] * program.F, rcond=None)[0])
+    gains = gains[: len(program.c) - program.n_slacks]
+    if program.feedback is not None:  # later steps are what is added to it
+        gains = gains[:m] + program.feedback
+    gains = np.abs(gains).reshape(-1, m, program.F.shape[1]).max(axis=0)
+    width = program.theta_max / 2 - program.theta_min / 2
+    box = np.where(np.isfinite(width), width, 0.0)
     bounded = np.isfinite(u_min) & np.isfinite(u_max)
-    asked = asked_of_inputs(program, u_min, u_max) * bounded[:, None]
+    asked = gains * box / half_widths(u_min, u_max)[:, None] * bounded[:, None]
     most = asked.max(axis=1, initial=0.0)
     # A small part alone may be an input with next to no effect, whose bounds are as they should be.
     too_large = (0 < most) & (most < 1e-9) & (half_widths(u_min, u_max) > 1e9)

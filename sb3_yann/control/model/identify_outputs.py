@@ -275,7 +275,7 @@ def identify_outputs(
         system.u_ss,
         E if d else None,
         system.d_ss if d else None,
-        notes=[*system.notes, *_notes(log, found, plain, step, model.noise), *_rates(log, every)],
+        notes=[*system.notes, *_notes(log, found, plain, step, model.noise)],
         gains=Gains.of(A, B, found.integrators, errors),
         state_names=state_names,
         input_names=log.input_names,
@@ -385,13 +385,6 @@ def _state_names(log: Log, model: Innovations, delays: Sequence[int]) -> Sequenc
     return [*own, *memory_labels(delays, log.input_names or names((0, m)))]
 
 
-def _rates(log: Log, every: Sequence[int]) -> list[str]:
-    """Return a note on outputs that are read now and then."""
-    shown = log.state_names or [f"y[{i}]" for i in range(len(every))]
-    rare = [f"{name} every {n}" for name, n in zip(shown, every, strict=True) if n > 1]
-    return [f"Read now and then: {', '.join(rare)} samples." for _ in rare[:1]]
-
-
 def _notes(
     log: Log, found: Structure, plain: Regression, step: Regression, noise: Array
 ) -> list[str]:
@@ -438,4 +431,8 @@ def _notes(
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
     notes = [log.in_names(each) for each in notes]
-    return [*notes, pole_note(*found.poles, "process and sensor noise")]
+    notes.append(pole_note(*found.poles, "process and sensor noise"))
+    shown = log.state_names or [f"y[{i}]" for i in range(len(log.every))]
+    if rare := [f"{name} every {n}" for name, n in zip(shown, log.every, strict=True) if n > 1]:
+        notes.append(f"Read now and then: {', '.join(rare)} samples.")
+    return notes

@@ -86,12 +86,6 @@ class LinearModel(LinearSystem):
     notes: tuple[str, ...] = field(init=False, repr=False, compare=False)
     drift: Array = field(init=False, repr=False, compare=False)
     gains: Gains | None = field(init=False, repr=False, compare=False)
-    state_names: tuple[str, ...] = field(default=(), compare=False)
-    input_names: tuple[str, ...] = field(default=(), compare=False)
-    units: tuple[str, ...] = field(default=(), compare=False)
-    estimated: tuple[int, ...] = field(default=(), compare=False)
-    C: Array | None = None
-    time_unit: str = field(default="", compare=False)
 
     def __init__(  # noqa: PLR0913 (the matrices of a plant and its operating point)
         self,

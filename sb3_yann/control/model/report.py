@@ -160,15 +160,12 @@ def _scaling(model: LinearSystem) -> list[str]:
     spread = np.max(factors) / np.min(factors)
     sizes = np.abs(model.B)
     effects = sizes[sizes > 1e-12 * np.max(sizes, initial=0.0)]  # the rest is rounding
-    advice = " Consider other units." if spread > 1e3 else ""
-    lines = []
-    if effects.size:
-        balance = f"; balancing A would rescale its states by up to {spread:.3g} against each other"
-        lines.append(
-            f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}"
-            f"{balance if spread > SAME_SCALE else ''}.{advice}"
-        )
-    return lines
+    if not effects.size:
+        return []
+    line = f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}"
+    if spread > SAME_SCALE:
+        line += f"; balancing A would rescale its states by up to {spread:.3g} against each other"
+    return [f"{line}.{' Consider other units.' if spread > 1e3 else ''}"]
 
 
 def _gains(model: LinearSystem) -> list[str]:

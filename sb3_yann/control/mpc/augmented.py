@@ -77,13 +77,12 @@ def offset_free(
     """
     check_type("mpc", mpc, LinearMPC, "a LinearMPC")
     old = mpc.model
-    n = mpc.model.n_states
     if old.estimated:
         raise ValueError(
             f"The MPC has {len(old.estimated)} estimated disturbances already: their observer is "
             "DisturbanceObserver(mpc.model)."
         )
-    C = old.shown if measured is None else check_outputs("measured", measured, n)
+    C = old.shown if measured is None else check_outputs("measured", measured, old.n_states)
     q = len(C)
     tracked = mpc.tracking.C
     if np.any(np.abs(tracked - tracked @ np.linalg.pinv(C) @ C) > 1e-9 * (1 + np.abs(tracked))):
@@ -103,23 +102,26 @@ def offset_free(
         "estimated": range(old.n_disturbances, of_both),
         "drift": None,  # the disturbance makes up for it
     }
-    model = LinearModel(**{**vars(old), **own})
     terminal = Terminal(mpc.terminal.cost, set="invariant" if len(mpc.terminal.set[1]) else None)
+    both = np.append(known.d_min, -bound), np.append(known.d_max, bound)
+    found = _changed(mpc, own, DisturbanceBounds(*both, known.preview), terminal)
+    noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
+    return found, DisturbanceObserver(found.model, C, every=every, **noise)
+
+
+def _changed(
+    mpc: LinearMPC, own: dict[str, Any], disturbances: DisturbanceBounds, terminal: Terminal
+) -> LinearMPC:
+    """Return the MPC with other disturbances, which its model has by its ``own`` arguments."""
     states = mpc.layout.state
-    found = replace(
+    return replace(
         mpc,
-        model=model,
-        disturbances=DisturbanceBounds(
-            np.concatenate([known.d_min, -bound]),
-            np.concatenate([known.d_max, bound]),
-            known.preview,
-        ),
+        model=LinearModel(**{**vars(mpc.model), **own}),
+        disturbances=disturbances,
         terminal=terminal,
         theta_min=mpc.theta_min[states],
         theta_max=mpc.theta_max[states],
     )
-    noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
-    return found, DisturbanceObserver(model, C, every=every, **noise)
 
 
 def with_extra(mpc: LinearMPC, low: ArrayLike, high: ArrayLike) -> LinearMPC:
@@ -174,14 +176,8 @@ def with_extra(mpc: LinearMPC, low: ArrayLike, high: ArrayLike) -> LinearMPC:
     }
     F, g = mpc.terminal.set
     start = mpc.layout.disturbance.start + first
-    states = mpc.layout.state
-    found = replace(
-        mpc,
-        model=LinearModel(**{**vars(old), **own}),
-        disturbances=DisturbanceBounds(inserted(known.d_min, bottom), inserted(known.d_max, top)),
-        terminal=Terminal(mpc.terminal.cost, (inserted(F, np.zeros(k), start), g)),
-        theta_min=mpc.theta_min[states],
-        theta_max=mpc.theta_max[states],
-    )
+    disturbances = DisturbanceBounds(inserted(known.d_min, bottom), inserted(known.d_max, top))
+    terminal = Terminal(mpc.terminal.cost, (inserted(F, np.zeros(k), start), g))
+    found = _changed(mpc, own, disturbances, terminal)
     found.take_laws(mpc)
     return found

@@ -31,7 +31,6 @@ class Bounds:
     half: Array
     softness: Array
     of_states: NDArray[np.bool_]
-    states: slice
     used: NDArray[np.bool_]
     moving: tuple[Array, ...]
 
@@ -60,7 +59,6 @@ class Bounds:
             half=half[used],
             softness=softness[used],
             of_states=(np.arange(len(used)) < n)[used],
-            states=problem.layout.state,
             used=used,
             moving=tuple(np.concatenate(both)[used] for both in moving),
         )
@@ -70,7 +68,7 @@ class Bounds:
 
         Room and result are in half-widths; below a lower bound it is negative.
         """
-        y = thetas[..., self.states] @ self.C.T
+        y = thetas[..., : self.C.shape[1]] @ self.C.T
         low = self.low
         high = self.high
         own_low, own_high, L, H = self.moving

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from sb3_yann._validation import Array, Bounds, Given, ReadOnlyArrays, check_bounds, to_float
+from sb3_yann._validation import Array, Bounds, Given, ReadOnlyArrays, check_bounds
 from sb3_yann.control.model.linear_model import LinearModel
 
 
@@ -175,39 +176,21 @@ def theta_box(
 ) -> Bounds:
     """Return the box of theta.
 
-    ``given`` are theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
-    ``states`` (n,) stand in for them. ``others`` are the boxes of r and d without their previews,
-    of bounds and of the previous input, from which those given must not differ.
+    ``given`` are theta_min and theta_max, a number or (n,) for the states; ``states`` (n,) stand in
+    for them. ``others`` are the boxes of r and d without their previews, of bounds and of the
+    previous input.
     """
     n = layout.n_states
     parts = []
     for value, fallback in zip(given, states, strict=True):
-        part = fallback if value is None else to_float("theta", value)
-        parts.append(part[:n] if part.shape == (layout.size,) else part)
+        part: Any = fallback if value is None else value
+        # `dataclasses.replace` passes the stored box, which is read-only, and means the states.
+        is_stored = isinstance(part, np.ndarray) and not part.flags.writeable
+        parts.append(part[:n] if is_stored and part.shape == (layout.size,) else part)
     pieces = [check_bounds("theta", parts[0], parts[1], n), *others]
     settled = np.argmax(layout.lift, axis=1)
     low, high = (np.concatenate(side)[settled] for side in zip(*pieces, strict=True))
-    low, high = check_bounds("theta", low, high, layout.size)
-    for name, value, stored in zip(("theta_min", "theta_max"), given, (low, high), strict=True):
-        _require_same_rest(name, value, stored, layout)
-    return low, high
-
-
-def _require_same_rest(name: str, given: Given, stored: Array, layout: ThetaLayout) -> None:
-    """Raise where a box given for all of theta differs from that of r, d and u_prev."""
-    box = None if given is None else to_float(name, given)
-    # `dataclasses.replace` passes the stored box, which is read-only, and means the states.
-    taken_over = isinstance(given, np.ndarray) and not given.flags.writeable
-    if box is None or box.shape != stored.shape or taken_over:
-        return
-    for i in np.flatnonzero(box != stored):
-        if i >= layout.n_states:
-            part = layout.names[i].partition("[")[0].replace("u_prev", "u")
-            side = name.partition("_")[2]
-            raise ValueError(
-                f"{name} has {box[i]:g} for {layout.names[i]}, but {part}_{side} is {stored[i]:g}. "
-                f"Pass {name} of the {layout.n_states} states only; the rest has its own bounds."
-            )
+    return check_bounds("theta", low, high, layout.size)
 
 
 @dataclass(frozen=True, eq=False)

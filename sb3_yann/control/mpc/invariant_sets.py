@@ -99,7 +99,13 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Facets:
     A, B = problem.prediction
     rows = rows * half
     closed = (A + B @ gain) * half / half[:, None]
-    steady = rows @ _steady_projection(problem, half)
+    parts = problem.layout
+    own = problem.steady_states
+    at_rest = np.zeros_like(A)  # the map from theta to the theta at rest under the same r and d
+    at_rest[parts.state, parts.now] = own.x
+    at_rest[parts.constant, parts.constant] = np.eye(parts.constant.stop - parts.constant.start)
+    at_rest[parts.previous, parts.now] = own.u[: parts.n_previous]
+    steady = rows @ (at_rest / half[:, None] * half)
     if np.any(bounds <= 0):
         raise ValueError(
             "Terminal(set='invariant') needs an operating point with room to every bound, but "
@@ -166,17 +172,6 @@ def hard_rows(
     bounds = np.concatenate(ends)
     bounded = np.isfinite(bounds)
     return found[bounded], bounds[bounded]
-
-
-def _steady_projection(problem: MPCProblem, half: Array) -> Array:
-    """Return the map from theta to the theta at rest under the same r and d, in units of half."""
-    parts = problem.layout
-    steady = problem.steady_states
-    at_rest = np.zeros((problem.n_theta, problem.n_theta))
-    at_rest[parts.state, parts.now] = steady.x
-    at_rest[parts.constant, parts.constant] = np.eye(parts.constant.stop - parts.constant.start)
-    at_rest[parts.previous, parts.now] = steady.u[: parts.n_previous]
-    return np.asarray(at_rest / half[:, None] * half)
 
 
 ZERO_LENGTH = 1e-9

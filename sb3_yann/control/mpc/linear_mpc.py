@@ -22,7 +22,7 @@ from sb3_yann._validation import (
     to_float,
     warn,
 )
-from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, SolveBudget
+from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, require_few
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
@@ -421,18 +421,24 @@ class LinearMPC(MPCProblem):
         ExplicitSolutionError
             If the solution fails its check; the message says where.
         """
-        return self._solved(SolveBudget(time_limit, region_limit), solver)
+        return self._solved(time_limit, region_limit, solver=solver)
 
-    def _solved(self, budget: SolveBudget, solver: str = "walk") -> PiecewiseAffine:
+    def _solved(
+        self,
+        time_limit: float | None = None,
+        region_limit: int | None = None,
+        effort_limit: float | None = None,
+        solver: str = "walk",
+    ) -> PiecewiseAffine:
         """Return the explicit law, solved within a budget unless it is there."""
         if solver not in self._laws:
             load_kernels()
             limits = self.deviations.u_min, self.deviations.u_max
-            with BudgetTimer(budget) as timer:
+            with BudgetTimer(time_limit, region_limit, effort_limit) as timer:
                 program = self.condensed().without(self.extra)
                 law = solve_explicit(program, *limits, self.infeasible, solver, timer)
             self._laws[solver] = self._widened(law)
-        budget.require(self._laws[solver].n_regions)
+        require_few(self._laws[solver].n_regions, region_limit)
         return self._laws[solver]
 
     def _widened(self, law: PiecewiseAffine) -> PiecewiseAffine:
@@ -485,7 +491,7 @@ class LinearMPC(MPCProblem):
         if rows * n > LARGE:
             return f"It has {rows} constraints on {n} parameters, too many to look for regions."
         try:
-            return self._solved(SolveBudget(region_limit=REGIONS, effort_limit=EFFORT))
+            return self._solved(region_limit=REGIONS, effort_limit=EFFORT)
         except ExplicitLimitError as error:
             return f"{error} Or call problem.explicit() before, which has no limit by default."
         except ExplicitSolutionError as error:

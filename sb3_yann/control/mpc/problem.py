@@ -402,29 +402,9 @@ class MPCProblem(ReadOnlyArrays):
         return hash((self.model, self.horizon, self.Q.tobytes(), self.R.tobytes()))
 
     def __repr__(self) -> str:
-        sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
+        sizes = f"theta={[*self.layout.names]}, inputs={self.model.n_inputs}"
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
-        if self.control_horizon is not None:
-            options += f", control_horizon={self.control_horizon}"
-        tracking = self.tracking
-        d = self.disturbances
-        limits = self.limits
-        r = (tracking.r_min, tracking.r_max), (d.d_min, d.d_max)
-        bounds = {"x": limits["x"], "u": limits["u"], "r": r[0], "d": r[1], **limits}
-        shown = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]
-        if self.layout.bounds:
-            shown.append(f"parametric_bounds={[*self.layout.bounds]}")
-        return f"{type(self).__name__}({', '.join([sizes, options, *filter(None, shown)])})"
-
-
-def _bounds_in_words(name: str, lower: Array, upper: Array) -> str:
-    """Return ``name_min=[...], name_max=[...]``, empty where nothing is bounded."""
-    sides = ((f"{name}_min", lower), (f"{name}_max", upper))
-    return ", ".join(
-        f"{side}=[{', '.join(f'{value:.4g}' for value in values)}]"
-        for side, values in sides
-        if np.any(np.isfinite(values))
-    )
+        return f"{type(self).__name__}({sizes}, {options})"
 
 
 TOLERANCE = 1e-9

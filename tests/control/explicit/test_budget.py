@@ -11,7 +11,6 @@ from fresh_process import run_python
 from sample_problems import benchmark
 from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC
 from sb3_yann.control.explicit import certificate
-from sb3_yann.control.explicit.budget import SolveBudget
 
 
 @pytest.mark.parametrize("solver", ["walk", "ppopt"])
@@ -112,4 +111,4 @@ def test_the_limit_of_time_holds_where_a_single_linear_program_takes_seconds() -
 
 def test_a_law_of_too_much_effort_is_given_up_before_it_is_found() -> None:
     with pytest.raises(ExplicitLimitError, match=r"more effort .* regions were found .* horizon"):
-        large_plant()._solved(SolveBudget(effort_limit=0.2))
+        large_plant()._solved(effort_limit=0.2)

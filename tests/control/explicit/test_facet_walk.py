@@ -19,7 +19,7 @@ from sb3_yann import LinearModel, LinearMPC, RateLimits, Terminal
 from sb3_yann.control import ExplicitSolutionError
 from sb3_yann.control._kernels import polyhedra as _kernels
 from sb3_yann.control.explicit import solve as module
-from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
+from sb3_yann.control.explicit.budget import BudgetTimer
 from sb3_yann.control.polyhedra import (
     Region,
     bounded_region,
@@ -46,7 +46,7 @@ def problem(name: str) -> LinearMPC:
 
 def regions_of(mpc: LinearMPC, solver: str) -> list[Region]:
     units = module.ProgramUnits(mpc.condensed(), mpc.u_min, mpc.u_max)
-    return module.critical_regions(units.scaled, solver, BudgetTimer(SolveBudget()))
+    return module.critical_regions(units.scaled, solver, BudgetTimer())
 
 
 def reaches_beyond(one: Region, other: Region) -> float:

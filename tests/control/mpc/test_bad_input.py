@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from errors import Message, raises, told
-from general_problems import servo
 from sample_problems import input_bounds_only, small_mpc
 from sb3_yann import (
     LinearModel,
@@ -263,20 +262,6 @@ def test_a_soft_bound_that_the_box_does_not_exceed_is_reported() -> None:
     for box in ({"theta_min": [-1.1, -2], "theta_max": [1, 2]},
                 {"theta_min": [-1, -2], "theta_max": [1.1, 2]}):  # fmt: skip
         assert said(**bounds, **box) == []
-
-
-@pytest.mark.parametrize("side", ["theta_min", "theta_max"])
-def test_a_box_of_all_of_theta_must_agree_with_the_bounds_of_its_parts(side: str) -> None:
-    plain = servo(rate=RateLimits(-0.5, 0.5))
-    given = {name: [*getattr(plain, name)] for name in ("theta_min", "theta_max")}
-    same = servo(rate=RateLimits(-0.5, 0.5), **given)
-    np.testing.assert_array_equal(same.theta_min, plain.theta_min)
-    given[side][0] *= 0.5  # of a state
-    assert getattr(servo(rate=RateLimits(-0.5, 0.5), **given), side)[0] == given[side][0]
-    given[side][3] *= 0.5
-    part = rf"{side} has .* for u_prev\[0\], but u_{side[-3:]} is"
-    with pytest.raises(ValueError, match=part + r".* of the 2 states only"):
-        servo(rate=RateLimits(-0.5, 0.5), **given)
 
 
 def test_a_rate_must_let_the_input_rest() -> None:
