@@ -123,10 +123,6 @@ class PlantLaw(ReadOnlyArrays):
             )
         return points, self.clamp(rows)
 
-    @property
-    def _is_fixed(self) -> bool:
-        return self.rate is None and self.moving is None
-
     def _within_range(self, u: Array, theta: Array) -> Array:
         """Return inputs (batch, m) within what rate and bounds in theta leave."""
         if self.moving is not None:
@@ -368,7 +364,8 @@ class PiecewiseAffine(PlantLaw):
     def __call__(self, theta: ArrayLike) -> Array:
         """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
         # The short way: real numbers, none masked, in one row as compiled code takes them.
-        if type(theta) is np.ndarray and theta.shape == self.theta_min.shape and self._is_fixed:
+        is_fixed = self.rate is None and self.moving is None
+        if is_fixed and type(theta) is np.ndarray and theta.shape == self.theta_min.shape:
             if theta.dtype.kind in "fiu" and theta.flags.carray:
                 u = np.empty(len(self.u_min))
                 given = theta.astype(np.float64, copy=False)
@@ -504,11 +501,9 @@ class PiecewiseAffine(PlantLaw):
         return partial(law_at, *self.packed)
 
     def __hash__(self) -> int:
-        """Return a hash that equal laws share."""
         return hash((self.gains.tobytes(), self.b.tobytes(), self.infeasible))
 
     def __repr__(self) -> str:
-        """Name the sizes."""
         law = f"regions={self.n_regions}, halfspaces={self.n_halfspaces}, theta={self.n_theta}"
         return f"PiecewiseAffine({law}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
 

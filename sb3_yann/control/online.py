@@ -277,11 +277,9 @@ class OnlineLaw(PlantLaw):
         return np.where(still, rows, -1)  # not those that change at run time
 
     def __hash__(self) -> int:
-        """Return a hash that equal laws share."""
         return hash((self.H.tobytes(), self.F.tobytes(), self.infeasible))
 
     def __repr__(self) -> str:
-        """Name the sizes."""
         sizes = f"constraints={self.n_constraints}, variables={len(self.c)}, theta={self.n_theta}"
         return f"OnlineLaw({sizes}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
 

@@ -402,9 +402,23 @@ class MPCProblem(ReadOnlyArrays):
         return hash((self.model, self.horizon, self.Q.tobytes(), self.R.tobytes()))
 
     def __repr__(self) -> str:
-        sizes = f"theta={[*self.layout.names]}, inputs={self.model.n_inputs}"
+        sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
-        return f"{type(self).__name__}({sizes}, {options})"
+        if self.control_horizon is not None:
+            options += f", control_horizon={self.control_horizon}"
+        limits = self.limits
+        r = self.tracking.r_min, self.tracking.r_max
+        d = self.disturbances.d_min, self.disturbances.d_max
+        bounds = {"x": limits["x"], "u": limits["u"], "r": r, "d": d, **limits}
+        shown = [
+            f"{name}_{end}=[{', '.join(f'{value:.4g}' for value in values)}]"
+            for name, sides in bounds.items()
+            for end, values in zip(("min", "max"), sides, strict=True)
+            if np.any(np.isfinite(values))
+        ]
+        if self.layout.bounds:
+            shown.append(f"parametric_bounds={[*self.layout.bounds]}")
+        return f"{type(self).__name__}({', '.join([sizes, options, *shown])})"
 
 
 TOLERANCE = 1e-9
