@@ -90,7 +90,7 @@ class PlantLaw(ReadOnlyArrays):
         model: LinearModel,
         theta_ss: ArrayLike,
         rate: ArrayLike | None = None,
-        moving: NDArray[np.intp] | None = None,
+        moving: ArrayLike | None = None,
         clamped: ArrayLike | None = None,
     ) -> Self:
         """Return the same law with its plant, see the attributes."""
@@ -236,12 +236,11 @@ class PlantLaw(ReadOnlyArrays):
             check_array(name, data[name], (2, law.n_inputs)) if name in data else None
             for name in ("rate", "moving")
         )
-        moves = None if moving is None else moving.astype(int)
         clamped = None
         if "clamped" in data:
             low, high = data["clamped"]
             clamped = check_bounds("clamped", low, high, law.n_theta)
-        return law.on_plant(model, theta_ss, rate, moves, clamped)
+        return law.on_plant(model, theta_ss, rate, moving, clamped)
 
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""

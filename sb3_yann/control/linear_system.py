@@ -209,36 +209,26 @@ def missing_observer(model: LinearSystem) -> str:
     )
 
 
-def past_inputs(model: LinearSystem) -> list[tuple[int, str]]:
-    """Return the number of the input, and the lag as in ``(k-1)``, of each last state named so."""
+def completed(
+    model: LinearSystem, state_names: Sequence[str], input_names: Sequence[str], units: Units
+) -> tuple[Sequence[str], Units]:
+    """Return names of states and units with those of inputs on their way, where they are left out.
+
+    Such are the last states of a model with dead time, named after an input with a lag: ``(k-1)``.
+    """
     inputs = labels_of(model)[1]
-    found = list[tuple[int, str]]()
+    past = list[tuple[int, str]]()
     for label in reversed(model.state_names):
         name, lag, rest = label.partition("(k-")
         if name not in inputs or not rest.removesuffix(")").isdigit():
             break
-        found.insert(0, (inputs.index(name), lag + rest))
-    return found
-
-
-def completed(
-    model: LinearSystem,
-    past: Sequence[tuple[int, str]],
-    state_names: Sequence[str],
-    input_names: Sequence[str],
-    units: Units,
-) -> tuple[Sequence[str], Units]:
-    """Return names of states and units with those of inputs on their way, where they are left out.
-
-    ``past`` are the last states of a model with dead time: numbers of inputs, and lags.
-    """
+        past.insert(0, (inputs.index(name), lag + rest))
     own = model.n_states - len(past)
     m = model.n_inputs
-    named = len(input_names) == m
-    if not isinstance(state_names, str) and len(state_names) == own and own:
-        inputs = list(input_names) if named else labels_of(model)[1]
-        state_names = [*state_names, *(inputs[j] + lag for j, lag in past)]
-    if not isinstance(units, str | Mapping) and len(units) == own + m:
+    if past and not isinstance(state_names, str) and len(state_names) == own and own:
+        called = list(input_names) if len(input_names) == m else inputs
+        state_names = [*state_names, *(called[j] + lag for j, lag in past)]
+    if past and not isinstance(units, str | Mapping) and len(units) == own + m:
         of_inputs = list(units[own:])
         units = [*units[:own], *(of_inputs[j] for j, _ in past), *of_inputs]
     return state_names, units

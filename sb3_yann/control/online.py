@@ -233,7 +233,8 @@ class OnlineLaw(PlantLaw):
             return u, feasible, found, None  # mostly: the rest takes microseconds
         for i in np.flatnonzero(found.status == kernels.UNCERTIFIED):
             feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
-        feasible &= self.dual.meets_fixed(rows)
+        S, w = self.dual.fixed
+        feasible &= np.all(rows @ S.T + w >= -1e-11, axis=1)
         softened = None
         outside = np.flatnonzero(~feasible)
         if len(outside) and self.infeasible == "zero_input":
@@ -394,11 +395,6 @@ class DualProgram:
         solution = found.multipliers, found.active, found.sizes
         inputs_of_batch(theta, self.K, self.k0, self.E, *solution, self.bounds, u)
         return u
-
-    def meets_fixed(self, theta: Array) -> NDArray[np.bool_]:
-        """Tell of each row whether it keeps what no input can change."""
-        S, w = self.fixed
-        return np.asarray(np.all(theta @ S.T + w >= -1e-11, axis=1))
 
     def gain(self, active: Integers, soft: bool = False) -> Array:
         """Return the derivative (m, n) of the inputs by theta for an active set."""

@@ -27,7 +27,6 @@ from sb3_yann.control.linear_system import (
     as_units,
     completed,
     names,
-    past_inputs,
     with_units,
     zero_order_hold,
 )
@@ -327,8 +326,7 @@ class LinearModel(LinearSystem):
         time_unit : str, optional
             Of ``dt``, where it has none yet: ValueError for another one.
         """
-        if past := past_inputs(self):
-            state_names, units = completed(self, past, state_names, input_names, units)
+        state_names, units = completed(self, state_names, input_names, units)
         given = {"state_names": state_names, "input_names": input_names, "units": units}
         if time_unit is not None:
             given["time_unit"] = time_unit
