@@ -184,10 +184,6 @@ class StateEstimator:
         self.estimate = predicted + self.gain @ (now - self.C_aug @ predicted)
         return self.x_hat, self.d_hat
 
-    def expected(self, u: ArrayLike, d: ArrayLike | None = None) -> Array:
-        """Return the outputs y (q,) that the estimate makes expect after u (m,) and measured d."""
-        return np.asarray(self.C_aug @ self._after(u, d))
-
     @cached_property
     def resting(self) -> Array:
         """The matrix from constant ``[y; u; d]`` to the estimate at which the filter rests."""

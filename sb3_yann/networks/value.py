@@ -133,7 +133,7 @@ class QuadraticStateActionValue(nn.Module):
     Parameters
     ----------
     M : ndarray, shape (n + m, n + m)
-        From :meth:`LinearMPC.state_action_matrix`. With a row and a column more, it is the form of
+        From :meth:`LinearMPC.state_action_terms`. With a row and a column more, it is the form of
         ``[theta; 1; u]``.
     ranges : Ranges
     hidden : tuple of int, default (64, 64)

@@ -185,7 +185,7 @@ class MaximumEntropy(Explores):
         logarithm: Haarnoja et al., *Soft Actor-Critic Algorithms and Applications*, 2018.
         """
         m = self.problem.model.n_inputs
-        curvature = np.diag(self.problem.state_action_matrix(self.gamma))[-m:]
+        curvature = np.diag(self.problem.state_action_terms(self.gamma).P)[-m:]
         each = curvature * (2 * self.initial_std * self.problem.u_half) ** 2
         return float(2 * self.critic_options.reward_scale * max(each.mean(), 1e-12))
 

@@ -54,7 +54,7 @@ def test_a_law_that_does_not_stabilize_has_no_value() -> None:
 @pytest.mark.parametrize("name", MPCS)
 def test_with_equal_discounts_the_law_maximizes_its_own_critic(name: str, gamma: float) -> None:
     mpc = replace(MPCS[name](), gamma=gamma, terminal=None)
-    M = mpc.state_action_matrix(gamma)
+    M = mpc.state_action_terms(gamma).P
     n = mpc.n_theta
     law = mpc.explicit()
     gain = law.gains[law.locate(np.zeros(n))]
@@ -62,9 +62,9 @@ def test_with_equal_discounts_the_law_maximizes_its_own_critic(name: str, gamma:
 
 
 @pytest.mark.filterwarnings("ignore:u_min")  # it says so
-def test_state_action_matrix_needs_a_law_that_rests_at_the_origin() -> None:
+def test_state_action_terms_need_a_law_that_rests_at_the_origin() -> None:
     mpc = input_bounds_only(LinearModel([[0.9]], [[1]], 1.0), u_min=0.2)
     with pytest.raises(
         ValueError, match="does not rest at the operating point: x_ss and u_ss must keep all bounds"
     ):
-        mpc.state_action_matrix(0.9)
+        mpc.state_action_terms(0.9)

@@ -155,10 +155,10 @@ def test_the_estimator_of_a_model_predicts_as_the_model_does() -> None:
     model = found.model
     y_ss = model.C @ model.x_ss
     estimator.reset(y[0] - y_ss)
-    one_ahead = [estimator.expected(u[0] - model.u_ss) + y_ss]
+    one_ahead = [estimator.C @ model.step(estimator.x_hat, u[0] - model.u_ss) + y_ss]
     for k in range(1, 300):
         estimator.update(y[k] - y_ss, u[k - 1] - model.u_ss)
-        one_ahead.append(estimator.expected(u[k] - model.u_ss) + y_ss)
+        one_ahead.append(estimator.C @ model.step(estimator.x_hat, u[k] - model.u_ss) + y_ss)
     late = slice(100, None)  # both have forgotten where they began
     np.testing.assert_allclose(np.array(one_ahead)[late], found.predict(y, u, 1)[late], atol=1e-6)
 

@@ -24,7 +24,7 @@ EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
 
 
 def papers(name: str, gamma: float = 0.99) -> QuadraticStateActionValue:
-    return QuadraticStateActionValue(solved(name).state_action_matrix(gamma), ranges_of(name))
+    return QuadraticStateActionValue(solved(name).state_action_terms(gamma).P, ranges_of(name))
 
 
 BOTH = pytest.mark.parametrize("kind", [critic_of, papers])
@@ -52,7 +52,7 @@ def test_value_is_the_quadratic_form_to_the_rounding_of_float32(
 ) -> None:
     rows = random_rows(name, 2000)
     z = np.hstack(in_physical_units(name, rows))
-    exact = -np.einsum("bi,ij,bj->b", z, solved(name).state_action_matrix(gamma), z)[:, None]
+    exact = -np.einsum("bi,ij,bj->b", z, solved(name).state_action_terms(gamma).P, z)[:, None]
     with th.no_grad():
         got = kind(name, gamma)(rows)
     assert got.shape == (2000, 1)
@@ -68,7 +68,7 @@ def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str, gamma: 
     critic_of(name, gamma)(rows).sum().backward()
     assert rows.grad is not None
     z = np.hstack(in_physical_units(name, rows.detach()))
-    slope = -2 * z @ solved(name).state_action_matrix(gamma)
+    slope = -2 * z @ solved(name).state_action_terms(gamma).P
     scale = np.concatenate([np.ones(law.n_theta), (law.u_max - law.u_min) / 2])
     expected = (slope * scale)[:, law.n_theta :]
     np.testing.assert_allclose(

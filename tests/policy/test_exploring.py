@@ -198,7 +198,7 @@ def test_entropy_starts_in_balance_and_what_the_user_gives_stays() -> None:
     assert model.target_entropy == pytest.approx(entropy.item(), abs=1e-3)
     mpc = model.policy.problem
     std = 0.1
-    curvature = mpc.state_action_matrix(model.gamma)[1, 1]
+    curvature = mpc.state_action_terms(model.gamma).P[1, 1]
     assert model.log_ent_coef.exp().item() == pytest.approx(2 * curvature * std**2, rel=1e-4)
     own = {"policy_kwargs": {"problem": mpc}, "ent_coef": 0.3, "target_entropy": -2.0}
     given = SAC("YannPolicy", LinearPlant(mpc), **own)

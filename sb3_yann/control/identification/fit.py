@@ -198,7 +198,6 @@ class Frozen:
     last: int
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return self.last - self.first + 1
 
 

@@ -66,7 +66,6 @@ class Identified(ReadOnlyArrays):
     __hash__ = object.__hash__
 
     def __str__(self) -> str:
-        """Return the report of the model."""
         return self.model.report()
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:

@@ -97,7 +97,6 @@ class IdentifiedOutputs(ReadOnlyArrays):
     __hash__ = object.__hash__
 
     def __str__(self) -> str:
-        """Return the report."""
         return self.report()
 
     def report(self) -> str:

@@ -370,16 +370,11 @@ class LinearMPC(MPCProblem):
         gamma = check.check_discount(gamma)  # before the law, which may take long
         return value(self.deviations, self.law(), gamma)
 
-    def state_action_matrix(self, gamma: float) -> Array:
-        """Return M (n_theta + m, n_theta + m): ``[theta; u]' M [theta; u]`` is the cost of u now.
-
-        The law follows. It holds where :meth:`value_matrix` does, and raises its errors. A price
-        adds to it.
-        """
-        return self.state_action_terms(gamma).P
-
     def state_action_terms(self, gamma: float) -> Value:
-        """Return the terms of the same cost of ``[theta; u]``, as :meth:`value_terms` does."""
+        """Return the terms of the cost of u now, the law ever after, as a form of ``[theta; u]``.
+
+        They hold where :meth:`value_matrix` does, and raise its errors.
+        """
         after = self.value_terms(gamma)
         own = self.deviations
         AB = np.hstack(own.prediction)

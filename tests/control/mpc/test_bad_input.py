@@ -185,7 +185,7 @@ def test_bad_discount_of_the_critic_is_named() -> None:
         (0, r"gamma = 0 must lie in \(0, 1\]"),
         ("high", TypeError("gamma = 'high' must be a number")),
     ):
-        for matrix in (mpc.value_matrix, mpc.state_action_matrix):
+        for matrix in (mpc.value_matrix, mpc.state_action_terms):
             with raises(message):
                 matrix(gamma)
     with pytest.raises(ValueError, match="samples = 0 must be a whole number"):

@@ -259,7 +259,7 @@ def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
     z = np.hstack([theta, u])
     form = np.einsum("bi,ij,bj->b", z, mpc.stage_matrix, z)
     np.testing.assert_allclose(mpc.stage_cost(theta, u), form, rtol=1e-9, atol=1e-9)
-    M = mpc.state_action_matrix(0.9)
+    M = mpc.state_action_terms(0.9).P
     following = mpc.predict(theta, u)
     value = np.einsum("bi,ij,bj->b", following, mpc.value_matrix(0.9), following)
     np.testing.assert_allclose(
