@@ -24,15 +24,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, warn
 from sb3_yann.deployment import code
-from sb3_yann.deployment.code import (
-    ControllerArrays,
-    input_ranges,
-    insensitive,
-    literal,
-    room_of,
-    sample_observations,
-    table,
-)
+from sb3_yann.deployment.code import ControllerArrays
 from sb3_yann.deployment.controller import KEPT_ROUNDING, MODES, Controller, steps_of
 
 
@@ -43,11 +35,11 @@ def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
     """
     controller = Controller(data)
     n_points = 48
-    drawn = sample_observations(controller, 4 * n_points)
+    drawn = code.sample_observations(controller, 4 * n_points)
     if precision == "float":
         drawn = drawn.astype(np.float32).astype(np.float64)
-    obs = insensitive(controller, drawn, precision)[:n_points]
-    room = room_of(data, precision)
+    obs = code.insensitive(controller, drawn, precision)[:n_points]
+    room = code.room_of(data, precision)
     # Beyond the box inputs may rest at their bounds, whatever is lost of a reading.
     steady = [np.any(controller.in_domain(each)) for each in (drawn, obs)]
     if not len(obs) or steady == [True, False]:
@@ -56,7 +48,7 @@ def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
             "range, at all points tried: readings are large beside what they move by. Pass "
             "precision='double'."
         )
-    ranges = input_ranges(controller, controller.evaluate(drawn))
+    ranges = code.input_ranges(controller, controller.evaluate(drawn))
     run = Run.with_estimator(data, obs) if "est_gain" in data else Run.of_readings(obs)
     answers = run.play(controller)
     room_in_loop = 0.0
@@ -79,17 +71,19 @@ def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
         **answers,
     }
     texts = [
-        table("yann_real" if each.dtype.kind == "f" else "int", name, each, precision)
+        code.table("yann_real" if each.dtype.kind == "f" else "int", name, each, precision)
         for name, each in numbers.items()
     ]
     n_outputs, n_states = run.plant["C_of_plant"].shape if run.plant else (0, 0)
-    sizes = {"POINTS": len(obs), "STEPS": len(run.lost), "STATES": n_states, "OUTPUTS": n_outputs}
-    sizes["LOADS"] = len(run.plant["loads_of_plant"]) if run.plant else 0
     return {
         "VECTORS": "\n".join(texts),
-        **{key: str(size) for key, size in sizes.items()},
+        "POINTS": str(len(obs)),
+        "STEPS": str(len(run.lost)),
+        "STATES": str(n_states),
+        "OUTPUTS": str(n_outputs),
+        "LOADS": str(len(run.plant.get("loads_of_plant", ()))),
         "ROOM_INSIDE": f"{room:g}",
-        "ROOM_OUTSIDE": f"{room_of(data, precision, inside=False):g}",
+        "ROOM_OUTSIDE": f"{code.room_of(data, precision, inside=False):g}",
         "ROOM_IN_LOOP": f"{room_in_loop:.2g}",
     }
 
@@ -266,7 +260,7 @@ def _definitions(data: ControllerArrays, precision: str) -> str:
         key.upper(): int(data[key]) for key in ("frozen_after", "hold", "recover", "transfer")
     }
     tolerances = {"late_after": data["late_after"], **code.search_tolerances(data, precision)}
-    flags |= {key.upper(): literal(value, precision) for key, value in tolerances.items()}
+    flags |= {key.upper(): code.literal(value, precision) for key, value in tolerances.items()}
     if walks:
         flags["WALK_FROM"] = int(data["walk_from"])
     if n_networks:
@@ -283,16 +277,16 @@ def _definitions(data: ControllerArrays, precision: str) -> str:
             **{f"WIDTH_{i + 1}": width for i, width in enumerate(widths)},
             "WIDTH_LAST": widths[-1],
             "ACTIVATION": activation,
-            "REACH": f"((real){literal(data['reach'], precision)})",
-            "FADES_FROM": literal(fade_start, precision),
-            "FADES_TO": literal(fade_end, precision),
-            "KEPT_ROUNDING": literal(KEPT_ROUNDING, precision),
+            "REACH": f"((real){code.literal(data['reach'], precision)})",
+            "FADES_FROM": code.literal(fade_start, precision),
+            "FADES_TO": code.literal(fade_end, precision),
+            "KEPT_ROUNDING": code.literal(KEPT_ROUNDING, precision),
             "N_KEPT": len(data["kept"]),
         }
     index = f"int{8 * code.index_bytes(indices)}_t"
     lines = [f"#define {key} {value}" for key, value in flags.items()]
-    lines += ["", *(table("real", key, each, precision) for key, each in numbers.items())]
-    lines += [table(index, key, each, precision) for key, each in indices.items()]
+    lines += ["", *(code.table("real", key, each, precision) for key, each in numbers.items())]
+    lines += [code.table(index, key, each, precision) for key, each in indices.items()]
     return "\n".join(lines)
 
 
@@ -318,12 +312,12 @@ def fmu_file(data: ControllerArrays, precision: str, about: str) -> bytes:
         for file, text in c_files(data, precision, about, name).items()
         if not file.endswith("_selftest.c")
     }
-    rest = ", ".join(literal(each, "double") for each in data["obs_rest"])
+    rest = ", ".join(code.literal(each, "double") for each in data["obs_rest"])
     entries = {
         "ABOUT": comment(about.splitlines()),
         "FILE": name,
         "GUID": identity,
-        "DT": literal(float(data["dt"]), "double"),
+        "DT": code.literal(float(data["dt"]), "double"),
         "REST": f"{{{rest}}}",
     }
     for suffix in (".c", ".h"):
@@ -334,8 +328,7 @@ def fmu_file(data: ControllerArrays, precision: str, about: str) -> bytes:
         **{f"sources/{file}": text.encode("ascii") for file, text in sources.items()},
     }
     folder, suffix = LIBRARIES.get((platform.system(), platform.machine()), ("", ""))
-    library = _library(sources) if folder else b""
-    if library:
+    if folder and (library := _library(sources)):
         parts[f"binaries/{folder}/{name}{suffix}"] = library
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -386,7 +379,6 @@ def _library(sources: dict[str, str]) -> bytes:
 def _description(data: ControllerArrays, about: str, identity: str, units: list[str]) -> bytes:
     """Return modelDescription.xml."""
     name = str(data["name"])
-    dt = float(data["dt"])
     root = ET.Element(
         "fmiModelDescription",
         fmiVersion="2.0",
@@ -402,8 +394,9 @@ def _description(data: ControllerArrays, about: str, identity: str, units: list[
         ET.SubElement(listed, "File", name=unit)
     logs = ET.SubElement(root, "LogCategories")
     ET.SubElement(logs, "Category", name="logStatusError")
-    if dt:
-        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(dt))
+    if data["dt"]:
+        step = repr(float(data["dt"]))
+        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=step)
     variables = ET.SubElement(root, "ModelVariables")
     _add_variables(variables, data)
     structure = ET.SubElement(root, "ModelStructure")
@@ -418,19 +411,15 @@ def _description(data: ControllerArrays, about: str, identity: str, units: list[
 
 def _add_variables(within: ET.Element, data: ControllerArrays) -> None:
     """Add all variables, in the order of their value references."""
-    inputs = [*map(str, data["action_names"])]
+    inputs = [*enumerate(map(str, data["action_names"]))]
+    readings = enumerate(zip(data["obs_names"], data["obs_rest"], strict=True))
     who = "0 the policy, 1 the MPC, 2 manual"
-    taken: list[tuple[str, str, str, str, str | None]] = []
-    for i, (name, rest) in enumerate(zip(data["obs_names"], data["obs_rest"], strict=True)):
-        start = repr(float(rest))
-        taken.append(("Real", "input", f"obs[{i}]", str(name), start))
     elapsed = "time since the last step in units of dt; 0 where it is not known"
-    taken.append(("Real", "input", "elapsed", elapsed, "0.0"))
-    for i, name in enumerate(inputs):
-        taken.append(("Real", "input", f"manual[{i}]", f"{name}, of the operator", "0.0"))
-    for i, name in enumerate(inputs):
-        taken.append(("Real", "output", f"command[{i}]", name, None))
-    taken += [
+    taken: list[tuple[str, str, str, str, str | None]] = [
+        *(("Real", "input", f"obs[{i}]", str(k), repr(float(rest))) for i, (k, rest) in readings),
+        ("Real", "input", "elapsed", elapsed, "0.0"),
+        *(("Real", "input", f"manual[{i}]", f"{k}, of the operator", "0.0") for i, k in inputs),
+        *(("Real", "output", f"command[{i}]", name, None) for i, name in inputs),
         ("Integer", "input", "request", who, "0"),
         ("Integer", "output", "status", "0, or the sum of what was found", None),
         ("Integer", "output", "mode", f"who acted: {who}", None),

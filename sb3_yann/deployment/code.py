@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -220,35 +221,18 @@ def literal(value: float, precision: str) -> str:
     return f"{decimal(value, precision)}{'f' if precision == 'float' else ''}"
 
 
-def wrap(entries: Iterable[str], width: int) -> list[str]:
-    """Return lines of entries with commas between them, a line of at least one entry each."""
-    lines = []
-    line = ""
-    for entry in entries:
-        if line and len(line) + len(entry) > width:
-            lines.append(line)
-            line = ""
-        line += f"{', ' if line else ''}{entry}"
-    return [*lines, line]
-
-
 def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> str:
     """Return the declaration of a constant array in C, of a type, of any shape but an empty one."""
     sizes = "".join(f"[{each}]" for each in values.shape)
-    return f"static const {kind} {name}{sizes} = {_nested(values, precision, 0)};"
-
-
-def _nested(values: NDArray[np.generic], precision: str, depth: int) -> str:
-    indent = "    " * (depth + 1)
-    outer = "    " * depth
-    if values.ndim > 1:
-        rows = f",\n{indent}".join(_nested(each, precision, depth + 1) for each in values)
-        return f"{{\n{indent}{rows},\n{outer}}}"
-    whole = values.dtype.kind in "ib"
-    texts = [str(int(each)) if whole else literal(float(each), precision) for each in values]
-    lines = wrap(texts, 90 - len(indent))
-    body = f",\n{indent}".join(lines)
-    return f"{{{body}}}" if len(lines) == 1 else f"{{\n{indent}{body},\n{outer}}}"
+    body = np.array2string(
+        values + 0 if values.dtype.kind == "b" else values,
+        max_line_width=90,
+        separator=", ",
+        threshold=sys.maxsize,
+        formatter={"int_kind": str, "float_kind": lambda each: literal(each, precision)},
+    )
+    body = body.translate(str.maketrans("[]", "{}"))
+    return f"static const {kind} {name}{sizes} =\n{body};"
 
 
 def ascii_text(lines: Iterable[str]) -> str:
@@ -281,8 +265,8 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     kept = np.ones(len(obs), bool)
     half = input_ranges(controller, actions) / 2
     inside = controller.in_domain(obs)
-    rooms = [room_of(controller.data, precision, is_inside) for is_inside in (False, True)]
-    room = np.where(inside, rooms[1], rooms[0])[:, None]
+    outside = room_of(controller.data, precision, inside=False)
+    room = np.where(inside, room_of(controller.data, precision), outside)[:, None]
     is_online = "qp_gram" in controller.data  # and continuous: all readings move at once
     for sign in (-1, 1):
         for j in [slice(None)] if is_online else range(obs.shape[1]):

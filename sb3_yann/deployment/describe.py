@@ -184,8 +184,7 @@ def describe(
     problem = policy.problem if isinstance(policy, StartsAsMPC) else None
     problem = policy if isinstance(policy, LinearMPC) else problem
     own = estimator if isinstance(estimator, StateEstimator) else None
-    note = _lacks(policy, problem, estimator)
-    note = " ".join(filter(None, [note, _unconfirmed(given)]))
+    note = " ".join(filter(None, [_lacks(policy, problem, estimator), _unconfirmed(given)]))
     if isinstance(policy, StartsAsMPC):
         layer = policy.actor.mu
         law, program = _with_regions(layer.base_law)
@@ -199,12 +198,11 @@ def describe(
             change = law.rate / _input_range(law)[2]
 
     n = law.n_theta
-    states = np.zeros(law.n_theta, bool)
     state_names: list[str] = []
     input_names = [f"u[{i}]" for i in range(law.n_inputs)]
     if law.model is not None:
         state_names, input_names = labels_of(law.model)
-    states[: len(state_names)] = True
+    states = np.arange(n) < len(state_names)
     labels = [*state_names, *(f"theta[{i}]" for i in range(len(state_names), n))]
     rest: Array = np.zeros(n)
     if problem is not None:
@@ -213,11 +211,10 @@ def describe(
 
     matrix, offset, scale, shift = _signal_maps(policy, law)
     watched = states
-    if isinstance(policy, StartsAsMPC):
-        if not keeps_entries(policy.actor.features_extractor):
-            labels = [f"obs[{i}]" for i in range(matrix.shape[1])]
-            shown = matrix != 0  # entries are watched that say what states are, and nothing else
-            watched = shown[states].any(0) & ~shown[~states].any(0)
+    if isinstance(policy, StartsAsMPC) and not keeps_entries(policy.actor.features_extractor):
+        labels = [f"obs[{i}]" for i in range(matrix.shape[1])]
+        shown = matrix != 0  # entries are watched that say what states are, and nothing else
+        watched = shown[states].any(0) & ~shown[~states].any(0)
     seen_rest = np.asarray(np.linalg.lstsq(matrix, rest - offset, rcond=None)[0], np.float64)
     signals = {
         "source": np.arange(matrix.shape[1]),
@@ -331,12 +328,9 @@ def _with_sources(problem: LinearMPC) -> list[str]:
 def _unconfirmed(given: Exportable) -> str:
     """Return whether a model has learnt what nothing has confirmed; empty if not, and of others."""
     policy = given.policy if isinstance(given, BaseAlgorithm) else None
-    improved = bool(getattr(given, "improvements", False))
-    if (
-        improved
-        or not isinstance(policy, StartsAsMPC)
-        or not ActorCheckpoint.of(policy).has_learned()
-    ):
+    if not isinstance(policy, StartsAsMPC) or getattr(given, "improvements", False):
+        return ""
+    if not ActorCheckpoint.of(policy).has_learned():
         return ""
     state = getattr(given, "guard_state", None)
     if state is None:
@@ -414,6 +408,7 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
     """Return a law for inputs in [-1, 1], or as they are where they have no bounds."""
     finite, middle, half = _input_range(law)
     A, b, starts, neighbors = law.open_regions
+    box = np.array([law.theta_min, law.theta_max])
     arrays: dict[str, Any] = {
         "gains": law.gains / half[:, None],
         "offsets": (law.offsets - middle) / half,
@@ -424,12 +419,7 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
         "zero_input": np.bool_(law.infeasible == "zero_input"),
         "disjoint": np.bool_(law.disjoint),
         "tolerances": np.array([law.tolerance, law.tie_tolerance]),
-        "box": np.array(
-            [
-                np.where(np.isfinite(law.theta_min), law.theta_min, -1.0),
-                np.where(np.isfinite(law.theta_max), law.theta_max, 1.0),
-            ]
-        ),
+        "box": np.where(np.isfinite(box), box, [[-1.0], [1.0]]),
         "per_input": 1 / half,
         "middle": middle / half,
     }

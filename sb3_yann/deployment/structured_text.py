@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from importlib.resources import files
 from itertools import groupby
 from xml.sax.saxutils import escape
@@ -197,7 +198,8 @@ def _array(name: str, kind: str, texts: list[str]) -> str:
     """Return the declaration of an array; what repeats is written once, ``3(0.0)``."""
     runs = ((text, len(list(group))) for text, group in groupby(texts))
     entries = [text if count == 1 else f"{count}({text})" for text, count in runs]
-    body = ",\n        ".join(code.wrap(entries, 90))
+    lines = textwrap.wrap(", ".join(entries), 90, break_on_hyphens=False)
+    body = "\n        ".join(lines)
     return f"{name} : ARRAY[0..{len(texts) - 1}] OF {kind} := [{body}];"
 
 
