@@ -224,12 +224,13 @@ def literal(value: float, precision: str) -> str:
 def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> str:
     """Return the declaration of a constant array in C, of a type, of any shape but an empty one."""
     sizes = "".join(f"[{each}]" for each in values.shape)
+    real = values.dtype.kind == "f"
     body = np.array2string(
-        values + 0 if values.dtype.kind == "b" else values,
+        values,
         max_line_width=90,
         separator=", ",
         threshold=sys.maxsize,
-        formatter={"int_kind": str, "float_kind": lambda each: literal(each, precision)},
+        formatter={"all": lambda each: literal(each, precision) if real else str(int(each))},
     )
     body = body.translate(str.maketrans("[]", "{}"))
     return f"static const {kind} {name}{sizes} =\n{body};"

@@ -12,6 +12,7 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
+from sb3_yann._validation import check_type
 from sb3_yann.env_pool import Source
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.improvement import Headroom
@@ -122,13 +123,11 @@ def _subject(
     seeds: Iterable[int],
 ) -> Subject:
     """Return what the report is about, checked."""
-    if not isinstance(model, BaseAlgorithm):
-        raise TypeError(f"model = {model!r} must be an SB3 model with a YannPolicy.")
+    check_type("model", model, BaseAlgorithm, "an SB3 model with a YannPolicy")
     policy = require_yann_policy(model.policy, "report")
-    given = {"guard": (guard, ImprovementGuard), "twin": (twin, PlantTwin)}
-    for name, (value, kind) in {**given, "headroom": (headroom, Headroom)}.items():
-        if value is not None and not isinstance(value, kind):
-            raise TypeError(f"{name} = {value!r} must be a {kind.__name__}, or None.")
+    check_type("guard", guard, ImprovementGuard | None, "an ImprovementGuard, or None")
+    check_type("twin", twin, PlantTwin | None, "a PlantTwin, or None")
+    check_type("headroom", headroom, Headroom | None, "a Headroom, or None")
     if guard is not None and getattr(guard, "model", None) is not model:
         raise ValueError(
             "The guard has not watched this model: pass the one that was its callback in learn, or "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -13,6 +12,7 @@ import numpy as np
 from scipy import stats
 from stable_baselines3.common.type_aliases import TrainFreq
 
+from sb3_yann._archive import digest_of
 from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_states
 from sb3_yann.compare import (
@@ -24,7 +24,7 @@ from sb3_yann.compare import (
     no_worse,
     relative_costs,
 )
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.evaluation import change_in_percent
 from sb3_yann.evaluation.plots import (
@@ -74,15 +74,12 @@ def loops_part(subject: Subject) -> Part:
         return left_out(title, NO_ENV)
     mpc = loops[OF_MPC]
     policy = loops[OF_POLICY]
-    rows = []
-    for name, of in (("mean", np.mean), ("median", np.median), ("worst", np.max)):
-        old = float(of(mpc.costs))
-        new = float(of(policy.costs))
-        rows.append([f"{name} cost", f"{old:.6g}", f"{new:.6g}", _change(old, new)])
+    averages = ("mean cost", np.mean), ("median cost", np.median), ("worst cost", np.max)
+    values = [(name, float(of(mpc.costs)), float(of(policy.costs))) for name, of in averages]
     shares = (_stage_costs(subject.problem, each) for each in (mpc, policy))
     names = "mean stage cost of states", "mean stage cost of inputs off their rest"
-    for name, old, new in zip(names, *shares, strict=True):
-        rows.append([name, f"{old:.6g}", f"{new:.6g}", _change(old, new)])
+    values += zip(names, *shares, strict=True)
+    rows = [[name, f"{old:.6g}", f"{new:.6g}", _change(old, new)] for name, old, new in values]
     for name, before, after in (
         ("steps that violate a limit", mpc.violations.sum(), policy.violations.sum()),
         ("episodes that the env terminates", mpc.terminated.sum(), policy.terminated.sum()),
@@ -93,14 +90,14 @@ def loops_part(subject: Subject) -> Part:
     count = len(subject.seeds)
     is_range = count > 2 and subject.seeds == (*range(first, first + count),)
     seeds = f"{first} to {last}" if is_range else ", ".join(map(str, subject.seeds))
+    cost = "the sum of the MPC's stage cost: the env gives no reward."
+    if is_rewarded(loops):
+        cost = "minus the sum of the rewards."
     how = (
         f"{count} episodes of {subject.env_name}, seeds {seeds}, each played by the MPC "
         "and by the policy from the same start, without any noise of actions. A cost is "
+        f"{cost}{of_estimates(subject.problem)}"
     )
-    of_rewards = "minus the sum of the rewards."
-    of_stages = "the sum of the MPC's stage cost: the env gives no reward."
-    how += of_rewards if is_rewarded(loops) else of_stages
-    how += of_estimates(subject.problem)
     if _in_twin(subject):
         how += " The env is a twin, fitted to the plant's log: the plant has played none of them."
     state = subject.state
@@ -329,14 +326,13 @@ def _pictures(subject: Subject) -> list[Html]:
     policy = subject.policy
     loops = subject.loops
     found = []
-    if subject.has_regions and loops is not None:
+    if isinstance(subject.law, PiecewiseAffine) and loops is not None:
         caption = (
             "The regions that the policy's closed loops visit, and how far it is from the MPC in "
             "each, in the input that is farthest."
         )
-        found.append(
-            picture(partial(use_figure, problem, policy, subject.shown_loops[OF_POLICY]), caption)
-        )
+        draw = partial(use_figure, problem, policy, subject.shown_loops[OF_POLICY])
+        found.append(picture(draw, caption))
     if problem.n_theta < 2:
         return found
     plane = subject.steepest_plane
@@ -461,11 +457,10 @@ def improve_part(subject: Subject) -> Part:
     else:
         text = "The policy is NOT the one that improve accepted last: it was changed since."
         finding = make_finding(False, text)
-    rows = []
-    for k, each in enumerate(found, start=1):
-        checks = str(len(each.checks))
-        place = f"{each.where}: {each.source}"
-        rows.append([str(k), place, str(each.episodes), checks])
+    rows = [
+        [str(k), f"{each.where}: {each.source}", str(each.episodes), str(len(each.checks))]
+        for k, each in enumerate(found, start=1)
+    ]
     tried = [
         [
             f"{k}.{j}",
@@ -563,15 +558,12 @@ def again_part(subject: Subject) -> Part:
             text = getattr(value, "__name__", type(value).__name__)
         settings.append([name, text])
     program = problem.condensed()
-    digest = hashlib.sha256()
-    arrays = [program.H, program.F, program.c, program.G, program.w, program.S]
-    arrays += [] if program.feedback is None else [program.feedback]
-    arrays += [problem.deviations.theta_min, problem.deviations.theta_max, problem.theta_ss]
-    for each in arrays:
-        digest.update(np.ascontiguousarray(each).tobytes())
+    arrays = {name: getattr(program, name) for name in "H F c G w S feedback".split()}
+    arrays |= {name: getattr(problem, name) for name in ("theta_min", "theta_max", "theta_ss")}
+    given = {name: each for name, each in arrays.items() if each is not None}
     prints = [
         ["the policy's weights", fingerprint(subject.policy.actor.state_dict())],
-        ["the MPC problem", digest.hexdigest()],
+        ["the MPC problem", digest_of(given)],
     ]
     parts = [
         tag("h3", "Versions"), table(["library", "version"], versions),

@@ -108,7 +108,7 @@ def constraints_part(subject: Subject) -> Part:
     head = ["quantity", "lower", "upper", "kind", "acts in the plan"]
     head += [f"{name}: {what}" for name in loops for what in ("range", "steps beyond")]
     rows = []
-    for name, key, (of, k), kind, series in _bounds(problem):
+    for name, key, of, k, kind, series in _bounds(problem):
         share = 100 * acting[key] / max(len(solvable), 1)
         low, high = (side[k] for side in problem.limits[of])
         row = [name, number(low), number(high), kind, f"{share:.1f} %"]
@@ -117,7 +117,7 @@ def constraints_part(subject: Subject) -> Part:
             parts = [np.zeros(0)]
             beyond = 0
             for x, u in episodes.pairs:
-                values = series(x, u)
+                values = series(x, u)[:, k]
                 below, above = problem.limits_at(of, x[: len(values)])  # at run time
                 parts.append(values)
                 out = (values < below[..., k] - rounding) | (values > above[..., k] + rounding)
@@ -140,9 +140,8 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
     mpc = loops[OF_MPC].excess
     policy = loops[OF_POLICY].excess
     assert mpc is not None and policy is not None
-    is_worse = bool(
-        np.any(less_safe(unsafe_columns(0, 0, 0, policy), unsafe_columns(0, 0, 0, mpc)))
-    )
+    ours, its = (unsafe_columns(0, 0, 0, each) for each in (policy, mpc))
+    is_worse = bool(np.any(less_safe(ours, its)))
     text = (
         "Excess over the hard bounds of the problem, in half-widths: "
         f"{policy.largest.max():.3g} at most with the policy, {mpc.largest.max():.3g} with the "
@@ -180,8 +179,8 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
     return tuple(found)
 
 
-def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, tuple[str, int], str, Any]]:
-    """Yield label, key, which of the limits, kind, and the values in an episode, of all bounds.
+def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, str, int, str, Any]]:
+    """Yield label, key, limits, the entry of these, kind, and values in an episode, of all bounds.
 
     All of it is in plant units.
     """
@@ -211,12 +210,8 @@ def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, tuple[str, int], str
     )  # fmt: skip
     for called, keys, of_limits, is_soft, values in groups:
         for k in np.flatnonzero(np.isfinite(problem.limits[of_limits]).any(axis=0)):
-
-            def series(x: Array, u: Array, k: int = k, of: Any = values) -> Array:
-                return np.asarray(of(x, u)[:, k])
-
             kind = "soft" if is_soft[k] else "hard"
-            yield called[k], keys[k], (of_limits, int(k)), kind, series
+            yield called[k], keys[k], of_limits, int(k), kind, values
 
 
 # ---- The law ----
@@ -264,7 +259,7 @@ def law_part(subject: Subject) -> Part:
 
 def _regions(subject: Subject) -> Html:
     problem = subject.problem
-    if not subject.has_regions or problem.n_theta < 2:
+    if not isinstance(subject.law, PiecewiseAffine) or problem.n_theta < 2:
         why = "A picture of regions needs an explicit law of two parameters or more."
         return tag("p", why, class_="said")
     plane = subject.steepest_plane
@@ -283,7 +278,6 @@ def _error_of_law(subject: Subject) -> tuple[int, float, int]:
     """
     problem = subject.problem
     law = subject.law
-    theta_half = subject.problem.theta_half
     program = ActiveConstraints(problem).units
     errors = [0.0]
     doubtful = 0
@@ -292,7 +286,7 @@ def _error_of_law(subject: Subject) -> tuple[int, float, int]:
     for theta, u, is_inside in zip(subject.samples, inputs, inside, strict=True):
         U = program.scaled.solve((theta - program.center) / program.half)
         if (U is not None) != is_inside:
-            near = 1e-6 * theta_half * np.vstack([np.eye(len(theta)), -np.eye(len(theta))])
+            near = 1e-6 * problem.theta_half * np.vstack([np.eye(len(theta)), -np.eye(len(theta))])
             doubtful += not np.any(law.in_domain(theta + near) != is_inside)
         elif U is not None:
             planned = program.program.first_input(U * program.reach, theta, len(u))

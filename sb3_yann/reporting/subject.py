@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._validation import Array, is_text
-from sb3_yann.control import LinearMPC, PiecewiseAffine
+from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import costs_of, excess_of_episodes
 from sb3_yann.control.online import Law
 from sb3_yann.control.wrapper_stack import require_state_shown
@@ -148,12 +149,10 @@ def number(value: float) -> str:
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Html:
     """Return a table that scrolls on a narrow screen; columns of numbers are set to the right."""
     body = [[*row] for row in rows]
+    numeric = re.compile(r"\s*|[+−-]*\d.*|none")
     kinds: list[dict[str, str]] = [{} for _ in head]
     for k, kind in enumerate(kinds):
-        texts = [str(row[k]) for row in body]
-        if texts and all(
-            not text.strip() or text.lstrip("+-−")[:1].isdigit() or text == "none" for text in texts
-        ):
+        if body and all(numeric.fullmatch(str(row[k])) for row in body):
             kind["class_"] = "number"
     lines = [
         tag("tr", *(tag(name, each, **kind) for each, kind in zip(row, kinds, strict=True)))
@@ -257,11 +256,6 @@ class Subject:
     def law(self) -> Law:
         """The MPC's law, as the policy was built with."""
         return self.problem.law(self.policy.law)
-
-    @property
-    def has_regions(self) -> bool:
-        """Whether the law is explicit."""
-        return isinstance(self.law, PiecewiseAffine)
 
     @property
     def state(self) -> GuardState | None:
