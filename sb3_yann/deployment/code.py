@@ -221,16 +221,19 @@ def literal(value: float, precision: str) -> str:
     return f"{decimal(value, precision)}{'f' if precision == 'float' else ''}"
 
 
-def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> str:
+def table(kind: str, name: str, values: NDArray[Any], precision: str) -> str:
     """Return the declaration of a constant array in C, of a type, of any shape but an empty one."""
     sizes = "".join(f"[{each}]" for each in values.shape)
-    real = values.dtype.kind == "f"
+
+    def shown(entry: Any) -> str:
+        return literal(entry, precision) if values.dtype.kind == "f" else str(int(entry))
+
     body = np.array2string(
         values,
         max_line_width=90,
         separator=", ",
         threshold=sys.maxsize,
-        formatter={"all": lambda each: literal(each, precision) if real else str(int(each))},
+        formatter={"all": shown},
     )
     body = body.translate(str.maketrans("[]", "{}"))
     return f"static const {kind} {name}{sizes} =\n{body};"
