@@ -21,8 +21,6 @@ EXACT = 1e-5
 """What rounding to float32 leaves of an agreement, relative to the spread of the rewards."""
 MIN_STEPS = 10  # steps that must be compared
 
-_RECORDED = ("observation", "following", "action", "reward", "counted")
-
 
 @dataclass(frozen=True)
 class CostFinding:
@@ -198,7 +196,7 @@ class CostAudit(BaseCallback):
         self.policy = require_yann_policy(self.model.policy, "CostAudit")
         watch_buffer(self.model)
         self.finding = None
-        self._records: list[dict[str, Any]] = []
+        self._records: list[tuple[Any, ...]] = []
 
     def _on_step(self) -> bool:
         if self.finding is None and len(self._records) < self.steps:
@@ -221,35 +219,31 @@ class CostAudit(BaseCallback):
             done = bool(self.locals["dones"][i])
             terminated = done and not info.get("TimeLimit.truncated", False)
             following = info["terminal_observation"] if done else self.locals["new_obs"][i]
-            self._records.append(
-                {
-                    "observation": np.array(self.model._last_obs[i]),  # type: ignore[index]
-                    "following": np.array(following),  # copies: an env may write into its arrays
-                    "action": np.array(actions[i], dtype=np.float64),
-                    "reward": float(rewards[i]),
-                    "counted": not (may_change_reward(info) or terminated),
-                }
-            )
+            # Copies: an env may write into its arrays.
+            seen = np.array(self.model._last_obs[i]), np.array(following)  # type: ignore[index]
+            counted = not (may_change_reward(info) or terminated)
+            action = np.array(actions[i], dtype=np.float64)
+            self._records.append((*seen, action, float(rewards[i]), counted))
 
     def _judge(self) -> None:
-        records = {name: np.array([each[name] for each in self._records]) for name in _RECORDED}
-        shown = records["observation"], records["following"]
-        finite = np.isfinite(records["reward"])
-        for each in shown:
+        before, after, actions, rewards, counted = map(np.array, zip(*self._records, strict=True))
+        finite = np.isfinite(rewards)
+        for each in (before, after):
             finite &= np.isfinite(each.reshape(len(finite), -1)).all(axis=1)
         if not finite.any():
             return
         theta, following = (
-            np.asarray(self.policy.theta(each[finite]).double().cpu().numpy()) for each in shown
+            np.asarray(self.policy.theta(each[finite]).double().cpu().numpy())
+            for each in (before, after)
         )
-        u = self.policy.inputs(records["action"][finite])
-        counted = records["counted"][finite]
+        u = self.policy.inputs(actions[finite])
+        counted = counted[finite]
         compared = self._compared(
             theta[counted],
             following[counted],
             u[counted],
-            records["reward"][finite][counted],
-            self._rounding(shown[0][finite][counted]),
+            rewards[finite][counted],
+            self._rounding(before[finite][counted]),
         )
         count = len(compared.rewards)
         if count < MIN_STEPS:  # what is not finite has had its own warning
@@ -299,11 +293,9 @@ class CostAudit(BaseCallback):
             f"The reward is not {expected}: over {len(error)} steps the two differ by "
             f"{error.mean():.3g} on average, where the cost is {np.abs(compared.cost).mean():.3g}.",
             f"Likely cause: {explanation}",
-        ]
-        said.append(
             f"The nearest straight line is reward = {line.scale:.6g} * (-cost) {line.offset:+.6g}, "
-            f"R² = {line.r2:.6f}."
-        )
+            f"R² = {line.r2:.6f}.",
+        ]
         if line.scale > 0 and line.r2 > 0.99:
             numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
             said.append(f'Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.')

@@ -102,29 +102,21 @@ class SeededGlobals(gym.Wrapper[Any, Any, Any, Any]):
 
     @contextmanager
     def _own_stream(self) -> Iterator[None]:
+        """Let global functions draw from the env's generators, and then from theirs again.
+
+        Those of numpy are exchanged, for their states are slow to read and to set. An exchange
+        forgets the second normal number of a pair that was drawn: the user's is put back.
+        """
         python_outside = random.getstate()
+        outside = get_bit_generator()
+        state: Any = np.random.get_state(legacy=False)  # noqa: NPY002 (what the env draws from)
         random.setstate(self.python_stream)
+        set_bit_generator(self.numpy_stream)
         try:
-            with _numpy_draws_from(self.numpy_stream):
-                yield
+            yield
         finally:
+            set_bit_generator(outside)
+            if state["has_gauss"]:
+                np.random.set_state(state)  # noqa: NPY002 (what the env draws from)
             self.python_stream = random.getstate()
             random.setstate(python_outside)
-
-
-@contextmanager
-def _numpy_draws_from(generator: Any) -> Iterator[None]:
-    """Let numpy's global functions draw from a bit generator, and then from theirs again.
-
-    Generators are exchanged, for their states are slow to read and to set. An exchange forgets the
-    second normal number of a pair that was drawn, so that of the user's pair is put back.
-    """
-    outside = get_bit_generator()
-    state: Any = np.random.get_state(legacy=False)  # noqa: NPY002 (what the env draws from)
-    set_bit_generator(generator)
-    try:
-        yield
-    finally:
-        set_bit_generator(outside)
-        if state["has_gauss"]:
-            np.random.set_state(state)  # noqa: NPY002 (what the env draws from)

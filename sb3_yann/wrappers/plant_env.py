@@ -81,7 +81,6 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         super().__init__(env)
         check_type("problem", problem, LinearMPC, "a LinearMPC, such as that of the policy")
         self.inputs = require_vector(env, "action_space")
-        names = problem.labels()
         units = ActionUnits.of(problem, self.inputs.low, self.inputs.high)
         u_ss = problem.model.u_ss
         self.units = units or ActionUnits("plant", np.ones_like(u_ss), u_ss.copy())
@@ -89,12 +88,12 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
             from sb3_yann.policy.observations import as_observation  # loads PyTorch
 
             observation = as_observation(observation, problem)
-        self.seen: Callable[[ArrayLike], Array] = observation or _as_it_is
+        self.seen: Callable[[ArrayLike], Array] = observation or np.asarray
         shape = np.shape(self.seen(np.zeros(space.shape)))
         if shape != (problem.n_theta,):
             what = "The observation" if observation is None else "What the map makes of it"
             raise ValueError(
-                f"{what} has shape {shape}, but theta = [{', '.join(names)}] has "
+                f"{what} has shape {shape}, but theta = [{', '.join(problem.labels())}] has "
                 f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order, or "
                 "pass observation=AffineObservation(matrix, offset)."
             )
@@ -108,12 +107,11 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(**kwargs)
-        shape = np.shape(observation)
-        declared = self.observation_space.shape
-        if shape != declared:
+        if (shape := np.shape(observation)) != self.observation_space.shape:
             raise ValueError(
                 f"The env's reset returned an observation of shape {shape}, and its "
-                f"observation_space has {declared}: return a vector, such as np.ravel(observation)."
+                f"observation_space has {self.observation_space.shape}: return a vector, such as "
+                "np.ravel(observation)."
             )
         self.theta = self.problem.units.to_deviations(self.seen(observation))
         return observation, info
@@ -134,11 +132,6 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         cost += info["violation_cost"]
         self.theta = after
         return observation, -cost, terminated, truncated, info
-
-
-def _as_it_is(observation: ArrayLike) -> Array:
-    """Return the observation as theta."""
-    return np.asarray(observation, np.float64)
 
 
 Slope = Callable[[Array, Array], ArrayLike]
@@ -236,13 +229,13 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         require_order(f, mpc.model.dt, x_ss, mpc.model.u_ss)
         env: Any = plant
         if ratio := ratio_of_time_units(plant.slope, mpc):
-            faster = ratio < 1
-            times = 1 / ratio if faster else ratio
+            times = max(ratio, 1 / ratio)
+            pace, cure = ("fast", "/") if ratio < 1 else ("slow", "*")
             warn(
-                f"f(x, u) is {times:g} times as {'fast' if faster else 'slow'} as the model of the "
+                f"f(x, u) is {times:g} times as {pace} as the model of the "
                 f"MPC, whose dt = {mpc.model.dt:g}{f' {mpc.model.time_unit}'.rstrip()}. If f is in "
-                "another unit of time than dt, pass lambda x, u: np.asarray(f(x, u)) "
-                f"{'/' if faster else '*'} {times:g}.",
+                f"another unit of time than dt, pass lambda x, u: np.asarray(f(x, u)) {cure} "
+                f"{times:g}.",
             )
         if layout.n_references:
             r = mpc.tracking

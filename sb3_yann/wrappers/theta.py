@@ -37,19 +37,26 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
     What lies on a bound is shown inside it, where float32 would round it beyond: some laws are zero
-    outside their box. ``low`` and ``high`` are (p,), the spaces of the env boxes of one dimension.
-    ``appends`` are parts of `ThetaLayout` that it may hold.
+    outside their box. ``low`` and ``high`` are (p,), of ``rows`` vectors of p / rows entries with
+    the same bounds. ``appends`` are parts of `ThetaLayout` that it may hold.
     """
 
     appends: tuple[str, ...] = ()
 
     def __init__(
-        self, env: Env, low: ArrayLike, high: ArrayLike, n_replaced: int = 0, n_new: int = 0
+        self,
+        env: Env,
+        low: ArrayLike,
+        high: ArrayLike,
+        n_replaced: int = 0,
+        n_new: int = 0,
+        rows: int = 1,
     ) -> None:
         inner = require_vector(env, "observation_space")
         super().__init__(env)
         self.inputs = require_vector(self, "action_space")
-        self.low, self.high = (np.atleast_1d(np.array(side, np.float64)) for side in (low, high))
+        sides = (np.array(side, np.float64, ndmin=1) for side in (low, high))
+        self.low, self.high = (np.tile(side, rows) for side in sides)
         if self.low.ndim != 1 or self.low.shape != self.high.shape:
             raise ValueError(
                 f"low has shape {self.low.shape} and high {self.high.shape}; give the bounds of "
@@ -148,7 +155,15 @@ class PastInputs(Appending):
         low = np.repeat(bounds.low, self.delays)
         high = np.repeat(bounds.high, self.delays)
         super().__init__(env, low, high)
-        self.initial = _as_initial(initial, bounds, np.array(self.delays) > 0)
+        late = np.array(self.delays) > 0
+        if initial is None and np.any(late & ((bounds.low >= 0) | (bounds.high <= 0))):
+            raise ValueError(
+                f"The env takes inputs from {bounds.low.tolist()} to {bounds.high.tolist()}: zero, "
+                "the default, is hardly the one before an episode. Pass initial, such as u_ss of "
+                "the model."
+            )
+        given = check_vector("initial", initial, len(bounds.low))
+        self.initial = np.clip(given, bounds.low, bounds.high)
         self.past: list[Array] = []
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
@@ -168,9 +183,7 @@ class PreviousInput(PastInputs):
     ----------
     env : gymnasium.Env, with one-dimensional Box spaces
     initial : array_like, shape (m,), optional
-        What counts as the previous input at the start of an episode, as the env takes it: zeros by
-        default. An env with an operating point needs it: ``model.u_ss``. So does one whose bounds
-        leave zero out, or begin or end there.
+        What counts as the previous input at the start of an episode: see :class:`PastInputs`.
 
     Examples
     --------
@@ -183,21 +196,6 @@ class PreviousInput(PastInputs):
     def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
         bounds = require_vector(env, "action_space")
         super().__init__(env, [1] * bounds.shape[0], initial)
-
-
-def _as_initial(initial: ArrayLike | None, bounds: spaces.Box, needed: NDArray[np.bool_]) -> Array:
-    """Return the inputs (m,) before an episode, by default zero.
-
-    Raise where inputs that are ``needed`` (m,) were hardly zero: their bounds leave zero out, or
-    begin there.
-    """
-    if initial is None and np.any(needed & ((bounds.low >= 0) | (bounds.high <= 0))):
-        raise ValueError(
-            f"The env takes inputs from {bounds.low.tolist()} to {bounds.high.tolist()}: zero, "
-            "the default, is hardly the one before an episode. Pass initial, such as u_ss of the "
-            "model."
-        )
-    return np.clip(check_vector("initial", initial, len(bounds.low)), bounds.low, bounds.high)
 
 
 class SetPoint(Appending):
@@ -238,7 +236,7 @@ class SetPoint(Appending):
         preview: int = 0,
     ) -> None:
         self.preview = check_int("preview", preview, 0, "It counts samples ahead.")
-        super().__init__(env, *_repeated(low, high, preview + 1))
+        super().__init__(env, low, high, rows=preview + 1)
         if not np.all(np.isfinite([self.low, self.high])):
             raise ValueError(
                 f"low = {self.low.tolist()} and high = {self.high.tolist()} must be finite: "
@@ -312,11 +310,6 @@ def _as_schedule(given: Schedule | Sequence[ArrayLike] | None) -> Schedule | Non
     return lambda step: given[min(step, len(given) - 1)]
 
 
-def _repeated(low: ArrayLike, high: ArrayLike, count: int) -> tuple[Array, Array]:
-    low, high = (np.tile(np.array(side, np.float64, ndmin=1), count) for side in (low, high))
-    return low, high
-
-
 class MeasuredDisturbance(Appending):
     """Appends a disturbance d (d,) that the env measures and reports in ``info``.
 
@@ -357,7 +350,7 @@ class MeasuredDisturbance(Appending):
         preview: int = 0,
     ) -> None:
         check_int("preview", preview, 0, "It counts samples ahead.")
-        super().__init__(env, *_repeated(low, high, preview + 1))
+        super().__init__(env, low, high, rows=preview + 1)
         self.n_loads = len(self.low) // (preview + 1)
         if below(env, EstimateState) is not None:
             raise ValueError(
