@@ -230,17 +230,12 @@ class SimulatedEpisodes(BaseCallback):
         seed: int = 2_000_000,
     ) -> None:
         super().__init__()
-        check_int("per_episode", per_episode)
-        check_range("step_tests", step_tests, 0, 1)
-        check_int("max_hold_steps", max_hold_steps)
-        check_range("noise", noise, 0, np.inf)
-        check_int("seed", seed, 0)
         self.env = as_source(env)
-        self.per_episode = per_episode
-        self.seed = seed
-        self.step_tests = step_tests
-        self.max_hold_steps = max_hold_steps
-        self.noise = noise
+        self.per_episode = check_int("per_episode", per_episode)
+        self.step_tests = check_range("step_tests", step_tests, 0, 1)
+        self.max_hold_steps = check_int("max_hold_steps", max_hold_steps)
+        self.noise = check_range("noise", noise, 0, np.inf)
+        self.seed = check_int("seed", seed, 0)
         # Single envs, whose steps are the training env's: copies that step as one may round.
         given = isinstance(self.env, gym.Env)
         self._pool = EnvPool(self.env if given else lambda: make_env(self.env))

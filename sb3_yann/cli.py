@@ -12,7 +12,6 @@ import sys
 import zipfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
     problem = 'a registered problem ("CSTR-v0") or "module:attribute", a LinearMPC of your own'
     env = 'the plant: the id of an environment, or "module:attribute", a function that makes one'
     model = "a model that model.save(path) has written"
@@ -113,7 +111,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _solve(options: Namespace) -> None:
-    """Solve a problem, print its report, and save the law."""
     if options.save:  # what takes long is not done in vain
         path = Path(options.save)
         if path.is_dir():
@@ -143,7 +140,6 @@ def _evaluate(options: Namespace) -> None:
 
 
 def _plot(options: Namespace) -> None:
-    """Draw the regions of a law."""
     from sb3_yann.control.law_plot import new_figure, save_figure
 
     figure = new_figure()
@@ -152,27 +148,21 @@ def _plot(options: Namespace) -> None:
 
 
 def _report(options: Namespace) -> None:
-    """Write the report on a model."""
     from sb3_yann import report as write
 
     seeds = _seeds(options.episodes)
     env = _env(options.env) if options.env else None
-    written = write(_model(options.model), options.page, env=env, seeds=seeds)
-    print(f"Written: {written}")
+    print(f"Written: {write(_model(options.model), options.page, env=env, seeds=seeds)}")
 
 
 def _export(options: Namespace) -> None:
-    """Write a controller, and print what it costs."""
     from sb3_yann import export as write
 
-    if _is_model(options.law):
-        given = _model(options.law)
-    elif Path(options.law).suffix == ".npz":
-        given = _law(options.law)
-    else:
-        given = _problem(options.law)
+    read = _model if _is_model(options.law) else _problem
+    if Path(options.law).suffix == ".npz":
+        read = _law
     written = write(
-        given,
+        read(options.law),
         options.path,
         name=options.name,
         precision="float" if options.float else "double",
@@ -183,7 +173,6 @@ def _export(options: Namespace) -> None:
 
 
 def _commission(options: Namespace) -> None:
-    """Run a commissioning, or go on with one, and print its batches."""
     from sb3_yann import Commissioning
 
     model = _model(options.model)
@@ -245,21 +234,13 @@ def _model(path: str) -> Any:
 
 
 def _checks(path: str | None) -> Any:
-    """Return the Checks that a JSON file sets; None without one."""
+    """Return the options of Checks that a JSON file sets; None without one."""
     if path is None:
         return None
-    from sb3_yann import Checks
-
     try:
-        given = json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is no JSON: {error}") from None
-    known = [each.name for each in fields(Checks)]
-    if not isinstance(given, dict) or not set(given) <= set(known):
-        raise ValueError(
-            f"{path} must be an object with some of {', '.join(known)}; it holds {given!r}."
-        )
-    return Checks(**given)
 
 
 def _law(given: str) -> Any:

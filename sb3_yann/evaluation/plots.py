@@ -101,7 +101,6 @@ class ActiveConstraints:
         return [*dict.fromkeys(self.names[i] for i in np.flatnonzero(slack < 1e-7))]
 
     def __call__(self, region: int, theta: Array) -> str:
-        """Return them as one text."""
         return ", ".join(self.at(theta) or ()) or "no constraint acts"
 
 
@@ -245,14 +244,7 @@ def surfaces_figure(
 ) -> Figure:
     """Return a figure of the control surface before, after, and of their difference.
 
-    Parameters
-    ----------
-    problem : LinearMPC
-        With the box of theta, names and units.
-    before, after : callable, model or YannPolicy
-        As of :func:`plot_surface`; the first two panels share their colors.
-    entries, frame
-        As there.
+    Parameters are those of :func:`plot_surface`. The first two panels share their colors.
 
     Examples
     --------
@@ -288,16 +280,8 @@ def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figur
     """Return a figure of the share of steps in each region, and of the distance from the MPC there.
 
     Regions are those visited most. The distance is the mean and the largest one, of the input that
-    is farthest.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        With an explicit law.
-    policy : callable, model or YannPolicy
-        As of :func:`plot_surface`.
-    episodes : Trajectories
-        Their observations are theta, in plant units.
+    is farthest. ``policy`` is as of :func:`plot_surface`, and observations of the episodes are
+    theta, in plant units.
 
     Examples
     --------
@@ -368,10 +352,7 @@ def _check_runs(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
 
 
 def loops_figure(
-    problem: LinearMPC,
-    runs: Runs,
-    *,
-    quantities: Sequence[Quantity] | None = None,
+    problem: LinearMPC, runs: Runs, *, quantities: Sequence[Quantity] | None = None
 ) -> Figure:
     """Return a figure of quantities over time, in plant units, with limits and set-points.
 
@@ -429,8 +410,8 @@ def loops_figure(
         own[-1].set_xlabel(f"time ({unit})" if unit else "time")
     found: dict[str, Any] = {}
     for panel in panels.ravel():
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+        handles, labels = panel.get_legend_handles_labels()
+        found |= zip(labels, handles, strict=True)
     last = ("limit", "soft limit", "bound of the input", "set-point")
     found = dict(sorted(found.items(), key=lambda each: each[0] in last))
     columns = min(4, len(found)) if max(map(len, found)) < 24 else 2
@@ -441,7 +422,6 @@ def loops_figure(
 
 
 def _draw_loops(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
-    """Draw one quantity of all controllers."""
     n = problem.n_theta
     reference = problem.set_points.get(entry, entry)
     label = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
@@ -536,14 +516,8 @@ def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, data: Array) -> Non
 def plot_gains(runs: Runs, axes: Axes | None = None) -> Axes:
     """Draw by how much the second controller's cost differs from the first one's, start by start.
 
-    The starts are sorted by it. Where it costs more, the bar has the other color.
-
-    Parameters
-    ----------
-    runs : mapping of str to Trajectories
-        Two controllers, from the same starts.
-    axes : matplotlib Axes, optional
-        Where to draw; a new figure's by default.
+    The starts are sorted by it. Where it costs more, the bar has the other color. ``runs`` are
+    those of two controllers, from the same starts.
     """
     (first, before), (second, after) = runs.items()
     change = np.sort(after.costs - before.costs)
@@ -591,19 +565,15 @@ def plot_decisions(decisions: Sequence[Any], axes: Axes | None = None) -> Axes:
     axes.step(episodes, known, where="post", color=COLORS[0], label="accepted policy")
     axes.axhline(0, color="black", linestyle="--", linewidth=1.2, label="MPC")
     shown = np.clip(np.nan_to_num(costs, nan=np.inf), bottom, top)
-    kinds = np.array(
-        [
-            each.verdict if each.verdict != "rejected" else f"rejected{each.restored:d}"
-            for each in decisions
-        ]
-    )
-    for kind, label, marker, color in (
-        ("accepted", "accepted", "o", COLORS[2]),
-        ("accepted in part", "accepted in part", "^", COLORS[4]),
-        ("rejected0", "refused, plays on", "x", COLORS[3]),
-        ("rejected1", "refused, policy restored", "X", COLORS[1]),
+    kinds = np.array([each.verdict for each in decisions])
+    refused = kinds == "rejected"
+    restored = np.array([each.restored for each in decisions])
+    for own, label, marker, color in (
+        (kinds == "accepted", "accepted", "o", COLORS[2]),
+        (kinds == "accepted in part", "accepted in part", "^", COLORS[4]),
+        (refused & ~restored, "refused, plays on", "x", COLORS[3]),
+        (refused & restored, "refused, policy restored", "X", COLORS[1]),
     ):
-        own = kinds == kind
         if own.any():
             style: dict[str, Any] = {"color": color, "markersize": 6, "clip_on": False}
             for which, alpha in ((own & ~in_part, 1.0), (own & in_part, 0.35)):
@@ -658,10 +628,8 @@ def plot_headroom(found: Any, axes: Axes | None = None) -> Axes:
     start = 0.0
     for k, name in enumerate(parts):
         value = 100 * getattr(found, name)
-        error = None
-        if name == "total":
-            start = 0.0
-            error = 100 * found.standard_error
+        error = 100 * found.standard_error if name == "total" else None
+        start = 0.0 if name == "total" else start
         axes.barh(k, value, left=start, color=COLORS[k], xerr=error, capsize=3, height=0.6)
         end = max(start, start + value) + (error or 0.0)
         axes.annotate(f"{value:+.2f} %", (end, k), (4, 0), textcoords="offset points", va="center")

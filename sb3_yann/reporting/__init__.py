@@ -17,17 +17,8 @@ from sb3_yann.env_pool import Source
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.improvement import Headroom
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
-from sb3_yann.reporting.evidence_parts import (
-    again_part,
-    distance_part,
-    guard_part,
-    headroom_part,
-    improve_part,
-    loops_part,
-    statistics_part,
-    twin_part,
-)
-from sb3_yann.reporting.problem_parts import constraints_part, law_part, plant_part
+from sb3_yann.reporting import evidence_parts as evidence
+from sb3_yann.reporting import problem_parts as problem
 from sb3_yann.reporting.subject import Html, Part, Subject, clean, page, paragraph, table, tag
 from sb3_yann.rollout import as_seeds
 from sb3_yann.twin import PlantTwin
@@ -36,8 +27,9 @@ __all__ = ["report"]
 
 TITLE = "Report on a policy that starts as an MPC"
 PARTS = (
-    plant_part, constraints_part, law_part, loops_part, statistics_part, distance_part, guard_part,
-    improve_part, twin_part, headroom_part, again_part,
+    problem.plant_part, problem.constraints_part, problem.law_part, evidence.loops_part,
+    evidence.statistics_part, evidence.distance_part, evidence.guard_part, evidence.improve_part,
+    evidence.twin_part, evidence.headroom_part, evidence.again_part,
 )  # fmt: skip
 
 

@@ -26,17 +26,7 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
-from sb3_yann.evaluation import change_in_percent
-from sb3_yann.evaluation.plots import (
-    inputs_of,
-    loops_figure,
-    plot_decisions,
-    plot_gains,
-    plot_headroom,
-    plot_twin,
-    surfaces_figure,
-    use_figure,
-)
+from sb3_yann.evaluation import change_in_percent, plots
 from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of
 from sb3_yann.improvement.improving import fingerprint, of_estimates
@@ -128,8 +118,8 @@ def loops_part(subject: Subject) -> Part:
         [
             paragraph(how, warning if known else ""),
             table(["", "MPC", "policy", "change"], rows),
-            picture(partial(plot_gains, loops), gains),
-            picture(partial(loops_figure, subject.problem, subject.shown_loops), caption),
+            picture(partial(plots.plot_gains, loops), gains),
+            picture(partial(plots.loops_figure, subject.problem, subject.shown_loops), caption),
             tag("h3", "Every episode"),
             episodes,
         ]
@@ -294,7 +284,7 @@ def distance_part(subject: Subject) -> Part:
         table(head, rows),
         *_pictures(subject),
     ]
-    u = inputs_of(problem, policy, theta)
+    u = plots.inputs_of(problem, policy, theta)
     rounding = FLOAT32_ROUNDING * problem.u_half
     low, high = problem.deviations.input_range(theta)
     # Where the MPC has no solution, bounds that change may give way: no further than with it.
@@ -317,7 +307,7 @@ def distance_part(subject: Subject) -> Part:
 def _distance(subject: Subject, theta: Array) -> Array:
     """Return the distance of the policy's inputs from the law's (batch, m)."""
     finite = theta[np.isfinite(theta).all(axis=1)]
-    return np.abs(inputs_of(subject.problem, subject.policy, finite) - subject.law(finite))
+    return np.abs(plots.inputs_of(subject.problem, subject.policy, finite) - subject.law(finite))
 
 
 def _pictures(subject: Subject) -> list[Html]:
@@ -331,7 +321,7 @@ def _pictures(subject: Subject) -> list[Html]:
             "The regions that the policy's closed loops visit, and how far it is from the MPC in "
             "each, in the input that is farthest."
         )
-        draw = partial(use_figure, problem, policy, subject.shown_loops[OF_POLICY])
+        draw = partial(plots.use_figure, problem, policy, subject.shown_loops[OF_POLICY])
         found.append(picture(draw, caption))
     if problem.n_theta < 2:
         return found
@@ -356,7 +346,7 @@ def _pictures(subject: Subject) -> list[Html]:
         "the MPC has a solution."
     )
     options = {"entries": plane, "frame": (low, high)}
-    draw = partial(surfaces_figure, problem, subject.law, policy, **options)  # type: ignore[arg-type]
+    draw = partial(plots.surfaces_figure, problem, subject.law, policy, **options)  # type: ignore[arg-type]
     return [*found, picture(draw, caption)]
 
 
@@ -400,7 +390,7 @@ def guard_part(subject: Subject) -> Part:
             "What each candidate, by the verdict on it, and the accepted policy change of the "
             f"MPC's mean cost on the same starts, of the guard's {len(state.settings['seeds'])}."
         )
-        parts += [picture(partial(plot_decisions, state.decisions), caption)]
+        parts += [picture(partial(plots.plot_decisions, state.decisions), caption)]
         parts += _decisions(state.decisions)
     return Part(title, join(parts), (make_finding(passed, text),))
 
@@ -506,7 +496,7 @@ def twin_part(subject: Subject) -> Part:
         "Left: costs of held-out episodes. Right: how the error of free runs grows with the steps "
         "that they look ahead."
     )
-    shown = picture(lambda: plot_twin(twin.trust)[0], caption)
+    shown = picture(lambda: plots.plot_twin(twin.trust)[0], caption)
     content = join([paragraph(text), lines(twin.report()), shown])
     return Part(title, content, (make_finding(twin.trusted, text),))
 
@@ -518,7 +508,7 @@ def headroom_part(subject: Subject) -> Part:
     if found is None:
         return left_out(title)
     caption = "The gain over the MPC part by part; the bar of the total has its standard error."
-    shown = picture(partial(plot_headroom, found), caption)
+    shown = picture(partial(plots.plot_headroom, found), caption)
     text = f"Headroom: {100 * found.total:.2f} % below the MPC's mean cost"
     finding = Finding("note", f"{text}; the verdict is to {found.verdict}.")
     return Part(title, join([lines(found.report()), shown]), (finding,))
