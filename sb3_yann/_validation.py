@@ -52,11 +52,8 @@ def check_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Arra
         isinstance(want, int) and got != want for got, want in zip(array.shape, shape, strict=True)
     ):
         wanted = ", ".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]},"
-        hint = (
-            " Write a matrix as rows, [[...], [...]], or np.diag([...])."
-            if array.ndim < len(shape) == 2
-            else ""
-        )
+        hint = " Write a matrix as rows, [[...], [...]], or np.diag([...])."
+        hint *= array.ndim < len(shape) == 2
         raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).{hint}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")
@@ -85,10 +82,7 @@ def check_symmetric(name: str, value: ArrayLike, size: int) -> Array:
 
 
 def check_bounds(
-    name: str,
-    lower: ArrayLike | None,
-    upper: ArrayLike | None,
-    size: int,
+    name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int
 ) -> tuple[Array, Array]:
     """Return bounds of shape ``(size,)``, the lower below the upper.
 

@@ -206,13 +206,13 @@ def rollout(
                     "The function that makes envs returned the same one twice. Make a new one each "
                     "time, since episodes run side by side, or pass the env itself."
                 )
-            lots = [
-                _play(
-                    of_episode(controller, i),
-                    _Envs(envs, resets[i : i + most], problem, pool.each),
-                )
-                for i in _shown(range(0, len(seeds), max(most, 1)))
-            ]
+            firsts: Iterable[int] = range(0, len(seeds), max(most, 1))
+            if len(seeds) > most:  # played one lot after the other
+                firsts = bar("episodes", firsts)
+            lots = []
+            for i in firsts:
+                plants = _Envs(envs, resets[i : i + most], problem, pool.each)
+                lots.append(_play(of_episode(controller, i), plants))
         if pool is not plant:
             pool.close()
         played = joined(lots)
@@ -389,11 +389,6 @@ def limit_of(env: Any) -> int | None:
     if isinstance(env, gym.Env) and env.has_wrapper_attr("_max_episode_steps"):
         return int(env.get_wrapper_attr("_max_episode_steps"))
     return getattr(env, "max_episode_steps", None)
-
-
-def _shown(lots: Sequence[Any]) -> Iterable[Any]:
-    """Return lots of episodes that are played one after the other, under a bar if there are two."""
-    return bar("episodes", lots) if len(lots) > 1 else lots
 
 
 def joined(parts: Sequence[Trajectories]) -> Trajectories:

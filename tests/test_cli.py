@@ -103,7 +103,7 @@ def test_export_takes_checks_and_keeps_the_rates_of_a_problem(folder, capsys) ->
     assert data["obs_min"].tolist() == [-2, -3] and data["frozen_after"] == 9
     assert main(["export", "my_cart:rated", "rated.npz"]) == 0
     assert Controller.load("rated.npz").data["change"].shape == (2, 1)
-    for text, said in (("{", "no JSON"), ('{"obs_mn": 1}', "some of obs_min"), ("[]", "an object")):
+    for text, said in (("{", "no JSON"), ('{"obs_mn": 1}', "are obs_min"), ("[]", "a mapping")):
         (folder / "limits.json").write_text(text)
         assert main(["export", "my_cart:cart", "not.npz", "--checks", "limits.json"]) == 1
         assert said in capsys.readouterr().err and not (folder / "not.npz").exists()

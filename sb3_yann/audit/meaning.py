@@ -18,8 +18,7 @@ from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.wrapper_stack import require_state_shown, require_theta_order
 from sb3_yann.rollout import Trajectories
 from sb3_yann.units import ActionUnits, Units
-from sb3_yann.wrappers import EstimateState, SetPoint
-from sb3_yann.wrappers.theta import below, require_vector
+from sb3_yann.wrappers.theta import EstimateState, below, require_vector
 
 MOSTLY = 0.5  # share of the starts beyond a box that is no chance
 WRONG = 0.5
@@ -242,11 +241,6 @@ def _push(env: gym.Env[Any, Any], action: Array, j: int) -> Array:
     pushed = np.array(action, dtype=space.dtype)
     pushed[j] = (action[j] + far) / 2
     return pushed
-
-
-def below_set_points(env: gym.Env[Any, Any]) -> bool:
-    """Tell whether a wrapper draws set-points, of which the env's reward knows nothing."""
-    return below(env, SetPoint) is not None
 
 
 def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:

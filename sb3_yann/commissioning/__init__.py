@@ -4,9 +4,4 @@ from sb3_yann.commissioning.commissioning import Commissioning
 from sb3_yann.commissioning.journal import Batch
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 
-__all__ = [
-    "Alarm",
-    "Batch",
-    "Commissioning",
-    "Watchdog",
-]
+__all__ = ["Alarm", "Batch", "Commissioning", "Watchdog"]

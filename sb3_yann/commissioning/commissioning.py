@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -27,12 +27,7 @@ from sb3_yann.commissioning.journal import (
 )
 from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.watchdog import Watchdog
-from sb3_yann.compare import (
-    RULE,
-    Difference,
-    allowed_excess,
-    level_of_look,
-)
+from sb3_yann.compare import RULE, Difference, allowed_excess, level_of_look
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, costs_of, excess_of_episodes
 from sb3_yann.env_pool import Source, one_env
@@ -137,11 +132,8 @@ class Commissioning:
     ) -> None:
         check_type("model", model, OffPolicyAlgorithm, "a DDPG or TD3 model")
         self.policy = require_yann_policy(model.policy, "Commissioning")
-        if not (isinstance(plant_env, str | gym.Env) or callable(plant_env)):
-            raise TypeError(
-                f"plant_env = {plant_env!r} must be the id of an environment, a gymnasium.Env or a "
-                "function that makes one."
-            )
+        wanted = "the id of an environment, a gymnasium.Env or a function that makes one"
+        check_type("plant_env", plant_env, str | gym.Env | Callable, wanted)
         self.model = model
         self.plant_env = plant_env
         self.verbose = verbose
@@ -409,16 +401,11 @@ class Commissioning:
             problem.deviations.u_max,
         )
         numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
-        learner = f"{type(self.model).__name__} {self.policy.actor.net_arch}"
+        names = "batch", "excite", "shadow", "rounds", "updates", "seed"
         return {
-            "batch": self.batch,
-            "excite": self.excite,
+            **{name: getattr(self, name) for name in names},
             "max_correction": self.smallest,
-            "shadow": self.shadow,
-            "rounds": self.rounds,
-            "updates": self.updates,
-            "seed": self.seed,
-            "learner": learner,
+            "learner": f"{type(self.model).__name__} {self.policy.actor.net_arch}",
             "problem": hashlib.sha256(numbers).hexdigest()[:16],
         }
 
@@ -434,7 +421,6 @@ class Commissioning:
             self._watch(self._fit(state.twin, state.twin_seed))
 
     def _loaded(self, accepted: Accepted) -> Whole:
-        """Return a policy that a record names."""
         if accepted.model is None:
             return self._mpc
         self.journal.record.load(accepted.model, self.model)

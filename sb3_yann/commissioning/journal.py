@@ -99,7 +99,6 @@ class Record:
 
 
 def _checksum(event: Event) -> int:
-    """Return the CRC-32 of an event as JSON."""
     return zlib.crc32(json.dumps(event, allow_nan=False).encode())
 
 
@@ -121,7 +120,6 @@ def _named(kind: type, event: Event) -> Event:
 
 
 def _as_episode(event: Event) -> PlantEpisode:
-    """Return the episode of an event."""
     named = _named(PlantEpisode, event)
     for name in ("thetas", "actions"):
         named[name] = np.array(named[name], float)
@@ -291,9 +289,10 @@ class Journal:
         """The numbers of the episodes that show the plant as it is now."""
         return [
             number
-            for number in range(self.state.first, len(self.episodes))
-            if self.episodes[number].usable_for_fitting
-            and len(self.episodes[number].actions) >= SHORTEST
+            for number, each in enumerate(self.episodes)
+            if number >= self.state.first
+            and each.usable_for_fitting
+            and len(each.actions) >= SHORTEST
         ]
 
     @property
@@ -302,9 +301,7 @@ class Journal:
 
         An episode that began and never ended counts as one.
         """
-        return bool(self._open) or (
-            bool(self.episodes) and not self.episodes[-1].usable_for_fitting
-        )
+        return bool(self._open) or not all(e.usable_for_fitting for e in self.episodes[-1:])
 
     @property
     def cut_off(self) -> int:

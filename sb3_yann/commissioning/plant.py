@@ -112,11 +112,7 @@ class Plant:
         return known
 
     def play(
-        self,
-        known: Array,
-        act: Feedback,
-        watchdog: Watchdog | None,
-        allowed: float = np.inf,
+        self, known: Array, act: Feedback, watchdog: Watchdog | None, allowed: float = np.inf
     ) -> PlantEpisode:
         """Play an episode from :meth:`begin`; after an alarm the MPC acts, from the very sample on.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array, check_array
+from sb3_yann._validation import Array, check_array, check_type
 from sb3_yann.control.identification.residuals import FOLDS
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.dynamics import Dynamics
@@ -42,11 +42,6 @@ class Alarm:
         "not a number", "violation", "outside the band", "drift" or "frozen sensor".
     message : str
         What was seen, for people.
-
-    Examples
-    --------
-    >>> Alarm("violation", "The plant reports a violation.").kind
-    'violation'
     """
 
     kind: str
@@ -213,8 +208,7 @@ class Watchdog:
         ValueError
             If its log is a single episode.
         """
-        if not isinstance(twin, PlantTwin):
-            raise TypeError(f"twin = {twin!r} must be a PlantTwin.")
+        check_type("twin", twin, PlantTwin, "a PlantTwin")
         return cls(twin.dynamics, Bands.of(twin))
 
     @property
@@ -301,9 +295,10 @@ class Watchdog:
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             name = problem.model.state_names
             shown = problem.units.to_plant(reading)[i]
-            said = f"{name[i] if name else f'reading {i}'} has been {shown:.6g}"
-            said += f" for {stands[i]} samples; the twin moves or the sensor is noisy"
-            return "frozen sensor", said
+            return "frozen sensor", (
+                f"{name[i] if name else f'reading {i}'} has been {shown:.6g} for {stands[i]} "
+                "samples; the twin moves or the sensor is noisy"
+            )
         return None
 
     def _beyond(self) -> tuple[str, str] | None:

@@ -133,7 +133,7 @@ def export(
         raise ValueError(
             f"{target.stem}.h would stand in for C's own header: call the file something else."
         )
-    limits = check_options("checks", checks or Checks(), Checks)
+    limits = check_options("checks", Checks() if checks is None else checks, Checks)
     data = describe(given, prefix, limits, estimator)
     if kind == "onnx" and "est_gain" in data:
         raise ValueError(

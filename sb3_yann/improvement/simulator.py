@@ -17,7 +17,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_yann._progress import shown
 from sb3_yann._validation import Array, Mask, NonFiniteWarning, warn
 from sb3_yann.audit.meaning import (
-    below_set_points,
     in_deviations,
     require_spaces,
     require_theta_shown,
@@ -37,6 +36,7 @@ from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import SHORTEST, Episode, observer_of
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import fit_ensemble
+from sb3_yann.wrappers.theta import SetPoint, below
 
 FIRST = 3_000_000  # seed of the first episode: far from those that people try first
 APART = 1_000_000  # how far the episodes of two seeds are apart
@@ -132,7 +132,7 @@ class Simulator:
         self.envs = pool_of(env, lambda: _Counted(self.make(), self.counted))
         with self.envs.acquire(1) as (one,):
             self.row = RowLayout(problem, observer_of(one))
-            self.unaware = below_set_points(one)
+            self.unaware = below(one, SetPoint) is not None  # its reward, of set-points
             require_spaces(problem, one)
             self.name = name_of(one if callable(env) else env)
         self.new_seeds = NewSeeds(FIRST + APART * seed)

@@ -29,10 +29,10 @@ from sb3_yann import (
     headroom,
     improve,
 )
-from sb3_yann.audit.meaning import below_set_points, warn_of_own_reward
+from sb3_yann.audit.meaning import warn_of_own_reward
 from sb3_yann.improvement.simulator import of_law
 from sb3_yann.rollout import rollout
-from sb3_yann.wrappers import SetPoint
+from sb3_yann.wrappers.theta import SetPoint, below
 
 MPC = two_input_mpc()
 
@@ -355,7 +355,7 @@ def test_what_a_violation_or_a_termination_costs_does_not_count() -> None:
 def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
     plain = Rewarded(stage)
     held = SetPoint(Rewarded(stage), -1, 1)
-    assert below_set_points(gym.wrappers.TimeLimit(held, 9)) and not below_set_points(plain)
+    assert below(gym.wrappers.TimeLimit(held, 9), SetPoint) and not below(plain, SetPoint)
     tracking = dataclasses.replace(mpc(), tracking=Tracking([0], -1, 1))
     headroom(tracking, held, n_starts=2)  # a warning would be an error
 
