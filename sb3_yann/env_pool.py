@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import VectorEnv
 
 from sb3_yann.control.simulator import require_makes
@@ -179,7 +180,7 @@ def one_env(source: Source | EnvPool) -> Iterator[gym.Env[Any, Any]]:
 
 
 def require_like_training(source: Source | EnvPool, training_env: Any, name: str) -> None:
-    """Raise ValueError if a simulator is the training env, or an env of another shape."""
+    """Raise ValueError if a simulator is the training env, or an env of another plant."""
     training = [env.unwrapped for env in getattr(training_env, "envs", [])]
     with one_env(source) as env:
         if any(env.unwrapped is each for each in training):
@@ -187,13 +188,21 @@ def require_like_training(source: Source | EnvPool, training_env: Any, name: str
                 f"{name} is the training env, whose episodes its own would interrupt. Give it "
                 "another one, e.g. its id."
             )
-        ours = env.observation_space.shape
-        theirs = training_env.observation_space.shape
-        if ours != theirs or env.action_space != training_env.action_space:
-            raise ValueError(
-                f"{name} has observations of shape {ours} and {env.action_space}, the training env "
-                f"{theirs} and {training_env.action_space}. Give it a simulator of this plant."
-            )
+        require_like(env, training_env, name, "the training env")
+
+
+def require_like(env: Any, other: Any, name: str, whose: str) -> None:
+    """Raise ValueError unless an env shows and takes what another one does, or a model.
+
+    The bounds of the actions may be rounded.
+    """
+    (x, u), (other_x, other_u) = ((e.observation_space, e.action_space) for e in (env, other))
+    same = x.shape == other_x.shape and u.shape == other_u.shape
+    if not same or not np.allclose([u.low, u.high], [other_u.low, other_u.high], rtol=1e-4):
+        raise ValueError(
+            f"{name} has observations of shape {x.shape} and {u}, {whose} {other_x.shape} and "
+            f"{other_u}. Give it a simulator of this plant, or the plant."
+        )
 
 
 def vector_env_of(env_id: str, n: int) -> VectorEnv[Any, Any, Any] | None:

@@ -41,9 +41,9 @@ class Episode:
     @property
     def driven(self) -> Array:
         """Inputs and disturbances of each step, shape (T, m + d)."""
-        return (
-            np.hstack([self.inputs, self.disturbances]) if self.disturbances.size else self.inputs
-        )
+        if not self.disturbances.size:
+            return self.inputs
+        return np.hstack([self.inputs, self.disturbances])
 
     @property
     def regressors(self) -> Array:
@@ -108,10 +108,10 @@ class Log:
             if size
         ]
         steps = sum(len(each) for each in self.episodes)
+        dt = f"{self.dt:g} {self.time_unit}".rstrip()
         lost = f"; {self.lost_steps} steps at gaps left out" if self.lost_steps else ""
         return (
-            f"Log({len(self)} episode{'s' * (len(self) > 1)}, {steps:,} steps of dt = {self.dt:g}"
-            f"{f' {self.time_unit}' if self.time_unit else ''}; "
+            f"Log({len(self)} episode{'s' * (len(self) > 1)}, {steps:,} steps of dt = {dt}; "
             f"{', '.join(columns)}{lost})"
         )
 
@@ -335,8 +335,9 @@ class Log:
                 f"of its other columns, {unread}, tells where one ends, pass time= or episode=."
             )
         n = len(states)
-        sizes = (n, len(inputs), len(disturbances), len(references))
-        x, *others = np.split(table, np.cumsum(sizes)[:-1], axis=1)
+        m = len(inputs)
+        d = len(disturbances)
+        x, *others = np.split(table, [n, n + m, n + m + d], axis=1)
         ends = np.zeros(len(table) + 1, dtype=bool)
         ends[[0, -1]] = True
         if episode is not None:
@@ -355,17 +356,14 @@ class Log:
                 time_unit = unit or "s"
             instants = np.array([each for each, _ in pairs])
             times = [instants[part] for part in parts]
-        named = [_name_and_unit(each) for each in wanted[: sum(sizes[:3])]]
-        names = [name for name, _ in named]
-        units = tuple(unit for _, unit in named)
-        m = len(inputs)
+        names, units = zip(*map(_name_and_unit, wanted[: n + m + d]), strict=True)
         return cls._of(
             records,
             dt,
             times,
-            state_names=tuple(names[:n]),
-            input_names=tuple(names[n : n + m]),
-            disturbance_names=tuple(names[n + m :]),
+            state_names=names[:n],
+            input_names=names[n : n + m],
+            disturbance_names=names[n + m :],
             units=units if any(units) else (),
             time_unit=time_unit or _name_and_unit(columns[time] if time else "")[1],
         )
@@ -488,20 +486,18 @@ def _time(
     """Return a time as it is given, an ISO 8601 time stamp in the unit, and which of them it is."""
     try:
         return _number(path, row, content, name), False
-    except ValueError:
+    except ValueError as error:
         try:
             stamp = datetime.fromisoformat(content[name].strip())
         except ValueError:
-            pass
-        else:
-            passed = (stamp - datetime(1970, 1, 1, tzinfo=stamp.tzinfo)).total_seconds()
-            if unit not in ("", *SECONDS):
-                raise ValueError(
-                    f"{path} has time stamps, and time_unit = {unit!r}: expected one of "
-                    f"{[*SECONDS]}, that of dt."
-                ) from None
-            return passed / SECONDS[unit or "s"], True
-        raise
+            raise error from None
+    if unit not in ("", *SECONDS):
+        raise ValueError(
+            f"{path} has time stamps, and time_unit = {unit!r}: expected one of {[*SECONDS]}, "
+            "that of dt."
+        )
+    passed = (stamp - datetime(1970, 1, 1, tzinfo=stamp.tzinfo)).total_seconds()
+    return passed / SECONDS[unit or "s"], True
 
 
 def require_one_state_more(name: str, parts: list[Array], states: list[Array]) -> None:

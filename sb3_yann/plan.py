@@ -115,8 +115,8 @@ class TwinPlant:
         A, B = self.slopes(row.begin(theta), u, rows)
         if row.observer is None:
             return A, B
-        number = np.arange(parts.size)
         n = parts.size
+        number = np.arange(n)
         to = np.where(number < parts.n_states, number + row.state.start, number)
         of_x = A[..., to, :]
         B = B[..., to, :]
@@ -251,13 +251,9 @@ class Plans:
 
     def of(self, chosen: Rows | Mask) -> Plans:
         """Return some of the starts."""
-        return Plans(
-            self.thetas[:, chosen],
-            self.inputs[:, chosen],
-            self.gains[:, chosen],
-            self.costs[chosen],
-            self.turn,
-        )
+        parts = self.thetas, self.inputs, self.gains
+        thetas, inputs, gains = (each[:, chosen] for each in parts)
+        return Plans(thetas, inputs, gains, self.costs[chosen], self.turn)
 
 
 def follow(plans: Plans, t: int, theta: Array) -> Array:
@@ -294,10 +290,10 @@ def planned(
     if preferred:
         ranked[-1] -= TIE * np.abs(ranked[-1])
     best = np.argmin(ranked, axis=0)
-    names = "thetas", "inputs", "gains"
-    kept = {k: np.stack([getattr(each, k) for each in found], 1)[:, best, every] for k in names}
+    parts = zip(*((each.thetas, each.inputs, each.gains) for each in found), strict=True)
+    thetas, inputs, gains = (np.stack(each, axis=1)[:, best, every] for each in parts)
     costs = np.array([each.costs for each in found])[best, every]
-    plans = improved(plant, soft, Plans(**kept, costs=costs, turn=turn), rows, SWEEPS)
+    plans = improved(plant, soft, Plans(thetas, inputs, gains, costs, turn), rows, SWEEPS)
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
     plans = improved(plant, task, hard, rows, SWEEPS)
     # The last search may have been damped, and its feedback with it.
@@ -486,11 +482,9 @@ def initial_guesses(
     """
     problem = task.problem
     until = steps // BURSTS
-    none = partial(_pushed, problem.deviations.u_min, 0)
-    pushes = [
-        none,
-        *(partial(_pushed, u, until) for u in (problem.deviations.u_min, problem.deviations.u_max)),
-    ]
+    low = problem.deviations.u_min
+    high = problem.deviations.u_max
+    pushes = [partial(_pushed, low, 0), partial(_pushed, low, until), partial(_pushed, high, until)]
     first = [push(law_of(problem)) for push in pushes]
 
     def played(policy: Policy) -> tuple[Array, Array]:
@@ -571,7 +565,7 @@ class Planning:
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
         problem = self.task.problem
-        constant = self.task.problem.layout.constant
+        constant = problem.layout.constant
         states = problem.layout.state
         known = np.isin(rows, [*self.plans])
         changed = np.zeros(len(rows), dtype=bool)

@@ -16,6 +16,7 @@ from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
 from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.env_pool import require_like
 from sb3_yann.improvement.imitation import policy_of
 from sb3_yann.improvement.simulator import Excited
 from sb3_yann.policy.checks import LOST_STATISTICS
@@ -66,16 +67,7 @@ class Plant:
         if model.get_vec_normalize_env() is None and getattr(model, "sees_normalized", False):
             raise ValueError(LOST_STATISTICS)  # before anything acts on the plant
         require_state_shown(env, self.yann.observation_given)
-        for name in ("observation_space", "action_space"):
-            own = getattr(model, name)
-            its = getattr(env, name)
-            if own.shape != its.shape or (
-                name == "action_space"
-                and not np.allclose([own.low, own.high], [its.low, its.high], rtol=1e-4)
-            ):
-                raise ValueError(
-                    f"plant_env has {name} = {its}, the model {own}: it is another plant."
-                )
+        require_like(env, model, "plant_env", "the model")
         self.mpc = law_of(self.problem)
         self.range = self.problem.deviations.u_max - self.problem.deviations.u_min
         units = self.yann.action_units

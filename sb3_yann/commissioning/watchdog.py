@@ -34,14 +34,9 @@ PREDICTED_MOVE = 3.0
 
 @dataclass(frozen=True)
 class Alarm:
-    """Why the plant should go back to its MPC.
+    """Why the plant should go back to its MPC, and a message for people.
 
-    Attributes
-    ----------
-    kind : str
-        "not a number", "violation", "outside the band", "drift" or "frozen sensor".
-    message : str
-        What was seen, for people.
+    The kind is "not a number", "violation", "outside the band", "drift" or "frozen sensor".
     """
 
     kind: str
@@ -164,16 +159,7 @@ class Watchdog:
     twin moves is frozen.
 
     Make one with :meth:`of`, anew after each fit of the twin. It holds nothing from one episode
-    to the next.
-
-    Attributes
-    ----------
-    dynamics : Dynamics
-        The twin's members.
-    bands : Bands
-        How far all may go while all is well.
-    alarm : Alarm or None
-        The first one of this episode.
+    to the next; ``alarm`` is the first one of this episode, if there is one.
 
     Examples
     --------
@@ -199,14 +185,9 @@ class Watchdog:
 
     @classmethod
     def of(cls, twin: PlantTwin) -> Watchdog:
-        """Return the watchdog of a twin, calibrated on its log.
+        """Return the watchdog of a twin, calibrated on its log: ValueError if that is one episode.
 
-        Raises
-        ------
-        TypeError
-            If it is no PlantTwin.
-        ValueError
-            If its log is a single episode.
+        TypeError if it is no PlantTwin.
         """
         check_type("twin", twin, PlantTwin, "a PlantTwin")
         return cls(twin.dynamics, Bands.of(twin))
@@ -217,13 +198,7 @@ class Watchdog:
         return self.alarm is None
 
     def start(self, theta: Array) -> None:
-        """Begin an episode at theta (n_theta,).
-
-        Raises
-        ------
-        ValueError
-            If theta has another shape, or is not finite.
-        """
+        """Begin an episode at theta (n_theta,); ValueError for another shape, or NaN."""
         dynamics = self.dynamics
         first = check_array("theta", theta, (dynamics.problem.n_theta,))
         n = dynamics.problem.model.n_states
@@ -238,17 +213,8 @@ class Watchdog:
     def watch(self, theta: Array, u: Array, after: Array) -> Alarm | None:
         """Return an alarm, or None: after one the episode's alarm stays as it is.
 
-        Parameters
-        ----------
-        theta, after : ndarray, shape (n_theta,)
-            Before and after a sample, as read.
-        u : ndarray, shape (m,)
-            What was commanded.
-
-        Raises
-        ------
-        RuntimeError
-            Before :meth:`start`.
+        theta and what comes after it (n_theta,) are as read before and after a sample, u (m,) is
+        what was commanded. RuntimeError before :meth:`start`.
         """
         if self._row is None:
             raise RuntimeError("No episode has begun: call start(theta) first.")

@@ -21,7 +21,7 @@ from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import costs_of, excess_of_episodes
 from sb3_yann.control.online import Law
 from sb3_yann.control.wrapper_stack import require_state_shown
-from sb3_yann.env_pool import Source, name_of, one_env
+from sb3_yann.env_pool import Source, name_of, one_env, require_like
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.state import GuardState
 from sb3_yann.improvement import Headroom
@@ -289,14 +289,8 @@ class Subject:
         """The closed loops of MPC and policy: theta and inputs in deviations; None without env."""
         if self.env is None:
             return None
-        own = self.policy.observation_space.shape, self.policy.action_space.shape
         with one_env(self.env) as env:
-            its = env.observation_space.shape, env.action_space.shape
-            if its != own:
-                raise ValueError(
-                    f"env = {name_of(env)} has observations and actions of shapes {its}, the model "
-                    f"{own}. Give the report a simulator of this plant."
-                )
+            require_like(env, self.policy, f"env = {name_of(env)}", "the model")
             require_state_shown(env, self.policy.observation_given)
         return self._play()
 

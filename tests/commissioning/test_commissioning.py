@@ -398,7 +398,7 @@ def test_another_commissionings_record_is_refused(tmp_path) -> None:
 
 
 def test_another_plant_and_what_is_no_model_are_refused() -> None:
-    with pytest.raises(ValueError, match="another plant"):
+    with pytest.raises(ValueError, match="Give it a simulator of this plant, or the plant"):
         commission(env="CSTR-v0").run(1)
     with pytest.raises(TypeError, match="must be a DDPG or TD3 model"):
         Commissioning(None, Cart)
