@@ -482,9 +482,11 @@ def initial_guesses(
     """
     problem = task.problem
     until = steps // BURSTS
-    low = problem.deviations.u_min
-    high = problem.deviations.u_max
-    pushes = [partial(_pushed, low, 0), partial(_pushed, low, until), partial(_pushed, high, until)]
+    none = partial(_pushed, problem.deviations.u_min, 0)
+    pushes = [
+        none,
+        *(partial(_pushed, u, until) for u in (problem.deviations.u_min, problem.deviations.u_max)),
+    ]
     first = [push(law_of(problem)) for push in pushes]
 
     def played(policy: Policy) -> tuple[Array, Array]:
