@@ -216,7 +216,12 @@ def rollout(
         if pool is not plant:
             pool.close()
         played = joined(lots)
-    return played if problem is None else _with_stage_costs(played, problem)
+    if problem is None:
+        return played
+    thetas, inputs, _ = played.padded()
+    taken = np.arange(len(inputs))[:, None] < played.lengths
+    costs, excess = costs_of(problem, thetas, inputs, taken)
+    return replace(played, costs=costs, excess=excess)
 
 
 def as_controller(policy: Any) -> Controller:
@@ -405,14 +410,6 @@ def joined(parts: Sequence[Trajectories]) -> Trajectories:
     if not parts:
         return Trajectories(np.zeros(0), np.zeros(0, np.int64), (), (), np.zeros(0, dtype=bool))
     return Trajectories(**{each.name: together(each.name) for each in fields(Trajectories)})
-
-
-def _with_stage_costs(played: Trajectories, problem: LinearMPC) -> Trajectories:
-    """Return the same with the stage costs of a problem, and the excess over its bounds."""
-    thetas, inputs, _ = played.padded()
-    taken = np.arange(len(inputs))[:, None] < played.lengths
-    costs, excess = costs_of(problem, thetas, inputs, taken)
-    return replace(played, costs=costs, excess=excess)
 
 
 def _watch_length(env: Any, steps: int) -> None:

@@ -192,11 +192,6 @@ class Watchdog:
         check_type("twin", twin, PlantTwin, "a PlantTwin")
         return cls(twin.dynamics, Bands.of(twin))
 
-    @property
-    def quiet(self) -> bool:
-        """Whether there has been no alarm in this episode."""
-        return self.alarm is None
-
     def start(self, theta: Array) -> None:
         """Begin an episode at theta (n_theta,); ValueError for another shape, or NaN."""
         dynamics = self.dynamics
@@ -268,7 +263,6 @@ class Watchdog:
         return None
 
     def _beyond(self) -> tuple[str, str] | None:
-        """Return an alarm where a chart leaves its band."""
         ratios = np.abs(self.bands.ratios(self._charts))
         if not ratios.max() > 1.0:
             return None

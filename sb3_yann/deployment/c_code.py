@@ -377,7 +377,6 @@ def _library(sources: dict[str, str]) -> bytes:
 
 
 def _description(data: ControllerArrays, about: str, identity: str, units: list[str]) -> bytes:
-    """Return modelDescription.xml."""
     name = str(data["name"])
     root = ET.Element(
         "fmiModelDescription",

@@ -343,7 +343,6 @@ class Controller:
         return np.asarray(shown[data["source"]])
 
     def _mode(self, status: Status) -> str:
-        """Return who acts now."""
         self._faults = self._faults + 1 if status & SENSOR else 0
         recover = int(self.data["recover"])
         self._sound = 0 if status else min(self._sound + 1, recover)

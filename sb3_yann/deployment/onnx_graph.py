@@ -269,7 +269,6 @@ def _kept(
 
 
 def _activate(graph: _Graph, x: str, data: ControllerArrays) -> str:
-    """Return the activation of x."""
     kind = str(data["activation"])
     op = graph.op
     if kind == "tanh":

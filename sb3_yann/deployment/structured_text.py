@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from importlib.resources import files
 from itertools import groupby
@@ -129,11 +130,11 @@ def _parts(data: ControllerArrays, precision: str) -> tuple[str, list[str], list
     entries |= {key: str(size) for key, size in sizes.items()}
     entries |= {f"{key}_LAST": str(size - 1) for key, size in sizes.items()}
     texts = []
+    lines = ACTIVATE[str(data["activation"])]
     for part in ("interface", "variables", "body"):
         text = (files("sb3_yann.deployment") / "st" / f"{part}.st").read_text(encoding="ascii")
         text = _chosen(text, {flag for flag, is_there in flags.items() if is_there})
-        if part == "body":
-            text = _activated(text, ACTIVATE[str(data["activation"])])
+        text = re.sub(" *@ACTIVATE@", lambda at: textwrap.indent(lines, at[0][:-10]), text)
         for key, entry in entries.items():
             text = text.replace(f"@{key}@", entry)
         texts.append(text)
@@ -155,16 +156,6 @@ def _chosen(text: str, flags: set[str]) -> str:
         elif all(open_parts):
             kept.append(line)
     return "\n".join(kept) + "\n"
-
-
-def _activated(body: str, lines: str) -> str:
-    """Return a body with the activation in its places, indented as they are."""
-    found = []
-    for line in body.splitlines():
-        indent = line[: len(line) - len(line.lstrip())]
-        own = line.strip() == "@ACTIVATE@"
-        found += [f"{indent}{each}" for each in lines.splitlines()] if own else [line]
-    return "\n".join(found) + "\n"
 
 
 def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:

@@ -114,7 +114,6 @@ def _subject(
     headroom: Headroom | None,
     seeds: Iterable[int],
 ) -> Subject:
-    """Return what the report is about, checked."""
     check_type("model", model, BaseAlgorithm, "an SB3 model with a YannPolicy")
     policy = require_yann_policy(model.policy, "report")
     check_type("guard", guard, ImprovementGuard | None, "an ImprovementGuard, or None")

@@ -396,7 +396,6 @@ def guard_part(subject: Subject) -> Part:
 
 
 def _decisions(decisions: Sequence[Decision]) -> list[Html]:
-    """Return every decision with its reason, as a table."""
     head = ["", "episode", "verdict", "candidate", "accepted", "MPC", "restored", "reason"]
     rows = []
     for k, each in enumerate(decisions, start=1):

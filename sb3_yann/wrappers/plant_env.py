@@ -345,7 +345,6 @@ class Equations(gym.Env[Array, Array]):
         return self.state.copy(), 0.0, lost, False, info
 
     def _advance(self, u: Array) -> Array:
-        """Return the state one sample later."""
         x = self.state
         h = self.dt / self.substeps
         for _ in range(self.substeps):

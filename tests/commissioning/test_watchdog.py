@@ -62,7 +62,7 @@ def barks(dog: Watchdog, episode: list[Transition]) -> tuple[int, Alarm] | None:
 def test_the_plant_of_the_log_raises_no_alarm(noise) -> None:
     dog = watchdog(noise)
     assert [barks(dog, drive(seed, noise)) for seed in range(100, 120)] == [None] * 20
-    assert dog.quiet
+    assert dog.alarm is None
 
 
 @pytest.mark.parametrize(("noise", "force"), [(0.0, 1.8), (0.0, 2.2), (NOISE, 1.4), (NOISE, 2.6)])
@@ -126,9 +126,9 @@ def test_the_first_alarm_of_an_episode_stays_until_the_next_begins() -> None:
     dog = watchdog()
     theta, u, after = drive(1)[0]
     alarm = barks(dog, [(theta, u, after * np.nan)])[1]
-    assert dog.watch(*drive(1)[1]) is alarm and not dog.quiet
+    assert dog.watch(*drive(1)[1]) is alarm and dog.alarm is alarm
     dog.start(drive(1)[0][0])
-    assert dog.quiet and dog.watch(*drive(1)[0]) is None
+    assert dog.alarm is None and dog.watch(*drive(1)[0]) is None
 
 
 def test_what_cannot_be_calibrated_is_refused() -> None:
