@@ -158,10 +158,7 @@ class Log:
     def with_all_states(self) -> Log:
         """Return the log cut where a state is not read.
 
-        Raises
-        ------
-        ValueError
-            If no two samples in a row have all states: the message names those read now and then.
+        ValueError names the states read now and then, if no two samples in a row have all.
         """
         if max(self.every) == 1:
             return self

@@ -180,12 +180,7 @@ class Commissioning:
         return [*self.journal.episodes]
 
     def run(self, batches: int) -> list[Batch]:
-        """Play until there are so many batches in all, and return them.
-
-        Parameters
-        ----------
-        batches : int
-            Those of a resumed record count.
+        """Play until there are so many batches in all, those of a resumed record too; return them.
 
         Raises
         ------

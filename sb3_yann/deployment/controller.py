@@ -119,8 +119,7 @@ class Controller:
             )
         self.data = {name: np.asarray(each) for name, each in data.items()}
         try:
-            version = int(self.data["format"])
-            if version != FORMAT:
+            if (version := int(self.data["format"])) != FORMAT:
                 raise ValueError(
                     f"The controller has format {version}, this reader takes {FORMAT}. Export the "
                     "model again, or take the reader of the version that wrote it."
@@ -186,15 +185,9 @@ class Controller:
     def evaluate(self, obs: ArrayLike, networks: bool = True) -> Array:
         """Return the policy's actions, without memory: (m,), or (batch, m) for a batch.
 
-        What is not finite counts as at the operating point, and the law acts then, as in
-        `model.predict`.
-
-        Parameters
-        ----------
-        obs : array_like, shape (n_obs,) or (batch, n_obs)
-            In the units of the export; with an estimator, what the policy sees of it.
-        networks : bool, default True
-            False is the MPC's law.
+        ``obs`` (n_obs,) or (batch, n_obs) are in the units of the export; with an estimator, what
+        the policy sees of it. What is not finite counts as at the operating point, and the law
+        acts then, as in `model.predict`. Without ``networks`` it is the MPC's law.
         """
         rows, single = self._rows(obs, len(self.data["source"]))
         action: Array = self._act(rows, networks)[0]
@@ -435,7 +428,7 @@ class Controller:
     def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the first region that theta violates least, and whether it holds theta."""
         data = self.data
-        rows = max(1, MAX_SLACKS // len(self.data["b"]))
+        rows = max(1, MAX_SLACKS // len(data["b"]))
         tolerance, tie = data["tolerances"]
         region = np.empty(len(theta), np.int64)
         inside = np.empty(len(theta), bool)

@@ -191,7 +191,7 @@ def statistics_part(subject: Subject) -> Part:
     largest = f"{change[worst]:.4g}, from seed {subject.seeds[worst]}" if more else "0"
     # The upper limit of Clopper and Pearson: how often a violation may still happen.
     bad = int(np.sum(policy.violations > 0))
-    most = 1.0 if bad == count else float(stats.beta.ppf(0.95, bad + 1, count - bad))
+    most = float(stats.binomtest(bad, count).proportion_ci(0.90).high)
     sentences = [
         text,
         f"It costs less from {less} starts and more from {more} of {count}; the largest "
