@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 
+from sb3_yann._validation import check_type
 from sb3_yann.control.simulator import require_makes
 
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
@@ -41,11 +42,8 @@ def as_source(env: Any) -> Any:
                 "registers no env of that id."
             )
         return found
-    if not (isinstance(env, str | gym.Env) or callable(env)):
-        raise TypeError(
-            f"env = {env!r} must be the id of an environment, a gymnasium.Env, or a function that "
-            "makes one."
-        )
+    wanted = "the id of an environment, a gymnasium.Env, or a function that makes one"
+    check_type("env", env, str | gym.Env | Callable, wanted)
     require_makes(env)
     return env
 

@@ -427,8 +427,7 @@ def _watch_length(env: Any, steps: int) -> None:
 
 def as_seeds(seeds: Iterable[int]) -> list[int]:
     """Return the seeds of episodes, whole numbers of at least 0."""
-    if not isinstance(seeds, Iterable):
-        raise TypeError(f"seeds = {seeds!r} must hold a seed for each episode, e.g. range(20).")
+    check_type("seeds", seeds, Iterable, "a seed for each episode, e.g. range(20)")
     return [check_int("seeds", each, 0) for each in seeds]
 
 

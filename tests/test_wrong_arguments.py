@@ -90,7 +90,7 @@ def with_two_outputs() -> ObserveDisturbance:
         (lambda: restore_accepted(None), TypeError("model = None must be a DDPG or TD3")),
         (lambda: SimulatedEpisodes(None), TypeError("env = None must be the id of")),
         (lambda: evaluate(lambda _: [0.0], None, [0]), TypeError("env = None must be the")),
-        (lambda: evaluate(lambda _: [0.0], plant(), 3), TypeError("seeds = 3 must hold a")),
+        (lambda: evaluate(lambda _: [0.0], plant(), 3), TypeError("seeds = 3 must be a seed")),
         (lambda: comparison_table("", None, played(0)), TypeError(f"before = None {PLAYED}")),
         (lambda: comparison_table("", played(0), 3), TypeError(f"after = 3 {PLAYED}")),
         (lambda: drawn([played(0)]), TypeError("runs = .* must be a mapping")),

@@ -144,8 +144,7 @@ class PastInputs(Appending):
     def __init__(self, env: Env, delays: Sequence[int], initial: ArrayLike | None = None) -> None:
         bounds = require_vector(env, "action_space")
         hint = "It counts past values of an input."
-        if not isinstance(delays, Iterable):
-            raise TypeError(f"delays = {delays!r} must be a list, one entry for each input. {hint}")
+        check_type("delays", delays, Iterable, "a list, how late each input acts")
         self.delays = [check_int("delays", each, 0, hint) for each in delays]
         if len(self.delays) != bounds.shape[0]:
             raise ValueError(
@@ -357,9 +356,7 @@ class MeasuredDisturbance(Appending):
                 "The env is in ObserveDisturbance already, whose observer would take the measured "
                 "disturbance for an unknown one. Wrap it in MeasuredDisturbance first."
             )
-        if not isinstance(key, str):
-            raise TypeError(f"key = {key!r} must be a str, the entry of info that holds d.")
-        self.key = key
+        self.key = check_type("key", key, str, "a str, the entry of info that holds d")
         self.held: Array = np.clip(np.zeros(self.low.shape), self.low, self.high)
         self.failing = np.zeros(self.low.shape, dtype=bool)
 
@@ -462,11 +459,8 @@ class EstimateState(Appending):
         low: ArrayLike | None = None,
         high: ArrayLike | None = None,
     ) -> None:
-        if not isinstance(observer, StateEstimator):
-            raise TypeError(
-                f"observer is a {type(observer).__name__}, and must be a StateEstimator: "
-                "identify_outputs(...).estimator(), or the second of offset_free(mpc)."
-            )
+        wanted = "identify_outputs(...).estimator(), or the second of offset_free(mpc)"
+        check_type("observer", observer, StateEstimator, f"a StateEstimator: {wanted}")
         free = np.full(observer.n_estimated, np.inf)
         low = -free if low is None else low
         high = free if high is None else high
@@ -537,6 +531,5 @@ class ObserveDisturbance(EstimateState):
     def __init__(
         self, env: Env, observer: DisturbanceObserver, low: ArrayLike, high: ArrayLike
     ) -> None:
-        if not isinstance(observer, DisturbanceObserver):
-            raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
+        check_type("observer", observer, DisturbanceObserver, "a DisturbanceObserver")
         super().__init__(env, observer, low, high)
