@@ -71,12 +71,8 @@ def inputs_of(problem: LinearMPC, policy: Any, theta: Array) -> Array:
     actor = getattr(getattr(policy, "policy", policy), "actor", None)
     if actor is None:
         return np.asarray(policy(theta), np.float64).reshape(len(theta), -1)
-    import torch as th
-
-    device = next(actor.mu.buffers()).device
     bounds = problem.deviations
-    with th.no_grad():
-        scaled = actor.mu(th.as_tensor(theta, device=device)).double().cpu().numpy()
+    scaled = actor.mu.frozen()(theta)
     return np.asarray((bounds.u_max + bounds.u_min) / 2 + problem.u_half * scaled)
 
 
