@@ -12,7 +12,6 @@ import sys
 import zipfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -131,10 +130,9 @@ def _evaluate(options: Namespace) -> None:
 
     seeds = _seeds(options.episodes, options.seed)
     model = _model(options.model)
-    env = _env(options.env)
-    policy = evaluation.evaluate(model, env, seeds)
+    policy = evaluation.evaluate(model, options.env, seeds)
     model.policy.limit_correction(0.0)  # what is left is the MPC
-    mpc = evaluation.evaluate(model, env, seeds)
+    mpc = evaluation.evaluate(model, options.env, seeds)
     title = f"{options.episodes} episodes from seed {options.seed}: the MPC, and {options.model}"
     print(evaluation.comparison_table(title, mpc, policy))
 
@@ -151,8 +149,7 @@ def _report(options: Namespace) -> None:
     from sb3_yann import report as write
 
     seeds = _seeds(options.episodes)
-    env = _env(options.env) if options.env else None
-    print(f"Written: {write(_model(options.model), options.page, env=env, seeds=seeds)}")
+    print(f"Written: {write(_model(options.model), options.page, env=options.env, seeds=seeds)}")
 
 
 def _export(options: Namespace) -> None:
@@ -178,7 +175,7 @@ def _commission(options: Namespace) -> None:
     model = _model(options.model)
     found = Commissioning(
         model,
-        _env(options.env),
+        options.env,
         batch=options.batch,
         max_correction=options.max_correction,
         log_path=options.record,
@@ -200,13 +197,6 @@ def _problem(given: str) -> Any:
     from sb3_yann.policy.checks import resolve_problem
 
     return resolve_problem(given, None)
-
-
-def _env(given: str) -> Any:
-    """Return an env's id as it is, and what ``"module:attribute"`` names, if there is such."""
-    module, _, attribute = given.partition(":")
-    # "module:Env-v0" is Gymnasium's own: import the module, then look the id up.
-    return getattr(import_module(module), attribute, given) if attribute else given
 
 
 def _model(path: str) -> Any:
