@@ -207,10 +207,8 @@ def plot_surface(
         With the box of theta, names and units.
     policy : callable, model or YannPolicy
         A law takes theta (batch, n_theta) in deviations.
-    axes : matplotlib Axes, optional
-        Where to draw; a new figure's by default.
-    entries : pair of int or str, default (0, 1)
-        The coordinates to the right and up: indices, or names as in ``problem.labels()``.
+    axes, entries
+        As of :func:`plot_regions`.
     frame : pair of array_like, shape (2,), optional
         The lower left and the upper right corner, in plant units; by default the box of theta.
 
@@ -393,17 +391,15 @@ def loops_figure(
     rows = -(-len(entries) // columns) * height
     figure = new_figure(3.2 * columns + 0.4, 1.9 * rows + 0.6)
     panels = figure.subplots(rows, columns, squeeze=False)
-    for k in range(rows // height * columns):
+    for k, entry in enumerate(entries):
         block, column = divmod(k, columns)
         own = panels[block * height : (block + 1) * height, column]
-        if k >= len(entries):
-            for panel in own:
-                panel.set_axis_off()
-            continue
-        _draw_loops(own[0], problem, runs, entries[k])
+        _draw_loops(own[0], problem, runs, entry)
         if height > 1:
-            _draw_differences(own[1], problem, runs, entries[k])
+            _draw_differences(own[1], problem, runs, entry)
         own[-1].set_xlabel(f"time ({unit})" if unit else "time")
+    for panel in panels[-height:, (len(entries) - 1) % columns + 1 :].ravel():
+        panel.set_axis_off()
     found: dict[str, Any] = {}
     for panel in panels.ravel():
         handles, labels = panel.get_legend_handles_labels()

@@ -168,11 +168,6 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         What estimates the disturbances of the MPC, as :func:`offset_free` returns it.
     substeps : int, default 10
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is of no use, or it is not known where episodes begin.
-
     Examples
     --------
     >>> from sb3_yann import LinearModel
