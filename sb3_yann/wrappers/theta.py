@@ -37,8 +37,8 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
     What lies on a bound is shown inside it, where float32 would round it beyond: some laws are zero
-    outside their box. ``low`` and ``high`` are (p,), of ``rows`` vectors of p / rows entries with
-    the same bounds. ``appends`` are parts of `ThetaLayout` that it may hold.
+    outside their box. ``low`` and ``high`` (p,) are repeated for each of so many ``rows``.
+    ``appends`` are parts of `ThetaLayout` that it may hold.
     """
 
     appends: tuple[str, ...] = ()
