@@ -477,7 +477,7 @@ def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
         report(model, path, seeds=[])
     with pytest.raises(ValueError, match=r"seeds = 0\.5 must be a whole number"):
         report(model, path, seeds=[0.5])
-    with pytest.raises(TypeError, match=r"seeds = 20 must hold .* range\(20\)"):
+    with pytest.raises(TypeError, match=r"seeds = 20 must be .* range\(20\)"):
         report(model, path, seeds=20)
     assert not path.exists()
 
