@@ -24,6 +24,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.twin.dynamics import Coordinates, law_of
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.selection import basis
 
 STANDARD_ERRORS = 4.0
 """A coefficient of a regression differs from a value where it is farther away than so many."""
@@ -506,7 +507,7 @@ def _rest_of(log: Logged) -> Array:
     n = unit.size
     z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes]) / log.scale
     y = np.concatenate([e.thetas[1:, row.state] for e in log.episodes]) / unit
-    curved = products(z)
+    curved = basis(z, False, 2)
     F = np.column_stack([np.ones(len(z)), curved if len(z) > 5 * (curved.shape[1] + 1) else z])
     here = np.zeros(z.shape[1])
     spread = z.std(axis=0)
@@ -514,7 +515,8 @@ def _rest_of(log: Logged) -> Array:
 
     def motion(x: Array) -> Array:
         now = np.concatenate([x * unit / log.scale[:n], here[n:]])
-        return np.asarray(weights[0] + products(now)[: F.shape[1] - 1] @ weights[1:] - x)
+        terms = basis(now[None], False, 2)[0]
+        return np.asarray(weights[0] + terms[: F.shape[1] - 1] @ weights[1:] - x)
 
     x = here[:n]
     for _ in range(5):
@@ -553,7 +555,7 @@ class _Effects(NamedTuple):
         z = np.concatenate([row.features(e.thetas[k], e.actions[k + shift]) for e, k in steps])
         y = np.concatenate([e.thetas[k + 1, row.state] for e, k in steps])
         x, u = np.split(z / log.scale, [-m], axis=1)
-        curved = products(x)
+        curved = basis(x, False, 2)
         states = curved if len(z) > 5 * (curved.shape[1] + m + 1) else x
         F = np.column_stack([u, np.ones(len(z)), states])
         if len(z) <= 5 * F.shape[1]:
@@ -573,9 +575,3 @@ class _Effects(NamedTuple):
         drift_error = np.sqrt(np.diag(covariance)) * factors[m]
         B = slopes[:m].T / size
         return cls(B, covariance, factors[:m] / size, slopes[m], drift_error, follows)
-
-
-def products(x: Array) -> Array:
-    """Return states (..., k), followed by their products of two."""
-    first, second = np.triu_indices(x.shape[-1])
-    return np.concatenate([x, x[..., first] * x[..., second]], axis=-1)

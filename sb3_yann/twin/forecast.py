@@ -83,9 +83,13 @@ class _Replays:
         predicted = np.stack([self._step(r, u) for r, u in self._logged()])
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(self.alive[:, None, :, None], errors, 0.0)  # (T, members, N, n)
-        self.weights = self._memory() if remembers else None
+        self.weights = None
+        if remembers:
+            basis = self._basis()
+            self.weights = self._memory(basis)
         if self.weights is not None:
-            self.errors = self.errors - self._remembered_of_log()
+            remembered = np.einsum("tmnk,mkj->tmnj", basis, self.weights)
+            self.errors = np.where(self.alive[:, None, :, None], self.errors - remembered, 0.0)
         number = np.arange(len(episodes))
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
         sizes = np.log(np.sum(unseen**2, axis=-1) + TINY_SQUARE)
@@ -149,18 +153,12 @@ class _Replays:
             [self._regressors(t, r, inputs, self.errors) for t, (r, _) in enumerate(self._logged())]
         )
 
-    def _remembered_of_log(self) -> Array:
-        assert self.weights is not None
-        found = np.einsum("tmnk,mkj->tmnj", self._basis(), self.weights)
-        return np.where(self.alive[:, None, :, None], found, 0.0)
-
-    def _memory(self) -> Array | None:
+    def _memory(self, basis: Array) -> Array | None:
         """Return weights (members, k, n) of a memory; None where there are few rows.
 
         An actuator that lags, backlash and a load that lasts show in these terms, an ARMAX model's
         (Ljung, *System Identification*, section 4.2).
         """
-        basis = self._basis()
         count = self.rows.shape[1]
         plain = 1 + self.errors.shape[3] + self.inputs.shape[2]
         if self.alive.sum() < STEPS_PER_WEIGHT * basis.shape[-1] or count < 2:

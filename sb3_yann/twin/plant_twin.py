@@ -355,7 +355,7 @@ def _fitted(
         members = [zero] * n_members
     dynamics = Dynamics(problem, coordinates, tuple(members))
     trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
-    found = judges(coordinates, parts, choice, runs.only(chosen)) if choice.by_fold else ()
+    found = judges(coordinates, parts, choice, runs.scores[chosen]) if choice.by_fold else ()
     name = f"hidden states, {choice.name}" if row.hidden else choice.name
     return PlantTwin(problem, log, dynamics, name, trust, notes, found)
 

@@ -340,7 +340,7 @@ def shrinkage_of(setting: Setting, problem: LinearMPC, k: int) -> Array:
 def candidates(
     coordinates: Coordinates,
     parts: Sequence[Episode],
-    kinds: Sequence[str] = KINDS,
+    kinds: Sequence[str],
     drifts: bool = False,
 ) -> list[Candidate]:
     """Return the model as it is, and polynomials of some kinds, the least free first."""
@@ -378,10 +378,6 @@ class FreeRuns:
         """The mean logarithm over horizons, (candidates, episodes): less is better."""
         return np.asarray(np.nanmean(np.log(self.by_episode + 1e-12), axis=2))
 
-    def only(self, number: int) -> FreeRuns:
-        """Return those of one candidate."""
-        return FreeRuns(self.horizons, self.by_episode[number : number + 1])
-
     def choose(self, first: int = 0) -> int:
         """Return the first candidate, from a number on, within one standard error of the best.
 
@@ -407,19 +403,14 @@ def held_out(
     longest = min(LONGEST_RUN, int(np.median([*map(len, parts)])))
     horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
     errors = np.empty((len(choices), len(parts), len(horizons)))
+    # Stepped as one: those with hidden units, and those without.
+    plain = np.array([each.by_fold[0].is_polynomial for each in choices])
+    alike = [np.flatnonzero(plain == kind) for kind in {*plain.tolist()}]
     for i, episode in enumerate(bar("candidates on held-out episodes", parts)):
-        for same in _alike(choices):
+        for same in alike:
             made = [choices[j].by_fold[i % FOLDS] for j in same]
             errors[same, i] = _errors(coordinates, episode, made, horizons)
     return FreeRuns(horizons, np.sqrt(errors))
-
-
-def _alike(choices: Sequence[Candidate]) -> Iterator[list[int]]:
-    """Yield which candidates can be stepped as one: those with hidden units, and those without."""
-    plain = [each.by_fold[0].is_polynomial for each in choices]
-    for kind in (True, False):
-        if kind in plain:
-            yield [i for i, each in enumerate(plain) if each == kind]
 
 
 def _errors(
@@ -442,27 +433,24 @@ def _errors(
 
 
 def judges(
-    coordinates: Coordinates, parts: Sequence[Episode], chosen: Candidate, runs: FreeRuns
+    coordinates: Coordinates, parts: Sequence[Episode], chosen: Candidate, scores: Array
 ) -> tuple[Judge, ...]:
     """Return the twins that a log may not refute: the chosen one, and those with other gains.
 
     In a closed loop a log may not tell the gain of an input, since the states follow it in many
     ways. The others are shrunk little: what the chosen one owes to its shrinkage shows as well.
-    ``runs`` are those of the chosen one, alone.
+    ``scores`` (episodes,) are those of the chosen one's free runs.
     """
     problem = coordinates.row.problem
     degree = 1 if chosen.setting is None else chosen.setting.degree
     names = labels_of(problem.model)[1]
-    others = list[Setting]()
-    for gain in product(range(len(names)), GAINS):
-        others.append(Setting(degree, LOOSE, FIRM, gain))
+    gains = [*product(range(len(names)), GAINS)]
+    others = [Setting(degree, LOOSE, FIRM, gain) for gain in gains]
     fits = [ridge(coordinates, each, others) for each in without_each_fold(parts)]
     rivals = [Candidate("", tuple(fit[i] for fit in fits)) for i in range(len(others))]
-    worse = surely_worse(held_out(coordinates, parts, rivals).scores - runs.scores)
+    worse = surely_worse(held_out(coordinates, parts, rivals).scores - scores)
     found = [Judge(Dynamics(problem, coordinates, chosen.by_fold))]
-    for rival, setting, wrong in zip(rivals, others, worse, strict=True):
-        assert setting.gain is not None
-        j, times = setting.gain
+    for rival, (j, times), wrong in zip(rivals, gains, worse, strict=True):
         says = f"a gain of {names[j]} {times:g} times the model's, which the log allows"
         found.append(Judge(Dynamics(problem, coordinates, rival.by_fold), says, bool(wrong)))
     return tuple(found)
