@@ -93,7 +93,9 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
                 "earlier episodes, as NormalizeReward does. If it draws from numpy's global "
                 "generator, wrap it in sb3_yann.wrappers.SeededGlobals."
             )
-    if len(seeds) > 1 and _all_alike(mpc):
+    first = mpc.observations[0][0]
+    alike = all(np.array_equal(each[0], first) for each in mpc.observations)
+    if len(seeds) > 1 and alike and np.allclose(mpc.costs, mpc.costs[0], rtol=1e-6, atol=0):
         warn(
             f"All {len(seeds)} starts of the guard's env {name} are one and the same: its reset "
             "ignores its seed. What the guard accepts is compared from this start only.",
@@ -148,12 +150,6 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
         raise KeyboardInterrupt
 
 
-def _all_alike(played: Trajectories) -> bool:
-    first = played.observations[0][0]
-    starts = all(np.array_equal(each[0], first) for each in played.observations)
-    return starts and bool(np.allclose(played.costs, played.costs[0], rtol=1e-6, atol=0))
-
-
 def still_holds(evidence: Evidence, player: Player) -> bool:
     """Return whether five episodes are still what the evidence says: only a name is known."""
     starts = evidence.starts
@@ -175,7 +171,9 @@ def still_holds(evidence: Evidence, player: Player) -> bool:
 def check_not_nested(guard: BaseCallback) -> None:
     """Raise ValueError if a callback is within one that does not tell it of the end."""
     event = guard.parent if isinstance(guard.parent, EventCallback) else None
-    event = event or _event_above(guard, guard.locals.get("callback"))
+    for each in all_callbacks(guard.locals.get("callback")):
+        if isinstance(each, EventCallback) and guard in all_callbacks(each)[1:]:
+            event = each
     if event is not None:
         raise ValueError(
             f"The guard is within a callback of the class {type(event).__name__}, which does not "
@@ -187,10 +185,10 @@ def check_not_nested(guard: BaseCallback) -> None:
 def check_alone(guard: BaseCallback) -> None:
     """Raise ValueError if another guard is among what was passed to learn."""
     callbacks = all_callbacks(guard.locals.get("callback"))
-    found = [each for each in callbacks if isinstance(each, type(guard))]
-    if len(found) > 1:
+    count = sum(isinstance(each, type(guard)) for each in callbacks)
+    if count > 1:
         raise ValueError(
-            f"{len(found)} guards were passed to learn, expected is one: each would restore what "
+            f"{count} guards were passed to learn, expected is one: each would restore what "
             "it accepted itself. Give one guard all starts, by n_eval_episodes or a simulator of "
             "both."
         )
@@ -213,16 +211,6 @@ def all_callbacks(callback: Any) -> list[BaseCallback]:
     within = [*getattr(callback, "callbacks", [])]
     within += [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]
     return [callback, *(found for each in within for found in all_callbacks(each))]
-
-
-def _event_above(guard: BaseCallback, callback: Any) -> EventCallback | None:
-    """Return an EventCallback that the guard is under, among what was passed to learn."""
-    above = [
-        each
-        for each in all_callbacks(callback)
-        if isinstance(each, EventCallback) and guard in all_callbacks(each)[1:]
-    ]
-    return above[-1] if above else None
 
 
 class InterruptHandler:

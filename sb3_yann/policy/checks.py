@@ -268,12 +268,6 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
     )
 
 
-def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
-    """Warn where an env shows deviations, and the problem is in plant units."""
-    if words := problem.shown_as_deviation(problem.units.to_plant(theta)):
-        warn(words)
-
-
 def require_theta(
     problem: LinearMPC,
     observation_space: spaces.Space[Any],

@@ -139,7 +139,7 @@ class Explores(StartsAsMPC):
 
     def says_that_it_explores(self) -> None:
         """Warn once where nothing says that the plant is a simulator, and no guard is at work."""
-        algorithm = None if self._algorithm is None else self._algorithm()
+        algorithm = self._algorithm
         if self.explored or algorithm is None or algorithm.policy is not self:
             return
         if not self.simulator and not self.guarded:
@@ -168,12 +168,13 @@ class MaximumEntropy(Explores):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        algorithm: Any = None if self._algorithm is None else self._algorithm()
-        if algorithm is not None:
-            algorithm.learning_starts = 0
-        if algorithm is not None and algorithm.ent_coef == "auto":
+        algorithm = self._algorithm
+        if algorithm is None:
+            return
+        algorithm.learning_starts = 0
+        if algorithm.ent_coef == "auto":
             algorithm.ent_coef = f"auto_{self.balanced_entropy_coefficient():.6e}"
-        if algorithm is not None and algorithm.target_entropy == "auto":
+        if algorithm.target_entropy == "auto":
             center = th.zeros(1, self.problem.model.n_inputs, dtype=th.float64)
             drawn = TruncatedNormal(center, th.full_like(center[0], math.log(2 * self.initial_std)))
             algorithm.target_entropy = float(drawn.entropy())
@@ -341,8 +342,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
     def get_distribution(self, obs: Any) -> TruncatedNormal:  # type: ignore[override]
         """Return the distribution of actions in [-1, 1]."""
         actor: Any = self.actor
-        distribution: TruncatedNormal = actor.distribution(obs)
-        return distribution
+        return actor.distribution(obs)  # type: ignore[no-any-return]
 
     def predict_values(self, obs: Any) -> th.Tensor:
         """Return the values of states, (batch, 1)."""

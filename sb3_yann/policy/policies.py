@@ -26,6 +26,7 @@ from sb3_yann._validation import (
     check_discount,
     check_int,
     check_range,
+    warn,
 )
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.online import LAWS
@@ -170,10 +171,15 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             activation_fn=checks.as_activation(activation_fn),
             **checks.with_fused_adam(sb3_kwargs),
         )
-        self._algorithm = _as_reference(algorithm)
+        self._builder = _as_reference(algorithm)
         self._met = _as_reference(None if algorithm is None else algorithm.get_env())
         if algorithm is not None:
             watch_buffer(algorithm)
+
+    @property
+    def _algorithm(self) -> Any:
+        """The algorithm that has built the policy; None for one that stands alone, and a copy."""
+        return self._builder and self._builder()
 
     def _meets(self, algorithm: BaseAlgorithm | None) -> None:
         """Raise unless the observations of an algorithm's env are what the policy takes."""
@@ -188,7 +194,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
 
         A discount that was changed since is refused.
         """
-        algorithm = None if self._algorithm is None else self._algorithm()
+        algorithm = self._algorithm
         if algorithm is None or algorithm.policy is not self:
             return
         if not self.gamma_given and algorithm.gamma != self.gamma:
@@ -226,8 +232,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         if finite_gradient(optimizer):
             return False
         self.refused[name] += 1
-        algorithm = None if self._algorithm is None else self._algorithm()
-        warn_of_refused_step(name, optimizer, self.refused[name], algorithm)
+        warn_of_refused_step(name, optimizer, self.refused[name], self._algorithm)
         optimizer.zero_grad()
         return True
 
@@ -259,7 +264,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle holds: it is no longer the policy of the algorithm."""
-        return {**self.__dict__, "_algorithm": None, "_met": None}
+        return {**self.__dict__, "_builder": None, "_met": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; torch drops the hooks of optimizers on the way."""
@@ -285,7 +290,9 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         if not self.first_obs_checked:
             self.first_obs_checked = True
             rows = np.reshape(observation, (-1, *cast(Any, self.observation_space.shape)))
-            checks.warn_of_misread_states(self.problem, self.theta(rows).double().cpu().numpy())
+            theta = self.theta(rows).double().cpu().numpy()
+            if words := self.problem.shown_as_deviation(self.problem.units.to_plant(theta)):
+                warn(words)
         return predicted
 
     def unscale_action(self, scaled_action: Array) -> Array:
