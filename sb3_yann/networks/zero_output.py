@@ -15,7 +15,7 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, check_int
 
 Activation = Callable[[th.Tensor], th.Tensor]
 FEW = 32
@@ -128,6 +128,9 @@ class ZeroOutputNetwork(nn.Module):
         pinned: th.Tensor | None = None,
     ) -> None:
         super().__init__()
+        if np.ndim(hidden) != 1 or len(hidden) not in (1, 2):
+            raise ValueError(f"hidden = {hidden!r} must name one or two widths, such as (16, 16).")
+        hidden = tuple(check_int("hidden", each) for each in hidden)
         with th.enable_grad():
             zero = th.zeros((), requires_grad=True)
             at_zero = activation(zero)

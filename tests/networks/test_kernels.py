@@ -160,3 +160,5 @@ def test_autocast_runs_the_operations_of_torch() -> None:
     with th.autocast("cpu"):
         assert not network_of(layer).compiles
         assert th.allclose(layer(theta), exact, atol=0.05)
+    small = theta.bfloat16()  # a type that numpy does not have
+    assert th.equal(layer(small), layer(small.double()))

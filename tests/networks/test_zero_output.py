@@ -212,3 +212,9 @@ def test_it_goes_on_from_a_saved_state() -> None:
             parameter.grad = gradient
             optimizer.step()
     assert th.equal(one, two)
+
+
+@pytest.mark.parametrize("hidden", [(), (4, 4, 4), -1, (0,), (8, -1)])
+def test_widths_that_are_none_are_named(hidden) -> None:
+    with pytest.raises(ValueError, match=r"hidden = .* must"):
+        ZeroOutputNetwork(2, 1, hidden)

@@ -20,7 +20,8 @@ WEIGHT_TYPES = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], f
 
 def to_numpy(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
     """Return what compiled code takes for a tensor, without its gradient: the same memory if so."""
-    return np.ascontiguousarray(tensor.numpy(force=True), dtype)
+    known = tensor.float() if tensor.dtype == th.bfloat16 else tensor  # which numpy does not have
+    return np.ascontiguousarray(known.numpy(force=True), dtype)
 
 
 @compiled()  # not a fast one: s(b) - s(b) must be zero wherever the two are computed
