@@ -397,7 +397,7 @@ def _fit(
     what = "the policy learns: steps of Adam"
     for k in bar(what, range(updates if len(at) else 0), timed=True):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
-        chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
+        chosen = rng.integers(len(at), size=BATCH)
         optimizer.zero_grad()
         loss = loss_of(act(chosen), to[chosen])
         loss.backward()  # type: ignore[no-untyped-call]

@@ -260,7 +260,7 @@ def test_a_frozen_layer_and_one_on_rows_act_as_the_layer(kind: Any) -> None:
     with th.no_grad():
         acts = layer(th.as_tensor(theta)).numpy()
         np.testing.assert_array_equal(layer.frozen()(theta), acts)
-        some = th.tensor([7, 3, 40])
+        some = np.array([7, 3, 40])
         np.testing.assert_allclose(layer.on_rows(th.as_tensor(theta))(some), acts[some], atol=1e-6)
     with pytest.raises(ValueError, match=r"theta has shape \(4, 3\), expected \(batch, 2\)"):
         layer.frozen()(np.zeros((4, 3)))

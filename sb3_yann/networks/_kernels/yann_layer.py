@@ -279,7 +279,7 @@ def backward(
 
 def layer_on_cpu(
     pack: Callable[[Array], PackedLaw],
-    theta: th.Tensor,
+    theta: th.Tensor | Array,
     constants: Constants,
     weights: tuple[th.Tensor, ...],
     pinned: Single,
@@ -291,7 +291,7 @@ def layer_on_cpu(
     ----------
     pack : callable
         From theta (batch, n) to what :func:`forward` takes of the law.
-    theta : Tensor, shape (batch, n)
+    theta : Tensor or ndarray, shape (batch, n)
     constants : tuple
     weights : tuple of Tensor
         Nodes, second and last.
