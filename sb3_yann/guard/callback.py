@@ -238,7 +238,7 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
-        return summary_of(self.state, self.player.policy, self.steps)
+        return summary_of(self.state, self.player.policy, self.steps, self.settings.eval_freq)
 
     @property
     def steps(self) -> int:

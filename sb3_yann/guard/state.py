@@ -306,7 +306,7 @@ REFUSAL_ADVICE = {
 """What helps against a reason for a refusal that holds such words: the first one that does."""
 
 
-def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
+def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0, eval_freq: int = 1) -> str:
     """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
     decisions = state.decisions
     evidence = state.evidence
@@ -336,7 +336,8 @@ def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
     counts = Counter(each.verdict for each in decisions)
     refused = [each.reason for each in decisions if each.verdict == "rejected"]
     kinds = [next((words for words in REFUSAL_ADVICE if words in why), why) for why in refused]
-    candidates = refusals = more = ""
+    candidates = "none was tried yet"
+    refusals = more = ""
     if decisions:
         candidates = (
             f"{counts['accepted']} accepted, {counts['accepted in part']} in part, "
@@ -351,12 +352,13 @@ def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0) -> str:
         kind, times = Counter(kinds).most_common(1)[0]
         refusals = f"most often ({times} times): {refused[kinds.index(kind)]}"
         more = REFUSAL_ADVICE.get(kind, "")
+    candidates += f", one every eval_freq = {eval_freq} episodes, not steps" * (eval_freq > 1)
     return summary_lines(
         verdict,
         **rows,
         violations=violations,
         steps=f"{steps:,} of the guard's simulator" if steps else "",
-        candidates=candidates or "none was tried yet",
+        candidates=candidates,
         refused=refusals,
         next=more,
     )

@@ -82,6 +82,8 @@ def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
         "2 cost more by more than the margin, which the rule allows: seeds 7, 12",
     ):
         assert words in guard.summary()
+    guard.settings = dataclasses.replace(guard.settings, eval_freq=1000)
+    assert "in 3 episodes, one every eval_freq = 1000 episodes, not steps" in guard.summary()
 
 
 def test_a_mean_of_few_starts_is_what_they_cost_of_the_policy_that_has_played_all() -> None:
