@@ -187,7 +187,7 @@ def check_range(
     value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     kinds = (int, float, np.integer, np.floating)
     if isinstance(value, bool) or not isinstance(value, kinds):
-        if isinstance(value, str):
+        if isinstance(value, str) and value[:1].isdigit():
             hint = f"{hint} In YAML 1e-1 is a string: write 0.1, or 1.0e-1.".lstrip()
         raise TypeError(f"{name} = {_short(value)} must be a number. {hint}".rstrip())
     try:

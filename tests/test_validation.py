@@ -39,6 +39,7 @@ BAD: list[tuple[Any, tuple[Any, ...], Message]] = [
     *((check_bool, (x,), TypeError("x = .* True or False")) for x in (0, 1, "no", None)),
     *((check_int, (x,), "whole number of at least 1") for x in (True, 2.0, "2", None, 0)),
     (check_range, ([[1], [1, 2]], 0, 2), TypeError(r"x = \[\[1\], \[1, 2\]\] must be a number")),
+    (check_range, ("1e-1", 0, 1), TypeError("x = '1e-1' must be a number. In YAML 1e-1 is a str")),
     (check_range, (10**30, 0, 2), "x = 10{30} must be between 0 and 2"),
 ]
 

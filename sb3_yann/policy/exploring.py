@@ -342,7 +342,8 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
     def get_distribution(self, obs: Any) -> TruncatedNormal:  # type: ignore[override]
         """Return the distribution of actions in [-1, 1]."""
         actor: Any = self.actor
-        return actor.distribution(obs)  # type: ignore[no-any-return]
+        distribution: TruncatedNormal = actor.distribution(obs)
+        return distribution
 
     def predict_values(self, obs: Any) -> th.Tensor:
         """Return the values of states, (batch, 1)."""

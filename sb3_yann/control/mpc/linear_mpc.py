@@ -266,13 +266,10 @@ class LinearMPC(MPCProblem):
         >>> mpc.u_max.tolist(), mpc.theta_max.round(2).tolist()
         ([2.0], [3.14, 8.0])
         """
-        of_model, of_names = (
-            {name: options.pop(name) for name in names.split() if name in options}
-            for names in (
-                "x_ss u_ss dt set_state get_state scale",
-                "state_names input_names units time_unit",
-            )
-        )
+        names = ("x_ss", "u_ss", "dt", "set_state", "get_state", "scale")
+        of_model = {name: options.pop(name) for name in names if name in options}
+        labels = ("state_names", "input_names", "units", "time_unit")
+        of_names = {name: options.pop(name) for name in labels if name in options}
         model = LinearModel.from_env(env, **of_model)
         model = model.named(**of_names) if of_names else model
         with borrow(env) as borrowed:
