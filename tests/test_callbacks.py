@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DDPG, PPO, TD3
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
@@ -37,14 +37,19 @@ def assert_all_actions_are_the_policy_s(model, env: Recorder) -> None:
 def test_every_executed_action_is_the_policy_s_own_in_every_learn(algorithm) -> None:
     model, env = noisy(algorithm)
     model.learn(150, callback=NoActionNoise())
-    model.learn(150, callback=NoActionNoise())
+    model.learn(150, callback=EveryNTimesteps(10, NoActionNoise()))
     assert len(env.pairs) == 300
     assert_all_actions_are_the_policy_s(model, env)
 
 
 def test_without_the_callback_the_same_model_explores() -> None:
     model, env = noisy()
-    model.learn(150)
+    assert np.all(np.abs(model.predict(env.reset(seed=0)[0])[0]) <= 2)  # no warning yet
+    words = "first 100 actions of this learn are random.*callback=NoActionNoise.*learning_starts=0"
+    with pytest.warns(UserWarning, match=words) as warned:
+        model.learn(150)
+    assert len(warned) == 1 and warned[0].filename == __file__
+    model.learn(2, reset_num_timesteps=False)  # beyond them: a warning would be an error
     with pytest.raises(AssertionError):
         assert_all_actions_are_the_policy_s(model, env)
 

@@ -39,7 +39,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    model = DDPG(YannPolicy, Cart(), device="cpu", seed=0, learning_starts=10)
+    model = DDPG(YannPolicy, Cart(), device="cpu", seed=0, learning_starts=0)
     model.policy.critic_warmup = 0
     model.learn(40)
     path = tmp_path_factory.mktemp("model") / "cart.zip"

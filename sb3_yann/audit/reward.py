@@ -174,7 +174,7 @@ class CostAudit(BaseCallback):
     --------
     >>> from stable_baselines3 import DDPG
     >>> audit = CostAudit(steps=20)
-    >>> model = DDPG("YannPolicy", "CSTR-v0", seed=0, learning_starts=30, device="cpu")
+    >>> model = DDPG("YannPolicy", "CSTR-v0", seed=0, learning_starts=0, device="cpu")
     >>> _ = model.learn(25, callback=audit)
     >>> audit.finding.matches
     True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 import weakref
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -294,6 +295,12 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             if words := self.problem.shown_as_deviation(self.problem.units.to_plant(theta)):
                 warn(words)
         return predicted
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Do what SB3 asks for at the start of each rollout, and name random actions in it."""
+        if not mode and sys._getframe(1).f_code.co_name == "collect_rollouts":
+            sb3_hooks.warn_of_random_actions(self._algorithm)
+        super().set_training_mode(mode)
 
     def unscale_action(self, scaled_action: Array) -> Array:
         """Return actions in [-1, 1] as the env takes them: in its action space, to the last bit."""

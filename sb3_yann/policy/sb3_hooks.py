@@ -164,6 +164,18 @@ def _not_finite(buffer: ReplayBuffer, parts: tuple[Any, ...]) -> dict[tuple[str,
     return found
 
 
+def warn_of_random_actions(algorithm: Any) -> None:
+    """Warn where a `learn` begins with actions that SB3 draws from the whole range."""
+    count = getattr(algorithm, "learning_starts", 0) - getattr(algorithm, "num_timesteps", 0)
+    if count > 0 and algorithm.num_timesteps == algorithm._num_timesteps_at_start:
+        warn(
+            f"The first {count} actions of this learn are random, evenly over the whole range, "
+            f"limits or not: learning_starts = {algorithm.learning_starts} of the "
+            f"{type(algorithm).__name__}. For the policy's own from the first step on, pass "
+            "learn(..., callback=NoActionNoise()), or learning_starts=0 to the model.",
+        )
+
+
 def watch_buffer(model: BaseAlgorithm) -> None:
     """Let the model's replay buffer leave out what is not finite, unless something stands in."""
     buffer = getattr(model, "replay_buffer", None)

@@ -60,6 +60,7 @@ def learnt(algorithm: Any = DDPG, **options: Any) -> Any:
     model = algorithm(
         "YannPolicy", "CSTR-v0", policy_kwargs=options, device="cpu", gamma=0.98, batch_size=32
     )
+    model.learning_starts = 0  # PPO has none, and does not ask
     shake(network_of(model), 0.1)
     return model
 

@@ -138,7 +138,7 @@ def test_networks_learn_from_extra_signals_and_travel_with_the_model(
 ) -> None:
     """What was learnt depends on the feed; saved and loaded it is the same, and goes on."""
     model = build(kind, critic_warmup=0)
-    model.learn(300)
+    model.learn(300, callback=NoActionNoise())
     ways = th.tensor([[9.0, FEED[0]], [9.0, FEED[1]]]).double()
     with th.no_grad():
         values = model.critic(ways, th.zeros(2, 1))[0]

@@ -107,8 +107,7 @@ def test_sb3_s_own_critic_loss_is_zero_at_the_start(critic, reward) -> None:
     show, observation, size = SHOWN["normalized"]
     kwargs = {"critic": CriticOptions(critic, reward_scale=scale, reward_offset=offset)}
     model = build(Seen(show, size), observation, policy_kwargs=kwargs)
-    model.learn(1)  # sets up the logger
-    model.replay_buffer.reset()
+    model.learn(0)  # sets up the logger
     origin = law().locate(np.zeros(3))
     rng = np.random.default_rng(0)
     while model.replay_buffer.size() < 500:

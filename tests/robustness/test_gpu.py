@@ -29,7 +29,7 @@ def build(algorithm, device: str = "auto", **policy_kwargs):
     if algorithm in (SAC, TQC, PPO):
         policy_kwargs["simulator"] = True
     warm = {"critic_warmup": 0, "actor_lr_mult": 1.0}
-    short = {"n_steps": 100, "batch_size": 50} if algorithm is PPO else {"learning_starts": 20}
+    short = {"n_steps": 100, "batch_size": 50} if algorithm is PPO else {"learning_starts": 0}
     options = policy_kwargs if algorithm is PPO else {**warm, **policy_kwargs}
     return algorithm("YannPolicy", Spring(), policy_kwargs=options, seed=0, device=device, **short)
 
