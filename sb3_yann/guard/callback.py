@@ -135,10 +135,10 @@ class ImprovementGuard(BaseCallback):
         What it held of another run is kept beside it, in a file with a number. Training goes on
         where it cannot be written, with a warning.
     save_path : path-like, optional
-        A folder for ``accepted_model.zip``, the model with the policy accepted last, up to date
-        after each acceptance. The default is the ``best_model_save_path`` of an EvalCallback of the
-        same `learn`, whose own ``best_model.zip`` is a candidate that no guard has accepted; none
-        without one.
+        A folder for ``accepted_model.zip``, the model with the policy accepted last: as it was when
+        that was accepted, at the end as `learn` leaves it. The default is ``best_model_save_path``
+        of an EvalCallback of the same `learn`, whose own ``best_model.zip`` is a candidate that no
+        guard has accepted; none without one.
     verbose : int, default 0
         1 prints each decision.
 
@@ -456,6 +456,7 @@ class ImprovementGuard(BaseCallback):
         finally:
             self.player.policy.guarded = False
             restore_accepted(self.model)
+            self._saved = None  # an early one, the MPC's own of step 0, knows nothing of the run
             self._save_accepted()
             self.player.envs.close()
             if self._handler is not None:

@@ -176,7 +176,9 @@ def test_the_file_holds_what_is_accepted_from_the_first_step_on(tmp_path) -> Non
     first, accepted, later = seen
     assert is_mpc(first) and not is_mpc(accepted)
     assert actor_bits(accepted.policy) == actor_bits(later.policy) == accepted_bits(guard)
-    assert actor_bits(saved(folder).policy) == actor_bits(model.policy)
+    last = saved(folder)
+    assert actor_bits(last.policy) == actor_bits(model.policy)
+    assert (first.num_timesteps, last.num_timesteps) == (0, 2 * STEPS)
     assert [each.name for each in folder.iterdir()] == ["accepted_model.zip"]
 
 
