@@ -194,6 +194,21 @@ def check_alone(guard: BaseCallback) -> None:
         )
 
 
+def warn_of_rare_trials(model: BaseAlgorithm, eval_freq: int) -> None:
+    """Warn where a `learn` has fewer episodes than there are from one candidate to the next."""
+    env: Any = model.get_env()
+    if not env.has_attr("_max_episode_steps"):
+        return
+    steps = model._total_timesteps - model.num_timesteps
+    length = max(env.get_attr("_max_episode_steps"))
+    if eval_freq > max(1, count := steps // length):
+        warn(
+            f"eval_freq = {eval_freq} counts training episodes, not steps, and {steps} steps are "
+            f"{count} of them, of {length} steps: unless they end sooner the guard tries no "
+            "candidate between the first episode and the end. eval_freq=1 tries each."
+        )
+
+
 def check_twin(policy: StartsAsMPC, problem: LinearMPC) -> None:
     """Raise ValueError unless a twin shows what the policy observes, theta of the same problem."""
     require_problem_of_twin(policy, problem)

@@ -220,6 +220,14 @@ def test_two_guards_at_once_are_refused(together) -> None:
         train(build(), STEPS, *guards)
 
 
+def test_candidates_that_are_rarer_than_episodes_are_named_before_the_first_step() -> None:
+    env = gym.wrappers.TimeLimit(Slide(), STEPS)
+    with pytest.warns(UserWarning, match="eval_freq = 3 counts .* 8 steps are 2 of them, of 4"):
+        train(build(env=env), 2 * STEPS, make_guard(eval_freq=3))
+    train(build(env=env), 2 * STEPS, make_guard(eval_freq=2))  # a warning would be an error
+    train(build(), 2, make_guard(eval_freq=2))  # of episodes of any length nothing is known
+
+
 @pytest.mark.parametrize(("kind", "deep"), [("every", False), ("every", True), ("eval", False)])
 def test_a_guard_within_an_event_callback_is_refused(deep, kind) -> None:
     guard = make_guard()
