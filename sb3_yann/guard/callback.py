@@ -30,6 +30,7 @@ from sb3_yann.guard.start import (
     check_twin,
     first_evidence,
     still_holds,
+    warn_of_place,
     warn_of_rare_trials,
 )
 from sb3_yann.guard.state import (
@@ -273,6 +274,7 @@ class ImprovementGuard(BaseCallback):
         check_not_nested(self)
         check_alone(self)
         require_same_statistics(self.model)
+        warn_of_place(self, sys._getframe())
         warn_of_rare_trials(self.model, self.settings.eval_freq)
         self._has_begun = False
         self._steps = 0

@@ -194,6 +194,19 @@ def check_alone(guard: BaseCallback) -> None:
         )
 
 
+def warn_of_place(guard: BaseCallback, frame: FrameType | None) -> None:
+    """Warn where RL Zoo would end another callback after Ctrl-C; ``frame`` is the caller's."""
+    given = getattr(guard.locals.get("callback"), "callbacks", [guard])
+    while frame is not None and frame.f_globals.get("__name__") != "rl_zoo3.exp_manager":
+        frame = frame.f_back
+    if frame is not None and guard in given[1:]:
+        warn(
+            f"ImprovementGuard is number {given.index(guard) + 1} of the hyperparameters' "
+            "callbacks, and after Ctrl-C RL Zoo tells the first alone that training has ended: "
+            "what was accepted would not be confirmed. Put the guard first."
+        )
+
+
 def warn_of_rare_trials(model: BaseAlgorithm, eval_freq: int) -> None:
     """Warn where a `learn` has fewer episodes than there are from one candidate to the next."""
     env: Any = model.get_env()

@@ -228,6 +228,14 @@ def test_candidates_that_are_rarer_than_episodes_are_named_before_the_first_step
     train(build(), 2, make_guard(eval_freq=2))  # of episodes of any length nothing is known
 
 
+def test_rl_zoo_is_told_of_a_guard_that_it_would_not_end_after_ctrl_c() -> None:
+    zoo = {"__name__": "rl_zoo3.exp_manager"}
+    with pytest.warns(UserWarning, match="number 2 of the hyperparameters' callbacks.*guard first"):
+        eval("act()", {**zoo, "act": lambda: train(build(), 2, make_guard())})
+    callbacks = [make_guard(), NoActionNoise()]  # a warning would be an error
+    eval("act()", {**zoo, "act": lambda: build().learn(2, callback=callbacks)})
+
+
 @pytest.mark.parametrize(("kind", "deep"), [("every", False), ("every", True), ("eval", False)])
 def test_a_guard_within_an_event_callback_is_refused(deep, kind) -> None:
     guard = make_guard()
