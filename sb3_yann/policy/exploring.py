@@ -290,7 +290,13 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
     def __init__(
         self, *args: Any, initial_std: float = 0.1, actor_lr_mult: float = 1.0, **kwargs: Any
     ) -> None:
-        super().__init__(*args, initial_std=initial_std, actor_lr_mult=actor_lr_mult, **kwargs)
+        if given := kwargs.get("critic_warmup"):
+            warn(
+                f"critic_warmup = {given} does nothing here: PPO moves actor and critic at once. "
+                "Leave it out; actor_lr_mult makes the actor slower.",
+            )
+        kwargs |= {"critic_warmup": 0, "initial_std": initial_std, "actor_lr_mult": actor_lr_mult}
+        super().__init__(*args, **kwargs)
         self._squash_output = True  # actions are in [-1, 1], and SB3 gives them units
 
     def _build(self, lr_schedule: Schedule) -> None:

@@ -192,6 +192,13 @@ def test_a_guard_of_before_does_not_silence_that_nobody_confirms_now() -> None:
         model.learn(8)
 
 
+def test_a_warmup_of_ppo_does_nothing_and_says_so(tmp_path) -> None:
+    with pytest.warns(UserWarning, match="critic_warmup = 5 does nothing here: PPO"):
+        policy = build(PPO, critic_warmup=5).policy
+    policy.save(tmp_path / "policy")
+    type(policy).load(tmp_path / "policy")  # a warning would be an error
+
+
 def test_entropy_starts_in_balance_and_what_the_user_gives_stays() -> None:
     model = build(SAC, initial_std=0.05)
     entropy = model.policy.actor.distribution(th.zeros(1, 1)).entropy()
