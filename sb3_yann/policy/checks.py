@@ -19,6 +19,7 @@ from sb3_yann.control import LinearMPC
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.observations import (
+    IN_YAML,
     AffineFeatures,
     AffineObservation,
     require_frozen,
@@ -194,8 +195,8 @@ def require_inverse_normalization(
         return
     if observation is None:
         raise ValueError(
-            "VecNormalize normalizes observations, and the law takes the state. Undo it: "
-            "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
+            "VecNormalize normalizes observations, and the law takes the state. Undo it: policy_"
+            f"kwargs={{'observation': AffineObservation.from_vec_normalize(venv)}}. {IN_YAML}"
         )
     require_outermost(normalize, algorithm.observation_space.shape)
     vars(algorithm)["sees_normalized"] = True  # both are saved with the model

@@ -248,17 +248,22 @@ def normalized(model: BaseAlgorithm, observations: Any) -> Any:
     return observations if normalize is None else normalize.normalize_obs(np.asarray(observations))
 
 
+IN_YAML = "In RL Zoo's hyperparameters leave normalize out."
+"""The other way out of a VecNormalize, for those who never saw it made."""
+
+
 def require_frozen(normalize: VecNormalize) -> None:
     """Raise if a VecNormalize changes what it has said, or changes the rewards."""
     if normalize.norm_reward:
         raise ValueError(
             "VecNormalize normalizes rewards: they are not the cost that the critic stands for. "
-            "Set venv.norm_reward = False; CriticOptions(reward_scale=...) takes a constant factor."
+            "Set venv.norm_reward = False; CriticOptions(reward_scale=...) takes a constant "
+            f"factor. {IN_YAML}"
         )
     if normalize.norm_obs and normalize.training:
         raise ValueError(
             "VecNormalize still moves its statistics: one observation means another state at each "
-            "step. Collect them first. Set venv.training = False then."
+            f"step. Collect them first. Set venv.training = False then. {IN_YAML}"
         )
 
 
