@@ -91,7 +91,7 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
                 f"{name} shows other numbers than the state that the law takes. Say what they "
                 f"mean: policy_kwargs={{'observation': {undo}}}, or AffineObservation.identity(n) "
                 "where the model is one of what is shown. A law without a policy takes the env "
-                "without the wrapper."
+                "without the wrapper; RL Zoo's hyperparameters need no frame_stack."
             )
         if not observation_given and (
             late := _library_names(layer) & {"DelayObservation", "StickyAction"}

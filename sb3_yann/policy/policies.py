@@ -132,9 +132,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         self.observation = as_observation(observation, self.problem)
         # Whether the user said what the env shows.
         self.observation_given = self.observation is not None
-        checks.require_theta(self.problem, observation_space, self.observation)
+        self._meets(algorithm, observation_space)
         self.to_theta = to_deviations(self.observation, self.problem)
-        self._meets(algorithm)
         if self.observation is not None:
             self.saved_kwargs["observation"] = self.observation
         self.first_obs_checked = False  # at the first observation
@@ -182,13 +181,15 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         """The algorithm that has built the policy; None for one that stands alone, and a copy."""
         return self._builder and self._builder()
 
-    def _meets(self, algorithm: BaseAlgorithm | None) -> None:
+    def _meets(self, algorithm: BaseAlgorithm | None, space: spaces.Space[Any]) -> None:
         """Raise unless the observations of an algorithm's env are what the policy takes."""
+        env = None if algorithm is None else algorithm.get_env()
+        if env is not None:  # first: wrappers say why a size is another one
+            require_state_shown(env, self.observation_given)
+        checks.require_theta(self.problem, space, self.observation)
         checks.require_inverse_normalization(self.problem, algorithm, self.observation)
-        if algorithm is not None and algorithm.get_env() is not None:
-            require_state_shown(algorithm.get_env(), self.observation_given)
-            if not self.observation_given:
-                require_theta_order(algorithm.get_env(), self.problem)
+        if env is not None and not self.observation_given:
+            require_theta_order(env, self.problem)
 
     def _meets_another_env(self) -> None:
         """Do the same where `set_env` has given the algorithm another env since.
@@ -202,7 +203,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             checks.refuse_another_gamma(algorithm, self.gamma)
         env = algorithm.get_env()
         if env is not None and (self._met is None or self._met() is not env):
-            self._meets(algorithm)
+            self._meets(algorithm, self.observation_space)
             self._met = weakref.ref(env)
 
     def _build(self, lr_schedule: Schedule) -> None:
