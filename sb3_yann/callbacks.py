@@ -73,7 +73,7 @@ class NoActionNoise(BaseCallback):
 class ControlDiagnostics(BaseCallback):
     """Records what SB3 does not: how far the policy is from its MPC, and whether limits held.
 
-    Scalars, over the steps since the last dump where nothing else is said:
+    Scalars, over the steps that no dump has shown yet where nothing else is said:
 
     - ``yann/distance_from_mpc_mean``, ``yann/distance_from_mpc_max``: distance of the executed
       action from the MPC's, as a fraction of the input range (largest over the inputs).
@@ -96,13 +96,17 @@ class ControlDiagnostics(BaseCallback):
         self.policy = require_yann_policy(self.model.policy, "ControlDiagnostics")
         watch_buffer(self.model)
         self.violations = 0
-        self._forget()
+        self._distances: list[float] = []
+        self._regions: list[int] = []
+        self._recorded = 0  # how many of them
         n_envs = self.training_env.num_envs
         self._episodes: list[list[tuple[Any, ...]]] = [[] for _ in range(n_envs)]
 
     def _on_step(self) -> bool:
         if "yann/violations" not in self.logger.name_to_value and self._recorded:
-            self._forget()  # the logger was dumped
+            # The logger was dumped, maybe in this step: what came since is still to show.
+            del self._distances[: self._recorded], self._regions[: self._recorded]
+            self._recorded = 0
         observations = np.asarray(self.model._last_obs)  # still s_t: SB3 advances it later
         # In [-1, 1]; on-policy algorithms call them otherwise.
         actions = self.locals.get("buffer_actions", self.locals["actions"])
@@ -127,11 +131,6 @@ class ControlDiagnostics(BaseCallback):
             self._record()
         return True
 
-    def _forget(self) -> None:
-        self._distances: list[float] = []
-        self._regions: list[int] = []
-        self._recorded = False
-
     def _record(self) -> None:
         if self._distances:
             self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
@@ -139,7 +138,7 @@ class ControlDiagnostics(BaseCallback):
             self.logger.record("yann/region", int(np.bincount(self._regions).argmax()))
         self.logger.record("yann/regions_visited", len(set(self._regions)))
         self.logger.record("yann/violations", self.violations)
-        self._recorded = True
+        self._recorded = len(self._distances)
 
     def _record_critic_error(self, episode: list[tuple[Any, ...]], info: dict[str, Any]) -> None:
         observations, actions, rewards = (np.array(part) for part in zip(*episode, strict=True))

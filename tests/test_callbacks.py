@@ -94,6 +94,18 @@ def test_tensorboard_shows_distances_regions_and_violations(pushed, tmp_path) ->
     assert shown["yann/critic_error"][-1] > 0
 
 
+def test_a_dump_of_a_guard_at_the_end_of_an_episode_leaves_all_its_steps_to_the_next() -> None:
+    class Dump(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.locals["dones"][0]:
+                self.logger.dump(self.num_timesteps)
+            return True
+
+    model, _ = noisy()
+    model.learn(400, callback=[NoActionNoise(), Dump(), diagnostics := ControlDiagnostics()])
+    assert len(diagnostics._distances) == len(diagnostics._regions) == 200
+
+
 def test_violations_count_and_the_critic_error_compares_q_with_the_return_that_followed() -> None:
     model, _ = noisy(env=Ending(gym.make("ClippedPendulum-v0"), 3, reward=-1.0), gamma=0.5)
     states: list[np.ndarray] = []
