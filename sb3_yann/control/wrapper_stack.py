@@ -111,6 +111,17 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
                     )
 
 
+def warn_of_moving_rewards(env: Any) -> None:
+    """Warn where a learner's rewards are divided by a statistic, which moves."""
+    for layer in layers_of(env):
+        if "NormalizeReward" in _library_names(layer) and layer.update_running_mean:
+            warn(
+                "NormalizeReward divides rewards by a statistic that moves: they are not minus the "
+                "stage cost, for which the critic stands, so that it learns its value anew. The "
+                "law stays. Leave the wrapper out; the critic finds its scale itself.",
+            )
+
+
 def _library_names(layer: Any) -> set[str]:
     """Return the names of a layer's classes that are a library's."""
     kinds = type(layer).__mro__

@@ -31,7 +31,11 @@ from sb3_yann._validation import (
 )
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.online import LAWS
-from sb3_yann.control.wrapper_stack import require_state_shown, require_theta_order
+from sb3_yann.control.wrapper_stack import (
+    require_state_shown,
+    require_theta_order,
+    warn_of_moving_rewards,
+)
 from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import checks, sb3_hooks
@@ -186,6 +190,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         env = None if algorithm is None else algorithm.get_env()
         if env is not None:  # first: wrappers say why a size is another one
             require_state_shown(env, self.observation_given)
+            warn_of_moving_rewards(env)
         checks.require_theta(self.problem, space, self.observation)
         checks.require_inverse_normalization(self.problem, algorithm, self.observation)
         if env is not None and not self.observation_given:

@@ -114,6 +114,7 @@ WRONG = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:NormalizeReward divides:UserWarning")
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_reward_or_observation_of_another_meaning_is_named(wrong) -> None:
     make, cause, text = WRONG[wrong]

@@ -470,6 +470,11 @@ def test_stacked_and_late_observations_are_named_unless_they_are_meant() -> None
 
 
 def test_wrappers_of_rewards_and_of_fixed_numbers_pass() -> None:
-    require_state_shown(wrappers.NormalizeReward(plant()), observation_given=False)
+    rewards = wrappers.NormalizeReward(plant())
+    require_state_shown(rewards, observation_given=False)
+    with pytest.warns(UserWarning, match="NormalizeReward divides .* for which the critic stands"):
+        built(rewards)
+    rewards.update_running_mean = False
+    built(rewards)  # a warning would be an error
     require_state_shown(wrappers.RecordEpisodeStatistics(plant()), observation_given=False)
     require_state_shown(Fixed(plant()), observation_given=False)
