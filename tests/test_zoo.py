@@ -166,6 +166,29 @@ def test_enjoy_replays_the_trained_model(run) -> None:
     assert np.isfinite(float(episode["r"]))
 
 
+OWN_PLANT = """
+import gymnasium as gym
+from policy_samples import scalar_mpc as mpc
+from sample_plants import LinearPlant
+make_env = lambda: gym.wrappers.TimeLimit(LinearPlant(mpc()), 20)
+"""
+
+
+def test_the_file_of_the_page_trains_a_plant_of_the_reader_s(tmp_path, monkeypatch) -> None:
+    utils = pytest.importorskip("rl_zoo3.utils")
+    page = (Path(__file__).parents[1] / "docs" / "policy.md").read_text(encoding="utf-8")
+    (entry,) = yaml.safe_load(
+        "MyPlant" + page.split("    MyPlant")[1].partition("\n\n-")[0]
+    ).values()
+    (tmp_path / "my_plant.py").write_text(OWN_PLANT)
+    monkeypatch.syspath_prepend(tmp_path)
+    env = sb3_yann.env_pool.make_env("my_plant:make_env")
+    model = DDPG(entry["policy"], env, policy_kwargs=entry["policy_kwargs"])
+    callbacks = utils.get_callback_list(entry)
+    model.learn(40, callback=callbacks)  # a warning would be an error
+    assert "is the MPC" in callbacks[0].summary()
+
+
 # ---- Search spaces for RL Zoo: trials keep the problem of their entry, workers share a study ----
 
 
