@@ -45,6 +45,19 @@ def warn(words: str, kind: type[Warning] = UserWarning) -> None:
     warnings.warn(words, kind, stacklevel=level)
 
 
+def add_note(error: BaseException, words: str) -> None:
+    """Let an error say more; before Python 3.11, which has notes, as one of its arguments."""
+    if sys.version_info >= (3, 11):
+        error.add_note(words)
+    else:
+        error.args = (*error.args, words)
+
+
+def said_by(error: BaseException) -> str:
+    """Return an error's message with its notes."""
+    return str(error) + "".join(f" ({each})" for each in getattr(error, "__notes__", []))
+
+
 def check_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
     """Return ``value`` as a finite, read-only float64 array of ``shape``; a letter is any size."""
     array = to_float(name, value)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_yann import __version__
-from sb3_yann._validation import check_int
+from sb3_yann._validation import check_int, said_by
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,7 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.traceback:
             raise
         kind = "" if isinstance(error, OSError | TypeError | ValueError) else type(error).__name__
-        print(f"sb3-yann {options.command}: {kind}{': ' * bool(kind)}{error}", file=sys.stderr)
+        print(
+            f"sb3-yann {options.command}: {kind}{': ' * bool(kind)}{said_by(error)}",
+            file=sys.stderr,
+        )
         return 1
     return 0
 

@@ -16,7 +16,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._progress import bar
-from sb3_yann._validation import Array, check_int, check_type, half_widths, warn
+from sb3_yann._validation import Array, add_note, check_int, check_type, half_widths, warn
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.mpc.bound_excess import BoundExcess, costs_of
@@ -277,15 +277,20 @@ class _Envs:
         self.resets = resets
         self.problem = problem
         self.each = each
+        self.steps = 0  # of the episode, the one that is under way included
 
     def reset(self) -> NDArray[Any]:
         """Return the first observations (k, n)."""
-        pairs = zip(self.envs, self.resets, strict=False)  # the last lot may be smaller
+        shown = (
+            self._asked(i, self.envs[i].reset, seed=seed, options=options)[0]
+            for i, (seed, options) in enumerate(self.resets)  # the last lot may be smaller
+        )
         # A copy of each: an env may write its next observation into the same array.
-        return np.stack([np.array(env.reset(seed=s, options=o)[0]) for env, (s, o) in pairs])
+        return np.stack([*map(np.array, shown)])
 
     def step(self, actions: Any, rows: Rows) -> _Step:
         """Step the envs ``rows`` (r,) with actions (r, m)."""
+        self.steps += 1
         observations, *others = zip(*self.each(self._one, rows, actions), strict=True)
         return _Step(np.stack(observations), *(np.array(each) for each in others))
 
@@ -293,12 +298,21 @@ class _Envs:
         """Step one env, and return what is in a `_Step` of it."""
         if self.problem is not None:
             action = action.astype(self.envs[i].action_space.dtype)
-        observation, reward, terminated, truncated, info = self.envs[i].step(action)
+        observation, reward, terminated, truncated, info = self._asked(i, self.envs[i].step, action)
         violated = bool(info.get("violation", False))
         success = bool(info.get("is_success", False))
         ends = bool(terminated), bool(truncated)
         changed = may_change_reward(info)
         return np.array(observation), as_reward(reward), *ends, violated, success, changed
+
+    def _asked(self, i: int, call: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        """Call an env; an error says in which episode, and where in it."""
+        try:
+            return call(*given, **named)
+        except Exception as error:
+            where = f"step {self.steps}" if self.steps else "the reset"
+            add_note(error, f"in {where} of the episode from the seed {self.resets[i][0]}")
+            raise
 
 
 class _Copies:

@@ -1,5 +1,6 @@
 """Seeded, paired episodes, and what is printed and drawn of them."""
 
+import sys
 from functools import partial
 
 import gymnasium as gym
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import unit_samples as units
+from sb3_yann._validation import said_by
 from sb3_yann.env_pool import EnvPool
 from sb3_yann.evaluation import Trajectories, evaluate
 
@@ -56,6 +58,8 @@ class Countdown(gym.Env):
 
     def step(self, action):
         reward = -float(self.left + action[0])
+        if self.left == 13:
+            raise ArithmeticError("thirteen")
         violation = self.left == 2
         self.left -= 1
         observation = np.full(1, self.left, np.float32)
@@ -87,6 +91,14 @@ def test_episodes_of_different_length_wait_for_nobody() -> None:
     assert [each[:, 0].tolist() for each in episodes.observations][:2] == [[3, 2, 1, 0], [1, 0]]
     np.testing.assert_allclose(episodes.actions[0][:, 0], [0.3, 0.2, 0.1], rtol=1e-6)
     assert_equal(episodes, evaluate(Tenth(), Countdown(), [3, 1, 4]))
+
+
+@pytest.mark.parametrize("version", [(3, 10), (3, 11)])
+def test_an_error_of_an_env_says_in_which_episode_and_step(version, monkeypatch) -> None:
+    monkeypatch.setattr("sys.version_info", min(version, tuple(sys.version_info)))
+    with pytest.raises(ArithmeticError, match="thirteen") as raised:
+        evaluate(Tenth(), Countdown, [3, 15])
+    assert "in step 3 of the episode from the seed 15" in said_by(raised.value)
 
 
 def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> None:
