@@ -9,13 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import (
-    Array,
-    check_array,
-    check_int,
-    check_outputs,
-    check_positive_vector,
-)
+from sb3_yann._validation import Array, check_array, check_int, check_outputs, check_positive_vector
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
 

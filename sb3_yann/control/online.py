@@ -15,12 +15,7 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, check_array, check_choice, check_int, half_widths, warn
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.parametric_qp import (
-    MILD,
-    ParametricQP,
-    moderated,
-    slack_costs,
-)
+from sb3_yann.control.explicit.parametric_qp import MILD, ParametricQP, moderated, slack_costs
 from sb3_yann.control.law import INFEASIBLE_OPTIONS, PiecewiseAffine, PlantLaw, bounds_of
 
 if TYPE_CHECKING:
@@ -218,7 +213,7 @@ class OnlineLaw(PlantLaw):
             f"{rows[inside][0].tolist()}: no input brings the model back from there, or a hard "
             "bound cannot be kept. Predictions run away, and rounding hides the law. The input is "
             "bounded, but not the MPC's; law.in_domain is False. Give theta_min and theta_max the "
-            "states from which inputs bring it back, or pass a shorter horizon.",
+            "states from which inputs bring it back, or pass a shorter horizon."
         )
 
     def _answers(self, rows: Array) -> tuple[Array, NDArray[np.bool_], Answers, Answers | None]:

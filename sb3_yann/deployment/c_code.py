@@ -173,11 +173,7 @@ class Run:
             if self.plant:
                 loads = reading[self.plant["loads_of_plant"]]
                 x = self.plant["step_of_plant"] @ [*x, *actions[-1], *loads, 1.0]
-        return {
-            "actions": np.array(actions),
-            "status": np.array(status),
-            "modes": np.array(modes),
-        }
+        return {"actions": np.array(actions), "status": np.array(status), "modes": np.array(modes)}
 
 
 def c_files(data: ControllerArrays, precision: str, about: str, file: str) -> dict[str, str]:

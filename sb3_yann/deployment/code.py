@@ -229,11 +229,7 @@ def table(kind: str, name: str, values: NDArray[Any], precision: str) -> str:
         return literal(entry, precision) if values.dtype.kind == "f" else str(int(entry))
 
     body = np.array2string(
-        values,
-        max_line_width=90,
-        separator=", ",
-        threshold=sys.maxsize,
-        formatter={"all": shown},
+        values, max_line_width=90, separator=", ", threshold=sys.maxsize, formatter={"all": shown}
     )
     body = body.translate(str.maketrans("[]", "{}"))
     return f"static const {kind} {name}{sizes} =\n{body};"

@@ -231,10 +231,7 @@ class Teacher:
 
 
 def imitate(
-    layer: LawLayer,
-    teacher: Teacher,
-    updates: int,
-    say: Callable[[str], None] = lambda text: None,
+    layer: LawLayer, teacher: Teacher, updates: int, say: Callable[[str], None] = lambda text: None
 ) -> float:
     """Fit a layer to plans of a model's episodes, and to their feedback nearby.
 

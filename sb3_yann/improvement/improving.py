@@ -35,13 +35,7 @@ from sb3_yann.improvement.confirmation import (
     Trial,
     confirm,
 )
-from sb3_yann.improvement.imitation import (
-    Teacher,
-    controller_of,
-    imitate,
-    policy_of,
-    refit_critic,
-)
+from sb3_yann.improvement.imitation import Teacher, controller_of, imitate, policy_of, refit_critic
 from sb3_yann.improvement.simulator import (
     Excited,
     OutOfStepsError,

@@ -316,11 +316,7 @@ class _Search:
     """What is played, one controller after the other."""
 
     def __init__(
-        self,
-        mpc: LinearMPC,
-        given: Source | PlantTwin,
-        seeds: range,
-        max_steps: int | None,
+        self, mpc: LinearMPC, given: Source | PlantTwin, seeds: range, max_steps: int | None
     ) -> None:
         self.mpc = mpc
         self.seeds = seeds

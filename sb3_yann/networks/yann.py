@@ -461,11 +461,7 @@ class SharedYannLayer(LawLayer):
         theta = sample_points(law)
         register_constants(self, samples=np.hstack([theta, self._actions(theta)]))
         self.network = ZeroOutputNetwork(
-            law.n_theta,
-            law.n_inputs,
-            hidden,
-            activation=activation,
-            pinned=th.tensor([pinned]),
+            law.n_theta, law.n_inputs, hidden, activation=activation, pinned=th.tensor([pinned])
         )
         self.limit(max_correction)
 

@@ -270,9 +270,7 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
 
 
 def require_theta(
-    problem: LinearMPC,
-    observation_space: spaces.Space[Any],
-    observation: AffineObservation | None,
+    problem: LinearMPC, observation_space: spaces.Space[Any], observation: AffineObservation | None
 ) -> None:
     """Raise unless theta is what is observed, or what ``observation`` makes of it."""
     shape = observation_space.shape

@@ -210,10 +210,7 @@ def to_deviations(given: AffineObservation | None, problem: LinearMPC) -> Affine
 
 
 def with_extra_shown(
-    problem: LinearMPC,
-    space: spaces.Space[Any],
-    observation: AffineObservation | None,
-    extra: int,
+    problem: LinearMPC, space: spaces.Space[Any], observation: AffineObservation | None, extra: int
 ) -> tuple[LinearMPC, AffineObservation | None]:
     """Return the problem with extra signals, and the map from what an env shows to its theta."""
     box: Any = space

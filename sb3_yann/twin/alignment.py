@@ -59,10 +59,7 @@ class Logged:
     """
 
     def __init__(
-        self,
-        coordinates: Coordinates,
-        episodes: tuple[Episode, ...],
-        units_confirmed: bool = False,
+        self, coordinates: Coordinates, episodes: tuple[Episode, ...], units_confirmed: bool = False
     ) -> None:
         self.row = coordinates.row
         self.problem = self.row.problem

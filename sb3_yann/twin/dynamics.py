@@ -279,11 +279,7 @@ class Dynamics:
         return np.asarray(np.moveaxis(rows[..., self.row.state], 0, 2))
 
     def roll_out(
-        self,
-        act: Callable[[Array], Array],
-        starts: Array,
-        steps: int,
-        given: Array | None = None,
+        self, act: Callable[[Array], Array], starts: Array, steps: int, given: Array | None = None
     ) -> tuple[Array, Array]:
         """Return rows (steps + 1, members, batch, size) and inputs (steps, ...) of a policy.
 

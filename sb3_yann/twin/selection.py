@@ -338,10 +338,7 @@ def shrinkage_of(setting: Setting, problem: LinearMPC, k: int) -> Array:
 
 
 def candidates(
-    coordinates: Coordinates,
-    parts: Sequence[Episode],
-    kinds: Sequence[str],
-    drifts: bool = False,
+    coordinates: Coordinates, parts: Sequence[Episode], kinds: Sequence[str], drifts: bool = False
 ) -> list[Candidate]:
     """Return the model as it is, and polynomials of some kinds, the least free first."""
     kept = without_each_fold(parts)

@@ -341,12 +341,7 @@ class MeasuredDisturbance(Appending):
     appends = ("disturbance",)
 
     def __init__(
-        self,
-        env: Env,
-        low: ArrayLike,
-        high: ArrayLike,
-        key: str = "disturbance",
-        preview: int = 0,
+        self, env: Env, low: ArrayLike, high: ArrayLike, key: str = "disturbance", preview: int = 0
     ) -> None:
         check_int("preview", preview, 0, "It counts samples ahead.")
         super().__init__(env, low, high, rows=preview + 1)

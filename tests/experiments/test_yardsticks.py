@@ -8,14 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from experiments import optimum, yardsticks
-from experiments.yardsticks import (
-    cloned,
-    maximum_entropy,
-    residual_rl,
-    sb3_ddpg,
-    sb3_ppo,
-    sb3_td3,
-)
+from experiments.yardsticks import cloned, maximum_entropy, residual_rl, sb3_ddpg, sb3_ppo, sb3_td3
 from sample_plants import Recorder
 from sb3_yann_envs import clipped_pendulum, cstr, problems
 

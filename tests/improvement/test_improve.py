@@ -340,10 +340,7 @@ class Unseeded(Spring):
     ("make", "what"),
     [
         (Unseeded, r"the env does not repeat it.*wrap it in sb3_yann.wrappers.SeededGlobals"),
-        (
-            Short,
-            r"None of \d+ episodes of the MPC in the simulator begins with \d+ steps",
-        ),
+        (Short, r"None of \d+ episodes of the MPC in the simulator begins with \d+ steps"),
         (Strange, r"The env shows \(3,\) and takes \(1,\); theta of the MPC has"),
     ],
 )
@@ -573,11 +570,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
             "it may lose: to settle it, log held steps of u",
             "the MPC and log held steps",
         ),
-        (
-            "the twin",
-            "plans +0.00 %, too little to teach",
-            "keep the MPC: there is little to gain",
-        ),
+        ("the twin", "plans +0.00 %, too little to teach", "keep the MPC: there is little to gain"),
         ("the twin", "2 starts with violations", "log more episodes, of other starts"),
         (
             "the twin",

@@ -81,12 +81,7 @@ def _slack(floats: Array, whole: Integers, region: int, theta: Array, at: int, l
 
 @compiled()
 def _best(
-    floats: Array,
-    whole: Integers,
-    theta: Array,
-    at: int,
-    known: float,
-    disjoint: bool,
+    floats: Array, whole: Integers, theta: Array, at: int, known: float, disjoint: bool
 ) -> tuple[int, float]:
     """Return the first region whose smallest slack ties with the largest, and the largest.
 

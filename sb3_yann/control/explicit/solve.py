@@ -88,11 +88,7 @@ class ProgramUnits:
     """
 
     def __init__(
-        self,
-        program: ParametricQP,
-        u_min: Array,
-        u_max: Array,
-        timer: BudgetTimer | None = None,
+        self, program: ParametricQP, u_min: Array, u_max: Array, timer: BudgetTimer | None = None
     ) -> None:
         m = len(u_min)
         self.program = program

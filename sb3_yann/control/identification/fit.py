@@ -237,11 +237,7 @@ def words_for(found: Sequence[Frozen], names: Sequence[str], values: Sequence[Ar
 
 
 def _unexplained(
-    states: Sequence[Array],
-    driven: Sequence[Array],
-    i: int,
-    runs: list[Frozen],
-    long: list[Frozen],
+    states: Sequence[Array], driven: Sequence[Array], i: int, runs: list[Frozen], long: list[Frozen]
 ) -> list[Frozen]:
     """Return the long runs of a state that nothing but a frozen sensor explains.
 

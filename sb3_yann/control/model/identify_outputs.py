@@ -11,18 +11,9 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_range
 from sb3_yann.control.gains import Gains
-from sb3_yann.control.identification.dead_time import (
-    as_delays,
-    exact_memory,
-    memory_labels,
-)
+from sb3_yann.control.identification.dead_time import as_delays, exact_memory, memory_labels
 from sb3_yann.control.identification.fit import require_moving, system_of
-from sb3_yann.control.identification.innovations import (
-    TINY_RIDGE,
-    Innovations,
-    filtered,
-    shifted,
-)
+from sb3_yann.control.identification.innovations import TINY_RIDGE, Innovations, filtered, shifted
 from sb3_yann.control.identification.least_squares import WEAK, Regression, pole_note, regress
 from sb3_yann.control.identification.outputs import (
     RUN_AHEAD,

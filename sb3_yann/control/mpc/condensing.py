@@ -283,10 +283,7 @@ def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array, A
 
 
 def _constraints(
-    problem: MPCProblem,
-    prediction: _Prediction,
-    slacks: list[str],
-    softness: dict[str, Array],
+    problem: MPCProblem, prediction: _Prediction, slacks: list[str], softness: dict[str, Array]
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     N = problem.horizon
     blocks = len(problem.blocks)

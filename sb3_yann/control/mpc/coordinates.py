@@ -169,10 +169,7 @@ def _after(part: slice, size: int) -> slice:
 
 
 def theta_box(
-    layout: ThetaLayout,
-    given: tuple[Given, Given],
-    states: Bounds,
-    others: Sequence[Bounds],
+    layout: ThetaLayout, given: tuple[Given, Given], states: Bounds, others: Sequence[Bounds]
 ) -> Bounds:
     """Return the box of theta.
 

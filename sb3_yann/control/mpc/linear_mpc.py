@@ -47,11 +47,7 @@ from sb3_yann.control.mpc.groups import (
     parametric_names,
 )
 from sb3_yann.control.mpc.invariant_sets import KeptSet, completed, hard_rows, kept_set
-from sb3_yann.control.mpc.problem import (
-    MPCProblem,
-    Value,
-    value,
-)
+from sb3_yann.control.mpc.problem import MPCProblem, Value, value
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.online import LAWS, Law, OnlineLaw, OnlineLawWarning, steepness
 from sb3_yann.control.simulator import borrow
@@ -587,7 +583,7 @@ def _warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
         warn(
             f"x_ss = {model.x_ss.tolist()} with u_ss = {model.u_ss.tolist()} is no steady state: "
             f"there the plant moves by {model.drift.tolist()} in one sample, and the law will rest "
-            "beside its references. Identify it with an x_ss and u_ss at which it rests.",
+            "beside its references. Identify it with an x_ss and u_ss at which it rests."
         )
 
 
@@ -601,7 +597,7 @@ def _warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> No
         warn(
             f"SoftBounds.x softens the bounds {lower[i]:g} to {upper[i]:g} of x[{i}], but theta_min"
             f" = {low[i]:g} and theta_max = {high[i]:g} do not exceed them: the law ends there. "
-            "Give theta_min and theta_max the states from which it is to come back.",
+            "Give theta_min and theta_max the states from which it is to come back."
         )
 
 
@@ -651,7 +647,7 @@ def _warn_of_misread_bounds(problem: MPCProblem) -> None:
                 f"{name}_min = {low:g} and {name}_max = {high:g} of entry {i} leave out the "
                 f"operating point, {point:g}, and hold 0. Bounds are what the plant shows. If "
                 f"these are deviations, pass {name}_min = {low + point:g} and {name}_max = "
-                f"{high + point:g}, or leave x_ss and u_ss out of the model.",
+                f"{high + point:g}, or leave x_ss and u_ss out of the model."
             )
             return
     has_point = bool(np.any(model.x_ss) or np.any(model.u_ss))
@@ -666,7 +662,7 @@ def _warn_of_misread_bounds(problem: MPCProblem) -> None:
         low, high, point = (each[i] for each in ranges["u"])
         warn(
             f"u_min = {low:g} and u_max = {high:g} leave out {labels_of(model)[1][i]} = {point:g}, "
-            f"the operating point: the law cannot rest there. {cure}",
+            f"the operating point: the law cannot rest there. {cure}"
         )
     if has_constants:
         return
@@ -675,7 +671,7 @@ def _warn_of_misread_bounds(problem: MPCProblem) -> None:
         warn(
             f"{labels_of(model)[0][i]} = {point:g}, the operating point, lies outside its "
             f"bounds, {low:g} to {high:g}: the law cannot rest there. Look at the "
-            "order of the states.",
+            "order of the states."
         )
 
 

@@ -14,14 +14,7 @@ import general_problems as general
 from benchmarks.suite import WRONG, Outcome, compare, examine, names
 from benchmarks.suite_problems import SUITE, quietly
 from fresh_process import run_python
-from sample_problems import (
-    DOUBLE_INTEGRATOR,
-    PROBLEMS,
-    benchmark,
-    box_points,
-    small_mpc,
-    solved,
-)
+from sample_problems import DOUBLE_INTEGRATOR, PROBLEMS, benchmark, box_points, small_mpc, solved
 from sb3_yann import LinearModel, LinearMPC, SoftBounds, Terminal
 from sb3_yann.control import ExplicitLimitError, PiecewiseAffine
 from sparse_qp import online_answers, relative_error
