@@ -33,10 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.traceback:
             raise
         kind = "" if isinstance(error, OSError | TypeError | ValueError) else type(error).__name__
-        print(
-            f"sb3-yann {options.command}: {kind}{': ' * bool(kind)}{said_by(error)}",
-            file=sys.stderr,
-        )
+        said = f"{kind}{': ' * bool(kind)}{said_by(error)}"
+        print(f"sb3-yann {options.command}: {said}", file=sys.stderr)
         return 1
     return 0
 

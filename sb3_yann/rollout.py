@@ -162,10 +162,8 @@ def evaluate(
     """
 
     def check(env: Any) -> None:
-        if isinstance(env, VectorEnv):
-            _require_same_inputs(policy, env.single_action_space)
-        else:
-            _require_same_inputs(policy, env.action_space)
+        _require_same_inputs(policy, getattr(env, "single_action_space", env.action_space))
+        if not isinstance(env, VectorEnv):
             _require_state_shown(policy, env)
 
     return rollout(as_controller(policy), env, seeds, starts, check=check)
@@ -281,10 +279,8 @@ class _Envs:
 
     def reset(self) -> NDArray[Any]:
         """Return the first observations (k, n)."""
-        shown = (
-            self._asked(i, self.envs[i].reset, seed=seed, options=options)[0]
-            for i, (seed, options) in enumerate(self.resets)  # the last lot may be smaller
-        )
+        starts = enumerate(self.resets)  # the last lot may be smaller
+        shown = (self._asked(i, self.envs[i].reset, seed=s, options=o)[0] for i, (s, o) in starts)
         # A copy of each: an env may write its next observation into the same array.
         return np.stack([*map(np.array, shown)])
 

@@ -174,9 +174,7 @@ def _other_observation(layer: Any) -> str:
     """Return the map that undoes a library's wrapper, empty where there is nothing to undo."""
     names = _library_names(layer)
     if "NormalizeObservation" in names:  # a frozen one: the others have been refused
-        spread = np.sqrt(layer.obs_rms.var + layer.epsilon)
-        mean = np.ravel(layer.obs_rms.mean).tolist()
-        return f"AffineObservation.normalized({mean}, {np.ravel(spread).tolist()})"
+        return _normalized(layer.obs_rms.mean, np.sqrt(layer.obs_rms.var + layer.epsilon))
     if "RescaleObservation" in names:
         shown, meant = (
             getattr(each, "single_observation_space", each.observation_space)
@@ -186,8 +184,7 @@ def _other_observation(layer: Any) -> str:
             return ""
         low, high = (np.asarray(each, np.float64) for each in (meant.low, meant.high))
         scale = (high - low) / (np.asarray(shown.high, np.float64) - shown.low)
-        mean = np.ravel(low - scale * shown.low).tolist()
-        return f"AffineObservation.normalized({mean}, {np.ravel(scale).tolist()})"
+        return _normalized(low - scale * shown.low, scale)
     if names & {"VecFrameStack", "FrameStackObservation"}:
         held = vars(layer)
         frames = held.get("n_stack") or held.get("stack_size") or held["stacked_obs"].n_stack
@@ -195,6 +192,10 @@ def _other_observation(layer: Any) -> str:
         size = int(np.prod(inner.observation_space.shape))
         return f"AffineObservation.newest_frame({size}, {frames})" if frames > 1 else ""
     return ""
+
+
+def _normalized(mean: Any, std: Any) -> str:
+    return f"AffineObservation.normalized({np.ravel(mean).tolist()}, {np.ravel(std).tolist()})"
 
 
 class _Judged(type):

@@ -179,11 +179,10 @@ def _on_all_known(evidence: Evidence, play: Play) -> tuple[Evidence, Verdict]:
         evidence = evidence.known_up_to(len(starts.seeds), play)
     except Unplayable as error:
         return evidence, Verdict(str(error), breaks_limit=True)
-    names = starts.seeds
-    verdict = no_worse(
-        evidence.scores, mpc, mpc, starts.tolerance, names=names, n_hard=starts.n_hard
+    scores = evidence.scores
+    return evidence, no_worse(
+        scores, mpc, mpc, starts.tolerance, names=starts.seeds, n_hard=starts.n_hard
     )
-    return evidence, verdict
 
 
 def try_before_training(
@@ -331,9 +330,8 @@ def _with_hard_starts(
     Others take the place of the new ones.
     """
     hard = np.zeros(1, dtype=np.int64) if scores is None else new.hardest(scores)
-    return replace(
-        evidence, starts=evidence.starts.with_hard(new, hard), new=None, confirmed=None
-    ), hard
+    starts = evidence.starts.with_hard(new, hard)
+    return replace(evidence, starts=starts, new=None, confirmed=None), hard
 
 
 def _after_loss(evidence: Evidence, new: Starts, scores: Scores | None, play: Play) -> Evidence:
@@ -379,12 +377,10 @@ def _parts(
         if kept.any() and np.any(changed & visits.any(axis=0) & ~kept):
             yield accepted.with_regions(candidate, np.flatnonzero(kept).tolist()), 0.0
     if rule.backtrack:
+        learned = accepted.has_learned()
         for share in PARTS_OF_THE_WAY:
-            from_mpc = not accepted.has_learned()
-            yield (
-                candidate.shrunk(share) if from_mpc else accepted.part_way(candidate, share),
-                share,
-            )
+            part = accepted.part_way(candidate, share) if learned else candidate.shrunk(share)
+            yield part, share
 
 
 def _decision(

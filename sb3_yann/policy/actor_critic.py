@@ -84,9 +84,8 @@ class CriticOptions:
         if self.prediction_model is not None and self.kind == "state_action":
             raise ValueError("prediction_model is for kind='afterstate', not for 'state_action'.")
         if self.value_scale is not None:
-            check_positive(
-                "value_scale", self.value_scale, "It multiplies the network, or is None."
-            )
+            hint = "It multiplies the network, or is None."
+            check_positive("value_scale", self.value_scale, hint)
         check_positive("reward_scale", self.reward_scale, "Give 1 for the cost as it is.")
         check_number("reward_offset", self.reward_offset)
 

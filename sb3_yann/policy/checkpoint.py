@@ -284,15 +284,13 @@ def _require_same_theta(old: LinearMPC, new: LinearMPC) -> None:
 
 def _lost(model: BaseAlgorithm, policy: StartsAsMPC) -> list[str]:
     """Return in words what a new model has not got, of what was learnt."""
-    lost = []
-    if int(policy.critic_updates):
-        lost.append("the critic, which is of the old law and costs")
     buffer: Any = getattr(model, "replay_buffer", None)
-    if buffer is not None and buffer.size():
-        lost.append("the replay buffer, whose rewards are of before")
-    if getattr(model, "guard_state", None) is not None:
-        lost.append("the guard's accepted policies")
-    return lost
+    learnt = {
+        "the critic, which is of the old law and costs": int(policy.critic_updates) > 0,
+        "the replay buffer, whose rewards are of before": buffer is not None and buffer.size() > 0,
+        "the guard's accepted policies": getattr(model, "guard_state", None) is not None,
+    }
+    return [what for what, is_there in learnt.items() if is_there]
 
 
 @th.no_grad()

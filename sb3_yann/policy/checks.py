@@ -14,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from sb3_yann._validation import Array, check_int, warn
+from sb3_yann._validation import Array, check_array, check_int, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
@@ -325,15 +325,11 @@ def as_box(
     """Return the edges of a box of theta, each (size,), or None for both."""
     if low is None and high is None:
         return None, None
-    edges = [np.asarray(each, np.float64) for each in (low, high)]
-    if any(each.shape != (size,) or not np.all(np.isfinite(each)) for each in edges):
-        raise ValueError(
-            f"low = {low!r} and high = {high!r} must be the edges of a box of theta: {size} "
-            "finite entries each, or None for both."
-        )
-    if np.any(edges[0] > edges[1]):
+    given: dict[str, Any] = {"low": low, "high": high}
+    bottom, top = (check_array(name, edge, (size,)) for name, edge in given.items())
+    if np.any(bottom > top):
         raise ValueError(f"low = {low!r} must not be above high = {high!r}.")
-    return edges[0], edges[1]
+    return bottom, top
 
 
 FIXED = LawLayer, AfterstateValue, QuadraticStateActionValue, AffineFeatures

@@ -29,13 +29,8 @@ from sb3_yann._validation import (
     check_range,
     warn,
 )
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearMPC, wrapper_stack
 from sb3_yann.control.online import LAWS
-from sb3_yann.control.wrapper_stack import (
-    require_state_shown,
-    require_theta_order,
-    warn_of_moving_rewards,
-)
 from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import checks, sb3_hooks
@@ -175,8 +170,9 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             activation_fn=checks.as_activation(activation_fn),
             **checks.with_fused_adam(sb3_kwargs),
         )
-        self._builder = _as_reference(algorithm)
-        self._met = _as_reference(None if algorithm is None else algorithm.get_env())
+        self._builder: Any = algorithm and weakref.ref(algorithm)
+        env = algorithm and algorithm.get_env()
+        self._met: Any = env and weakref.ref(env)
         if algorithm is not None:
             watch_buffer(algorithm)
 
@@ -189,12 +185,12 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         """Raise unless the observations of an algorithm's env are what the policy takes."""
         env = None if algorithm is None else algorithm.get_env()
         if env is not None:  # first: wrappers say why a size is another one
-            require_state_shown(env, self.observation_given)
-            warn_of_moving_rewards(env)
+            wrapper_stack.require_state_shown(env, self.observation_given)
+            wrapper_stack.warn_of_moving_rewards(env)
         checks.require_theta(self.problem, space, self.observation)
         checks.require_inverse_normalization(self.problem, algorithm, self.observation)
         if env is not None and not self.observation_given:
-            require_theta_order(env, self.problem)
+            wrapper_stack.require_theta_order(env, self.problem)
 
     def _meets_another_env(self) -> None:
         """Do the same where `set_env` has given the algorithm another env since.
@@ -394,10 +390,6 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             **{f"{name}_lr_mult": multiple for name, multiple in self.lr_mult.items()},
             "critic": self.critic_options,
         }
-
-
-def _as_reference(value: Any) -> weakref.ref[Any] | None:
-    return None if value is None else weakref.ref(value)
 
 
 def _as_correction(value: float | None) -> float | None:

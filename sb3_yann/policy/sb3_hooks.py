@@ -170,9 +170,8 @@ def warn_of_random_actions(algorithm: Any) -> None:
     if count > 0 and algorithm.num_timesteps == algorithm._num_timesteps_at_start:
         warn(
             f"The first {count} actions of this learn are random, evenly over the whole range, "
-            f"limits or not: learning_starts = {algorithm.learning_starts} of the "
-            f"{type(algorithm).__name__}. For the policy's own from the first step on, pass "
-            "learn(..., callback=NoActionNoise()), or learning_starts=0 to the model.",
+            "limits or not. For the policy's own from the first step on, pass learn(..., "
+            f"callback=NoActionNoise()), or learning_starts=0 to the {type(algorithm).__name__}."
         )
 
 

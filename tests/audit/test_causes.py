@@ -251,8 +251,7 @@ def test_one_step_that_is_lost_does_not_hide_what_is_wrong_in_the_others() -> No
 def test_a_vec_normalize_that_is_switched_on_later_is_named(switch, cause) -> None:
     env = VecNormalize(DummyVecEnv([plant]), training=False, norm_reward=False, clip_obs=np.inf)
     options = {"problem": MPC, "observation": AffineObservation.from_vec_normalize(env)}
-    still = {"gradient_steps": 0, "learning_starts": 0}
-    model = DDPG(YannPolicy, env, policy_kwargs=options, **still)
+    model = DDPG(YannPolicy, env, policy_kwargs=options, gradient_steps=0, learning_starts=0)
     setattr(env, switch, True)
     with pytest.warns(CostMismatchWarning, match=f"Set venv.{switch} = False"):
         model.learn(100, callback=(audit := CostAudit()))  # NoActionNoise would refuse it

@@ -246,7 +246,7 @@ def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:
     model.policy.confine_correction(None, None)
     assert not np.array_equal(again.predict(theta)[0], model.predict(theta)[0])
     for low, high in ((half, -half), (None, half), (half[:2], half), (-np.inf * half, half)):
-        with pytest.raises(ValueError, match="low = "):
+        with pytest.raises(ValueError, match="low"):
             model.policy.confine_correction(low, high)
 
 
