@@ -5,13 +5,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from torch import nn
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback, Mask
@@ -19,7 +17,6 @@ from sb3_yann.compare import RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation import change_in_percent
 from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
-from sb3_yann.networks import RowAdam
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.plan import PAUSE, Planning, Plans, follow, slopes_of_inputs
 from sb3_yann.policy.policies import StartsAsMPC
@@ -326,7 +323,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
             break
         prices = np.where(last.costs > mpc + room, 1 + price, 1.0)[chosen]
         lower = _downhill(layer, teacher, scenarios.of(chosen), last.of(chosen), prices, size)
-        _fit(layer, *lower, nn.functional.mse_loss, teacher.rng, updates)
+        _fit(layer, *lower, np.inf, teacher.rng, updates)
     layer.load_state_dict(best)
     return saved
 
@@ -376,30 +373,24 @@ def fit_layer(
     wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
     to = th.as_tensor(wanted[finite], dtype=th.float32)
-    _fit(layer, at, to, partial(nn.functional.smooth_l1_loss, beta=HUBER), rng, updates)
+    _fit(layer, at, to, HUBER, rng, updates)
 
 
 def _fit(
     layer: LawLayer,
     at: th.Tensor,
     to: th.Tensor,
-    loss_of: Callable[[th.Tensor, th.Tensor], th.Tensor],
+    largest: float,
     rng: np.random.Generator,
     updates: int,
 ) -> None:
-    """Take steps of Adam on the loss of actions (rows, m) at theta (rows, n_theta)."""
-    kind = RowAdam if layer.row_gradients else partial(th.optim.Adam, fused=True)
-    optimizer: Any = kind(layer.network.weights(), lr=RATE)
-    act = layer.on_rows(at)
+    """Fit a layer to actions (rows, m) at theta (rows, n_theta), see :meth:`LawLayer.descend`."""
     what = "the policy learns: steps of Adam"
-    for k in bar(what, range(updates if len(at) else 0), timed=True):
-        optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
-        chosen = rng.integers(len(at), size=BATCH)
-        optimizer.zero_grad()
-        loss = loss_of(act(chosen), to[chosen])
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-    optimizer.zero_grad()
+    steps = (
+        (rng.integers(len(at), size=BATCH), RATE * (1 - k / updates))
+        for k in bar(what, range(updates if len(at) else 0), timed=True)
+    )
+    layer.descend(at, to, largest, steps)
 
 
 def policy_of(layer: LawLayer, problem: LinearMPC) -> Feedback:

@@ -6,7 +6,7 @@ a network for each region, as in the paper. `SharedYannLayer` has one network fo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from typing import Any
 
@@ -19,7 +19,12 @@ from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.mpc.invariant_sets import KeptSet
 from sb3_yann.control.online import Law
-from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
+from sb3_yann.networks.zero_output import (
+    Activation,
+    RowAdam,
+    ZeroOutputNetwork,
+    register_constants,
+)
 from sb3_yann.units import FLOAT32_ROUNDING, KEPT_ROUNDING
 
 ChangeBounds = tuple[Array, Array]
@@ -145,15 +150,34 @@ class LawLayer(nn.Module):
         own = network.weights(), network.pinned_array
         return layer_on_cpu(pack, theta, self.constants, *own, self.row_gradients)
 
-    def on_rows(self, theta: th.Tensor) -> Callable[[NDArray[np.int64]], th.Tensor]:
-        """Return the layer as a function of indices of rows of theta, whose law is found once."""
-        if theta.device.type != "cpu" or not self.network.compiles:
-            return lambda rows: self(theta[rows])
-        floats, whole, inputs, points = self._for_loops(theta.double().numpy())
-        # Of numpy: rows of a tensor take ten times as long to index.
-        return lambda rows: self._compiled(
-            points[rows], lambda at: (floats, whole, inputs[rows], at)
-        )
+    def descend(
+        self,
+        theta: th.Tensor,
+        wanted: th.Tensor,
+        largest: float,
+        steps: Iterable[tuple[NDArray[np.int64], float]],
+    ) -> None:
+        """Take steps of Adam towards actions (rows, m) that are wanted at theta (rows, n).
+
+        Each step names rows and a rate. Errors count by their square, beyond the ``largest`` by
+        their size: Huber's loss. Networks without data stay as they are.
+        """
+        network = self.network
+        weights = network.weights()
+        if theta.device.type == "cpu" and network.compiles:
+            from sb3_yann.networks._kernels.yann_layer import descend
+
+            own = self.constants, weights, network.pinned_array
+            descend(self._for_loops, theta, wanted.numpy(), largest, steps, *own)
+            return
+        optimizer = RowAdam(weights)
+        for rows, optimizer.param_groups[0]["lr"] in steps:
+            optimizer.zero_grad()
+            actions = self(theta[rows])
+            errors = (actions.detach() - wanted[rows]).clamp(-largest, largest)
+            actions.backward(errors / len(rows))
+            optimizer.step()
+        optimizer.zero_grad()
 
     @th.no_grad()
     def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -251,7 +251,7 @@ def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("kind", [YannLayer, SharedYannLayer])
-def test_a_frozen_layer_and_one_on_rows_act_as_the_layer(kind: Any) -> None:
+def test_a_frozen_layer_acts_and_a_compiled_one_descends_as_the_layer(kind: Any) -> None:
     layer = kind(problem().explicit(), (8, 8), max_correction=0.3)
     shake(layer, 0.3)
     layer.confine(0.3 * problem().theta_min, 0.4 * problem().theta_max)
@@ -260,7 +260,14 @@ def test_a_frozen_layer_and_one_on_rows_act_as_the_layer(kind: Any) -> None:
     with th.no_grad():
         acts = layer(th.as_tensor(theta)).numpy()
         np.testing.assert_array_equal(layer.frozen()(theta), acts)
-        some = np.array([7, 3, 40])
-        np.testing.assert_allclose(layer.on_rows(th.as_tensor(theta))(some), acts[some], atol=1e-6)
     with pytest.raises(ValueError, match=r"theta has shape \(4, 3\), expected \(batch, 2\)"):
         layer.frozen()(np.zeros((4, 3)))
+    at = th.as_tensor(theta)[th.isfinite(th.as_tensor(acts[:, 0]))]
+    wanted = layer(at).detach().neg()
+    own = copy.deepcopy(layer)
+    own.network.has_loops = False
+    for each in (layer, own):
+        each.descend(at, wanted, 0.1, [(np.arange(k, k + 40), 1e-3) for k in range(9)])
+    after = layer(at).detach()
+    assert 1e-3 < np.abs(after + wanted).max() < 0.1
+    np.testing.assert_allclose(after, own(at).detach(), atol=1e-6)

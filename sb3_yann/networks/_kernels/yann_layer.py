@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -319,6 +319,65 @@ def frozen_layer(
         return _actions([*pack(_rows(theta, weights[0])), *rest])[0]
 
     return act
+
+
+@compiled(
+    "void(float32[:, ::1], float32[:, ::1], int64[::1], float32[:, :, ::1], int64[::1], float64)"
+)
+def _adam(
+    weights: Single,
+    gradients: Single,
+    used: Integers,
+    moments: Single,
+    taken: Integers,
+    rate: float,
+) -> None:
+    """Take a step of Adam for the rows in use of weights (p, size), as `RowAdam` does.
+
+    ``moments`` (2, p, size) are the averages of a row's gradients and of their squares, ``taken``
+    (p,) how many steps it has done with this one.
+    """
+    first = np.float32(0.9)
+    second = np.float32(0.999)
+    for s in range(len(used)):
+        i = used[s]
+        size = np.float32(rate / (1 - 0.9 ** taken[i]))
+        scale = np.float32(1 / (1 - 0.999 ** taken[i]))
+        for j in range(weights.shape[1]):
+            g = gradients[s, j]
+            mean = g + first * (moments[0, i, j] - g)
+            square = g * g + second * (moments[1, i, j] - g * g)
+            moments[0, i, j] = mean
+            moments[1, i, j] = square
+            weights[i, j] -= size * mean / (np.sqrt(square * scale) + np.float32(1e-8))
+
+
+def descend(
+    pack: Callable[[Array], PackedLaw],
+    theta: th.Tensor,
+    wanted: Single,
+    largest: float,
+    steps: Iterable[tuple[Integers, float]],
+    constants: Constants,
+    weights: tuple[th.Tensor, ...],
+    pinned: Single,
+) -> None:
+    """Take steps of Adam with a layer, see `LawLayer.descend`; its law is found once."""
+    floats, whole, inputs, points = pack(_rows(theta, weights[0]))
+    arrays = [to_numpy(each) for each in weights]  # the same memory
+    flat = [each.reshape(len(each), -1) for each in arrays]
+    moments = [np.zeros((2, *each.shape), np.float32) for each in flat]
+    taken = np.zeros(len(pinned), np.int64)
+    for rows, rate in steps:
+        given: list[Any] = [floats, whole, inputs[rows], points[rows], *constants, *arrays, pinned]
+        actions, kept = _actions(given)
+        used = kept[1]
+        slopes: Any = np.clip(actions - wanted[rows], -largest, largest) / np.float32(len(rows))
+        gradients = [np.zeros((len(used), *each.shape[1:]), np.float32) for each in arrays]
+        backward(slopes, False, *given[-6:], *kept, *gradients)
+        taken[used] += 1
+        for own, by, average in zip(flat, gradients, moments, strict=True):
+            _adam(own, by.reshape(len(by), -1), used, average, taken, rate)
 
 
 def _rows(theta: Any, nodes: Any) -> Array:
