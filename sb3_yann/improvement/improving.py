@@ -660,7 +660,7 @@ class _Work:
     def _rounds(
         self, simulator: Simulator, trial: SimulatorTrial, best: float
     ) -> tuple[LearntModel, str]:
-        """Fit, plan and imitate until the simulator shows what plans gain, or no more than before."""
+        """Fit, plan and imitate until the simulator shows what plans gain, or nothing more."""
         lost: list[Any] = []
         weights = self.weights()
         least = best
