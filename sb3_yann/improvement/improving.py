@@ -695,7 +695,7 @@ class _Work:
                     weights = self.weights()
                     note = ""
             same = self._from_starts_of(trial, model)
-            if same is None:
+            if same is None or number + 1 == self.rounds:
                 continue
             if useful and found.accepted:
                 same.show()
