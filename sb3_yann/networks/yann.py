@@ -122,7 +122,10 @@ class LawLayer(nn.Module):
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
         network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
         if theta.device.type == "cpu" and not theta.requires_grad and network.compiles:
-            return self._compiled(theta, self._for_loops)
+            from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
+
+            own = network.weights(), network.pinned_array
+            return layer_on_cpu(self._for_loops, theta, self.constants, *own, self.row_gradients)
         theta = clamp_theta(theta, self.clamped)
         law, correction = self._correction(theta)
         if self.reach is not None:
@@ -142,13 +145,6 @@ class LawLayer(nn.Module):
         given = law.detach(), theta.detach(), adds, rows, bounds, self.constants[3]
         kept: th.Tensor = _Kept.apply(output, *given)  # type: ignore[no-untyped-call]
         return kept
-
-    def _compiled(self, theta: th.Tensor | Array, pack: Callable[[Array], Any]) -> th.Tensor:
-        from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
-
-        network: Any = self._modules["network"]
-        own = network.weights(), network.pinned_array
-        return layer_on_cpu(pack, theta, self.constants, *own, self.row_gradients)
 
     def descend(
         self,

@@ -488,14 +488,11 @@ def test_a_fit_takes_the_way_of_most_plans_and_reaches_bounds() -> None:
     assert np.mean(found[rows[:, 0] > 0.6] == 1.0) > 0.9
 
 
-def test_a_twin_takes_no_steps_of_a_simulator() -> None:
-    with pytest.raises(ValueError, match="max_steps = 9 bounds the steps of a simulator, and a tw"):
-        improve(model_of(), twin_of(), max_steps=9)
-
-
-def test_a_twin_that_is_not_trusted_is_refused() -> None:
+def test_a_twin_that_is_not_trusted_is_refused_and_so_are_steps_of_a_simulator() -> None:
     model = model_of()
     before = bits(model)
+    with pytest.raises(ValueError, match="max_steps = 9 bounds the steps of a simulator, and a tw"):
+        improve(model, twin_of(), max_steps=9)
     with pytest.raises(UntrustedTwinError, match="There is one episode"):
         improve(model, twin_of(episodes=1))
     with pytest.raises(ValueError, match=r"Fit the twin with model\.policy\.problem"):
