@@ -39,6 +39,7 @@ Reading = tuple[Array, Array]
 """A matrix M (n, n) and an offset v (n,): what is shown as x, in plant units, may mean M x + v."""
 SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
+FAR = 3.5  # times as far or as little as the model says: a nonlinear plant alone varies more
 SIGN_STEPS = 10  # steps for which it is pushed where outputs are read
 LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
 EXPLAINED_REWARD = 0.95
@@ -175,7 +176,7 @@ def warn_of_signs(
     theta: Callable[[Array], Array] = np.asarray,
     inputs: Callable[[Array], Array] = np.asarray,
 ) -> None:
-    """Warn where an input moves the states against the model, in the first step of some starts.
+    """Warn where an input moves the states against the model or far otherwise, in the first step.
 
     Two steps from one start differ by that input alone: neither noise that the seed repeats, nor
     what is not linear in the states, gets in. It costs a step of the env for each input and start.
@@ -225,11 +226,19 @@ def warn_of_signs(
             size = float(np.sum(expected**2))
             if size > 0 and np.linalg.norm(effect) > LEAST_EFFECT:
                 gains.append(float(np.sum(effect * expected)) / size)
-        if len(gains) == len(starts) > 0 and max(gains) < 0:
+        if not len(gains) == len(starts) > 0:
+            continue
+        found = f"{np.median(gains):.2g} times as far in {when}, from {len(gains)} starts"
+        if max(gains) < 0:
             warn(
-                f"{name} moves the env against the sign of the model's B: {np.median(gains):.2g} "
-                f"times as far in {when}, from {len(gains)} starts. The MPC steers the wrong way. "
-                "Look at the sign and the order of the actions, and at B.",
+                f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "
+                "the wrong way. Look at the sign and the order of the actions, and at B.",
+            )
+        elif min(gains) > FAR or (0 < min(gains) and max(gains) < 1 / FAR):
+            warn(
+                f"{name} moves the env otherwise than the model's B says: {found}. Is a step of "
+                f"the env the model's dt, {model.step_length}, and the input in the "
+                "same unit? Else identify the model anew.",
             )
 
 

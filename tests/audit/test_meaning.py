@@ -257,6 +257,8 @@ def test_a_guard_names_an_input_of_the_other_sign(gains: Any) -> None:
 @pytest.mark.parametrize("plant", [{"gains": (3, 0.2)}, {"gains": (1, 1), "late": True}])
 def test_another_gain_and_dead_time_are_no_other_sign(plant: Any) -> None:
     assert not of_signs(lambda: Plant(**plant))
+    rest = said(lambda: guarded(STEERED, lambda: StageCost(Plant(**plant), STEERED)), "otherwise")
+    assert ["heater" in each for each in rest] == [True] * (plant["gains"] == (3, 0.2))
 
 
 def test_headroom_tells_it_too() -> None:
