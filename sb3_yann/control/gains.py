@@ -111,7 +111,8 @@ def count_integrators(A: Array, deviation: Callable[[Array], float] = lambda R: 
     """Return how many poles are 1, or cannot surely be told from it.
 
     ``deviation(R)`` is the standard deviation of ``trace(R dA)``. With the inverse R of ``I - A``
-    that is the relative one of ``det(I - A)``: poles that repeat do not spoil it.
+    that is the relative one of ``det(I - A)``: poles that repeat do not spoil it. Of a pole's share
+    in R it is its own: poles that are farther away do not count with it.
     """
     values = np.linalg.eigvals(A)
     values = values[np.argsort(np.abs(values - 1), kind="stable")]
@@ -119,9 +120,12 @@ def count_integrators(A: Array, deviation: Callable[[Array], float] = lambda R: 
     known = projector(A, near)
     count = 0
     while count < near:
+        following = count + (2 if values[count].imag else 1)
         if abs(values[count] - 1) > ON_CIRCLE:
-            R = settled(A, projector(A, count)) @ known
-            if not deviation(R) * SURE_ERRORS > 1:
+            before = projector(A, count)
+            R = settled(A, before)
+            own = projector(A, following) - before
+            if not min(deviation(R @ known), deviation(R @ own)) * SURE_ERRORS > 1:
                 break
-        count += 2 if values[count].imag else 1
+        count = following
     return count

@@ -16,6 +16,7 @@ from sb3_yann._archive import digest_of
 from sb3_yann._validation import Array
 from sb3_yann.audit.meaning import misread_states
 from sb3_yann.compare import (
+    COST_ROUNDING,
     INPUT_STEP,
     RULE,
     Difference,
@@ -110,7 +111,7 @@ def loops_part(subject: Subject) -> Part:
         for seed, a, b, v, w in each
     ]
     head = ["seed", "MPC", "policy", "change", "MPC: violations", "policy: violations"]
-    apart = np.abs(policy.costs - mpc.costs) > FLOAT32_ROUNDING * np.abs(mpc.costs)
+    apart = np.abs(policy.costs - mpc.costs) > COST_ROUNDING * np.abs(mpc.costs)
     episodes = table(head, single[:1000])
     if not apart.any() and np.array_equal(mpc.violations, policy.violations):
         episodes = paragraph("Each costs what it costs with the MPC, and violates as often.")
@@ -171,7 +172,7 @@ def statistics_part(subject: Subject) -> Part:
     passed: bool | None = None
     text = f"On average the policy costs {abs(mean):.2f} % {'less' if mean < 0 else 'more'} than "
     text += "the MPC. One episode says nothing about others."
-    if np.all(np.abs(change) <= FLOAT32_ROUNDING * scale):
+    if np.all(np.abs(change) <= COST_ROUNDING * scale):
         text = "From these starts the policy costs what the MPC costs."
     elif count > 1:
         width = 100 * Difference.relative(change, mpc.costs).room(RULE.significance)
@@ -184,7 +185,7 @@ def statistics_part(subject: Subject) -> Part:
         )
         if passed is None:
             text += " That it differs from the MPC at all is not shown."
-    rounding = FLOAT32_ROUNDING * np.abs(mpc.costs)
+    rounding = COST_ROUNDING * np.abs(mpc.costs)
     less = int(np.sum(change < -rounding))
     more = int(np.sum(change > rounding))
     worst = int(np.argmax(change))
@@ -225,7 +226,7 @@ def _beyond(subject: Subject) -> Finding:
         taken = 'The env takes no reset(options={"state": x})'
         return Finding("note", f"{text} {taken}: other starts are not tried.")
     change = relative_costs(policy.costs - mpc.costs, mpc.costs)
-    more = int(np.sum(change > FLOAT32_ROUNDING))
+    more = int(np.sum(change > COST_ROUNDING))
     reason = no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
     text += (
         f" From {count} states beyond, anywhere in the box of parameters, the cost changes by "
