@@ -531,10 +531,18 @@ def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np
             )
     spans = [np.diff(each) for each in times]
     whole = np.concatenate(spans)
-    if 2 * np.sum(np.abs(whole - dt) > 0.1 * dt) > len(whole):
+    uneven = np.abs(whole - dt) > 0.1 * dt
+    if 2 * np.sum(uneven) > len(whole):
+        middle = float(np.nanmedian(whole))
+        if abs(middle - dt) <= 0.1 * dt:
+            raise ValueError(
+                f"{np.mean(uneven):.0%} of the log's steps differ from dt = {dt:g} by more than a "
+                "tenth, and a model needs even ones. Put the readings on a grid of dt first, as "
+                "historians and pandas' resample do."
+            )
         raise ValueError(
-            f"dt = {dt:g}, but a step of the log takes {np.nanmedian(whole):g} (the median). Give "
-            'time and dt in the same unit; of time stamps dt is in seconds, or in time_unit="h".'
+            f"dt = {dt:g}, but a step of the log takes {middle:g} (the median). Give time and dt "
+            'in the same unit; of time stamps dt is in seconds, or in time_unit="h".'
         )
     return [np.abs(each - dt) <= 0.1 * dt for each in spans]
 
