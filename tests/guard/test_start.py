@@ -325,6 +325,7 @@ class Door(gym.Env):
         return self.x.astype(np.float32), -cost, out and not self.cuts, out and self.cuts, info
 
 
+@pytest.mark.filterwarnings("ignore:.* moves the env otherwise")  # a tenth as far
 @pytest.mark.parametrize(
     ("success", "cuts"),
     [(False, False), (False, True), (True, False), (True, True)],
@@ -339,9 +340,8 @@ def test_an_episode_that_ends_sooner_is_refused_unless_its_end_is_a_success(succ
     first = guard.decisions[0]
     assert first.candidate_cost < first.mpc_cost
     assert first.verdict == ("accepted" if success else "rejected")
-    if not success:
-        assert "or that ends sooner" in first.reason and "is_success" in first.reason
-        assert is_mpc(model)
+    told = "or that ends sooner" in first.reason and "is_success" in first.reason
+    assert success or (told and is_mpc(model))
 
 
 class Endless(Slide):
