@@ -226,7 +226,7 @@ def warn_of_signs(
             size = float(np.sum(expected**2))
             if size > 0 and np.linalg.norm(effect) > LEAST_EFFECT:
                 gains.append(float(np.sum(effect * expected)) / size)
-        if not len(gains) == len(starts) > 0:
+        if not starts or len(gains) < len(starts):
             continue
         found = f"{np.median(gains):.2g} times as far in {when}, from {len(gains)} starts"
         if max(gains) < 0:

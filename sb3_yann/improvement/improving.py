@@ -63,7 +63,7 @@ from sb3_yann.units import FLOAT32_ROUNDING
 
 LEAST = 2e-4  # what a policy must gain in a twin, relative to the MPC's mean cost
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
-PROMISED = 0.95  # share of what plans gain in the model that ends the rounds, of the same starts
+PROMISED = 0.95  # share of a gain in the model that the simulator must show from the same starts
 LITTLE_MORE = 0.02  # share of a gain by which another round must raise it
 OTHERS = 9  # scenarios beside each that is planned, in which a policy shows what it has not learnt
 TRIES = 3  # confirmations of a policy that is taught what it has lost
@@ -694,27 +694,21 @@ class _Work:
                     # Ten starts may hold none that gains: the confirmation has others.
                     weights = self.weights()
                     note = ""
-            same = self._from_starts_of(trial, model)
-            if same is None or number + 1 == self.rounds:
+            played = [each for each in trial.episodes if each is not None]
+            asks = useful and found.accepted
+            ends = number > 0 and stalls
+            if number + 1 == self.rounds or not (played and (asks or ends)):
                 continue
-            if useful and found.accepted:
+            same = Teacher(Scenarios.like(model, played), self.seed)
+            if asks:
                 same.show()
                 if -found.logged >= PROMISED * same.gain:
                     break
-            # Else the model has to learn more.
-            known = -found.logged >= PROMISED * same.saved(same.play(self.layer).costs)
-            if number and stalls and known:
+            # Where the simulator shows less than the model says, there is more to learn.
+            if ends and -found.logged >= PROMISED * same.saved(same.play(self.layer).costs):
                 break
         self.layer.load_state_dict(weights)
         return model, note if least == best else ""
-
-    def _from_starts_of(self, trial: SimulatorTrial, model: LearntModel) -> Teacher | None:
-        """Return a teacher of the starts that a trial played; None where no episode is of use."""
-        twice = [each for one in trial.episodes if one is not None for each in (one, one)]
-        if not twice:
-            return None
-        scenarios = Scenarios.like(model, twice, self.rng)
-        return Teacher(scenarios.of(np.arange(0, len(twice), 2)), self.seed)
 
     def _confirm(self, simulator: Simulator, model: LearntModel, best: float) -> bool:
         """Let the simulator decide; teach what is lost, at most three times, then retreat."""

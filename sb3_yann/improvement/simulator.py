@@ -511,24 +511,26 @@ class Scenarios:
         cls,
         model: LearntModel,
         episodes: Sequence[Episode],
-        rng: np.random.Generator,
+        rng: np.random.Generator | None = None,
         midway: int = 0,
     ) -> Scenarios:
         """Return scenarios like some episodes, with their references and disturbances.
 
-        Every other one begins as its episode did, the others in the box of all first states; the
-        last ``midway`` ones where their episode had got to.
+        They begin as their episodes did. With ``rng`` every other one begins in the box of all
+        first states, and the last ``midway`` ones where their episode had got to.
         """
         row = model.dynamics.row
         steps = max(map(len, episodes))
         n = model.problem.model.n_states
         first = np.zeros(len(episodes), dtype=np.int64)
-        last = first[len(first) - midway :]
-        last[:] = rng.integers([len(each) for each in episodes[len(first) - midway :]])
+        if rng is not None:
+            last = first[len(first) - midway :]
+            last[:] = rng.integers([len(each) for each in episodes[len(first) - midway :]])
         thetas = row.shown(np.array([e.thetas[t] for e, t in zip(episodes, first, strict=True)]))
-        thetas = thetas.copy()
-        moved = thetas[1 : len(first) - midway : 2, :n]
-        moved[:] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
+        if rng is not None:
+            thetas = thetas.copy()
+            moved = thetas[1 : len(first) - midway : 2, :n]
+            moved[:] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
         given = [
             e.thetas[np.minimum(t + np.arange(steps), len(e)), row.given]
             for e, t in zip(episodes, first, strict=True)
