@@ -24,6 +24,7 @@ from sb3_yann.control.identification.innovations import (
     mean_square,
     refined,
     shifted,
+    with_lags,
 )
 from sb3_yann.control.identification.least_squares import NOT_EXCITED
 from sb3_yann.control.identification.residuals import curvature_test, project_out
@@ -40,6 +41,7 @@ SURE_DELAY = 10.0
 NO_MOVE = 1e-12
 SETTLING = 30  # samples in which a filter finds the first state
 FOLLOWS = 0.1  # share of an input that its feedback law leaves, below which the notes say so
+TIED = 0.25  # the same, above which coarse steps of an input may be its test signal
 WORSE = 1.1
 """Mean square of free runs, relative to those without dead time, from which it is not taken."""
 
@@ -56,7 +58,6 @@ class Structure:
     fits: tuple[Array, Array]  # (q,) each, one and `RUN_AHEAD` steps ahead, in percent
     refined: bool = False  # by prediction errors
     idle: tuple[int, ...] = ()  # inputs and disturbances without effect beyond chance
-    feedback: tuple[tuple[int, float], ...] = ()  # inputs that follow outputs; what does not
     curvature: Array = field(default_factory=lambda: np.zeros(0))  # (q,), share of the errors
     poles: tuple[Array, Array] = (np.zeros(0),) * 2  # with errors
     integrators: int = 0
@@ -104,7 +105,6 @@ def fit_structure(
         model=final.model,
         start=final.start,
         idle=tuple(past.idle()),
-        feedback=tuple(_feedback(episodes)),
         curvature=curvature_test(past.arx, past.rows)[0],
         poles=(poles[0], poles[1]),
         integrators=integrators,
@@ -112,33 +112,42 @@ def fit_structure(
     )
 
 
-def _feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, float]]:
+def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, float]]:
     """Return the inputs that follow earlier outputs, and what share of them does not.
 
-    ValueError for an input that is a function of earlier outputs and inputs alone.
+    ValueError for an input that is a function of earlier outputs and inputs alone, all as rounded.
     """
-    longer = [each for each in episodes if len(each) > lags]
-    if sum(map(len, longer)) <= 10 * lags * episodes[0].regressors.shape[1]:
-        return []
-    late = [*range(lags, -1, -1)]
-    y = np.concatenate(
-        [np.hstack([each.states[lags - i : len(each) - i] for i in late]) for each in longer]
-    )
-    u = np.concatenate(
-        [np.hstack([each.inputs[lags - i : len(each) - i] for i in late]) for each in longer]
-    )
+    q = episodes[0].states.shape[1]
     m = episodes[0].inputs.shape[1]
-    now = u[:, -m:]
-    own = np.column_stack([np.ones(len(u)), u[:, :-m]])
+    width = episodes[0].regressors.shape[1]
+    rows = [each.regressors for each in with_lags(episodes, lags + 1, lags)]
+    if sum(map(len, rows)) <= 10 * lags * width:
+        return []
+    past = np.concatenate(rows).reshape(-1, lags + 1, width)
+    now = past[:, 0, q : q + m]
+    own = np.column_stack([np.ones(len(now)), past[:, 1:, q : q + m].reshape(len(now), -1)])
+    known = np.hstack([own, past[..., :q].reshape(len(now), -1)])
     alone = np.mean(project_out(own, now) ** 2, axis=0)
-    left = np.mean(project_out(np.hstack([own, y]), now) ** 2, axis=0) / np.maximum(alone, NO_MOVE)
+    rest = project_out(known, now)
+    left = np.mean(rest**2, axis=0) / np.maximum(alone, NO_MOVE)
     moves = alone > NO_MOVE * np.var(now, axis=0)
-    if tied := [j for j in range(m) if moves[j] and left[j] < NO_MOVE]:
+    # Of a law, rounded readings leave what their rounding adds up to; a test signal is larger.
+    law = np.linalg.lstsq(known, now, rcond=None)[0]
+    grain = np.sqrt((_resolution(now) ** 2 + _resolution(known) ** 2 @ law**2) / 12)
+    small = np.all(np.abs(rest) < 6 * grain, axis=0) & (np.std(rest, axis=0) < 1.5 * grain)
+    tied = moves & ((left < NO_MOVE) | (small & (left < TIED)))
+    if tied.any():
         raise ValueError(
-            f"u[{tied[0]}] is a function of earlier outputs and inputs: a feedback law alone sets "
-            f"it. {NOT_EXCITED}"
+            f"u[{np.argmax(tied)}] is a function of earlier outputs and inputs, to within their "
+            f"rounding: a feedback law alone sets it. {NOT_EXCITED}"
         )
     return [(j, float(left[j])) for j in range(m) if moves[j] and left[j] < FOLLOWS]
+
+
+def _resolution(columns: Array) -> Array:
+    """Return the least difference of two values of each column, 0 where there are no two."""
+    steps = [np.diff(np.unique(each)) for each in columns.T]
+    return np.array([np.min(each) if len(each) else 0.0 for each in steps])
 
 
 class Search:
@@ -242,12 +251,11 @@ def free_run_errors(
         return none, none
     target = np.concatenate([each.states[ahead:] for each in longer])
     guess = np.concatenate([predicted(model, each, start, ahead) for each in longer])
-    read = np.isfinite(target)
     with np.errstate(invalid="ignore"):
-        count = read.sum(axis=0)
-        mean = np.where(read, target, 0.0).sum(axis=0) / count
-        moved = np.sqrt((np.where(read, target - mean, 0.0) ** 2).sum(axis=0) / count)
-        errors = np.sqrt((np.where(read, target - guess, 0.0) ** 2).sum(axis=0) / count)
+        count = np.isfinite(target).sum(axis=0)
+        mean = np.nansum(target, axis=0) / count
+        moved = np.sqrt(np.nansum((target - mean) ** 2, axis=0) / count)
+        errors = np.sqrt(np.nansum((target - guess) ** 2, axis=0) / count)
     return errors, 100 * (1 - errors / np.where(moved > 0, moved, np.nan))
 
 
@@ -281,11 +289,9 @@ def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Epis
     constants = np.exp2(np.arange(max(3, int(np.log2(longest)) + 1), dtype=np.float64))
     parts = [_filtered(a[:, ~slow], b, constants) for a, b in zip(y, driven, strict=True)]
     rows = np.concatenate(parts)
-    center = rows.mean(axis=0)
     scale = rows.std(axis=0)
-    scale[scale == 0] = 1.0
-    parts = [(each - center) / scale for each in parts]
-    rows = np.concatenate(parts)
+    rows = (rows - rows.mean(axis=0)) / np.where(scale > 0, scale, 1.0)
+    parts = np.split(rows, np.cumsum([*map(len, parts)])[:-1])
     filled = [each.copy() for each in y]
     for i in np.flatnonzero(slow):
         wanted = np.concatenate([each[:, i] for each in y])
@@ -304,15 +310,12 @@ def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Epis
 
 def _filtered(fast: Array, driven: Array, constants: Array) -> Array:
     """Return (T + 1, k): fast outputs now and filtered, and inputs of before, filtered."""
+    from scipy.signal import lfilter  # takes half a second to import
+
     before = np.vstack([driven[:1], driven])  # the first input acts from the second sample on
     signals = np.hstack([fast, before])
     found = [signals]
-    for constant in constants:
-        pole = np.exp(-1 / constant)
-        now = signals[0]
-        rows = np.empty_like(signals)
-        for k, each in enumerate(signals):
-            now = pole * now + (1 - pole) * each
-            rows[k] = now
-        found.append(rows)
+    for pole in np.exp(-1 / constants):
+        smooth, _ = lfilter([1 - pole], [1, -pole], signals, axis=0, zi=pole * signals[:1])
+        found.append(smooth)
     return np.hstack(found)

@@ -18,6 +18,7 @@ from sb3_yann.control.identification.least_squares import WEAK, Regression, pole
 from sb3_yann.control.identification.outputs import (
     RUN_AHEAD,
     Structure,
+    feedback,
     fit_structure,
     predicted,
     stand_ins,
@@ -224,26 +225,22 @@ def identify_outputs(
     every = log.every
     slow = np.array(every) > 1
     episodes = stand_ins(read, slow) if slow.any() else read
-    require_moving(episodes, log.sizes)
     try:
+        require_moving(episodes, log.sizes)
         plain = regress(episodes, log.sizes, None, 0.0)
+        center = plain.center
+        scale = np.where(plain.spread > 0, plain.spread, 1.0)
+        scaled = [_scaled(each, center, scale, q, m) for each in episodes]
+        follows = feedback(scaled)
     except ValueError as error:
         raise ValueError(log.in_names(str(error).replace("x[", "y["))) from None
     share = check_range("held_out", held_out, 0, 0.5, "[]")
-    center = plain.center
-    scale = np.where(plain.spread > 0, plain.spread, 1.0)
-    scaled = [_scaled(each, center, scale, q, m) for each in episodes]
     known = [_scaled(each, center, scale, q, m) for each in read]
     found = fit_structure(scaled, wanted, as_delays(delay, m), share, known)
     model, start = _in_plant_units(found, center, scale, q)
-    rows = shifted(read, found.delays)
     states = [
-        Episode(
-            filtered(model, each.states, each.driven @ model.B.T + model.c, start),
-            each.inputs,
-            each.disturbances,
-        )
-        for each in rows
+        replace(x, states=filtered(model, x.states, x.driven @ model.B.T + model.c, start))
+        for x in shifted(read, found.delays)
     ]
     n = model.order
     step = regress(states, (n, m, d), None, TINY_RIDGE * sum(map(len, states)))
@@ -265,7 +262,7 @@ def identify_outputs(
         system.u_ss,
         E if d else None,
         system.d_ss if d else None,
-        notes=[*system.notes, *_notes(log, found, plain, step, model.noise)],
+        notes=[*system.notes, *_notes(log, found, plain, step, model.noise, follows)],
         gains=Gains.of(A, B, found.integrators, errors),
         state_names=state_names,
         input_names=log.input_names,
@@ -274,6 +271,7 @@ def identify_outputs(
         time_unit=log.time_unit,
     )
     late = np.repeat(np.arange(m), found.delays)
+    mean = np.append(start[0], plain.center[q : q + m][late])
     memory = np.diag(plain.spread[q : q + m][late] ** 2)
     return IdentifiedOutputs(
         model=whole,
@@ -284,10 +282,7 @@ def identify_outputs(
         one_step_fit=found.fits[0],
         long_fit=found.fits[1],
         excitation=plain.excitation,
-        start=(
-            np.append(start[0], plain.center[q : q + m][late]),
-            linalg.block_diag(start[1], memory) if len(late) else start[1],
-        ),
+        start=(mean, linalg.block_diag(start[1], memory)),
         every=every,
         drift=np.append(drift - system.x_ss, np.zeros(len(late))),
     )
@@ -351,13 +346,9 @@ def _with_memory(
     q = len(model.C)
     A: Array = linalg.block_diag(model.A, np.zeros((late, late)))
     B: Array = np.zeros((n + late, m))
-    last = n - 1
-    for j, lag in enumerate(delays):
-        last += lag
-        if lag:
-            A[:n, last] = model.B[:, j]
-        else:
-            B[:n, j] = model.B[:, j]
+    waits = np.array(delays) > 0
+    A[:n, (n - 1 + np.cumsum(delays))[waits]] = model.B[:, :m][:, waits]
+    B[:n, ~waits] = model.B[:, :m][:, ~waits]
     A, B = exact_memory(A, B, delays, n)
     E = np.vstack([model.B[:, m:], np.zeros((late, model.B.shape[1] - m))])
     C = np.hstack([model.C, np.zeros((q, late))])
@@ -376,7 +367,12 @@ def _state_names(log: Log, model: Innovations, delays: Sequence[int]) -> Sequenc
 
 
 def _notes(
-    log: Log, found: Structure, plain: Regression, step: Regression, noise: Array
+    log: Log,
+    found: Structure,
+    plain: Regression,
+    step: Regression,
+    noise: Array,
+    follows: list[tuple[int, float]],
 ) -> list[str]:
     """Return notes on the fit, dead time, weak excitation, feedback, curvature and poles."""
     n = found.model.order
@@ -410,7 +406,7 @@ def _notes(
     notes += [
         f"{driven[j]} follows the outputs: a feedback law explains all but {100 * left:.2g} % of "
         "what its own past leaves. Its gain rests on that rest."
-        for j, left in found.feedback
+        for j, left in follows
     ]
     if np.any(found.curvature > 0):
         notes.append(

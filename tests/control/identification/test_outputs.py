@@ -124,10 +124,8 @@ def test_a_record_that_begins_at_rest_hides_no_dead_time() -> None:
 
 def test_an_integrator_keeps_its_pole() -> None:
     a = np.array([[1.0, 0.3], [0.0, 0.8]])
-    b = np.array([[0.0], [0.2]])
-    c = np.array([[1.0, 0.0]])
     u = steps(1500, 1, 4) - 3
-    found = identify_outputs(played(u, a, b, c, 5), u, dt=1)
+    found = identify_outputs(played(u, a, 0.2 * np.eye(2)[:, 1:], np.eye(1, 2), 5), u, dt=1)
     assert np.max(np.abs(np.linalg.eigvals(found.model.A))) == pytest.approx(1, abs=0.01)
 
 
@@ -170,24 +168,26 @@ def test_a_measured_disturbance_makes_E() -> None:
     assert rms(guess - y[20:]) < 1.1 * rms(best - y[20:])
 
 
-def test_feedback_alone_identifies_nothing() -> None:
+@pytest.mark.parametrize(("dither", "decimals"), [(0.0, 15), (0.0, 3), (0.0, 1), (0.5, 1)])
+def test_feedback_alone_identifies_nothing(dither: float, decimals: int) -> None:
     rng = np.random.default_rng(0)
     x = np.zeros(2)
-    u = []
-    y = []
-    before = 0.0
-    held = 0.0
+    rows = []
+    held = before = 0.0
     for _ in range(500):
-        y.append(np.array([x[0] + 0.05 * rng.normal()]))
-        held = held - 0.5 * (y[-1][0] - before) - 0.05 * y[-1][0]  # a PI controller at rest
-        before = y[-1][0]
-        u.append([held])
-        x = np.array([[0.9, 0.2], [0.0, 0.7]]) @ x + [0.0, 0.3 * held] + 0.05 * rng.normal(size=2)
-    y.append(np.array([x[0]]))
+        y = x[0] + 0.5 * rng.normal()
+        held = held - 0.5 * (y - before) - 0.05 * y  # a PI controller at rest
+        before = y
+        rows.append([y, held + dither * rng.choice([-1, 1])])
+        x = [[0.9, 0.2], [0.0, 0.7]] @ x + [0.0, 0.3 * rows[-1][1]] + 0.5 * rng.normal(size=2)
+    y, u = np.hsplit(np.round(rows, decimals), 2)  # a historian rounds
+    if dither:
+        identify_outputs(y, u[:-1], dt=1, order=2, delay=0)
+        return
     with pytest.raises(ValueError, match="feedback law alone"):
-        identify_outputs(np.array(y), np.array(u), dt=1)
+        identify_outputs(y, u[:-1], dt=1)
     with pytest.raises(ValueError, match=r"u\[0\] never changes"):
-        identify_outputs(np.array(y), np.ones((500, 1)), dt=1)
+        identify_outputs(y, np.ones((499, 1)), dt=1)
 
 
 def test_an_input_without_effect_is_named() -> None:
