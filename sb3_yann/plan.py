@@ -230,7 +230,8 @@ def roll_out(
     m = task.problem.model.n_inputs
 
     def act(t: int, theta: Array) -> Array:
-        return np.clip(np.nan_to_num(policy(t, theta)), *task.limits(theta))
+        u = policy(t, theta)
+        return np.clip(np.where(np.isnan(u), 0.0, u), *task.limits(theta))
 
     return play(act, lambda t, theta, u: plant.step(theta[t], u[t], rows), starts, steps, m)
 
@@ -297,7 +298,7 @@ def planned(
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
     plans = improved(plant, task, hard, rows, SWEEPS)
     # The last search may have been damped, and its feedback with it.
-    _, gains = _backward(plant, task, plans, rows, np.zeros(len(rows)))
+    _, gains, _ = _backward(plant, task, plans, rows, np.zeros(len(rows)))
     return dataclasses.replace(plans, gains=gains)
 
 
@@ -315,10 +316,14 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
     failed: Rows = np.zeros(k, dtype=np.intp)
     for _ in bar(f"{k} plans: rounds, at most", range(rounds), timed=True):
         old = plans.of(active)
-        corrections, gains = _backward(plant, task, old, rows[active], damping[active])
+        corrections, gains, hoped = _backward(plant, task, old, rows[active], damping[active])
         plans.gains[:, active] = gains
-        waiting: Rows = np.arange(len(active))
+        # A search for what the curvature does not promise would try every size and damping in vain.
+        settled = hoped <= SETTLED * np.abs(old.costs)
+        waiting: Rows = np.flatnonzero(~settled)
         for size in SIZES:
+            if not len(waiting):
+                break
             moved = dataclasses.replace(old, inputs=old.inputs + size * corrections, gains=gains)
             now = active[waiting]
             some = moved.of(waiting)
@@ -331,8 +336,6 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
             plans.inputs[:, won] = inputs[:, better]
             plans.costs[won] = costs[better]
             waiting = waiting[~better]
-            if not len(waiting):
-                break
         lost = np.isin(np.arange(len(active)), waiting)
         failed[active] = np.where(lost, failed[active] + 1, 0)
         more = np.maximum(DAMPED * damping[active], 1.0)
@@ -347,8 +350,8 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
 
 def _backward(
     plant: TwinPlant, task: Task, plans: Plans, rows: Rows, damping: Array
-) -> tuple[Array, Array]:
-    """Return corrections (T, k, m) and gains (T, k, m, n_theta)."""
+) -> tuple[Array, Array, Array]:
+    """Return corrections (T, k, m), gains (T, k, m, n_theta), and what those should save (k,)."""
     problem = task.problem
     thetas = plans.thetas
     inputs = plans.inputs
@@ -367,6 +370,7 @@ def _backward(
     V = np.tile(2 * task.end, (len(rows), 1, 1))
     corrections = np.empty_like(inputs)
     gains = np.empty_like(plans.gains)
+    saved = np.zeros(len(rows))
     damped = 2 * damping[:, None, None] * problem.stage_matrix[size:, size:]
     for t in reversed(range(len(inputs))):
         v[:, states] += gradient[t]
@@ -382,13 +386,15 @@ def _backward(
         move = _bounded_step(Huu + damped, qu, low[t], high[t])
         K = _feedback(Huu + damped, Hux, move <= low[t], move >= high[t], moving[t])
         Kt = K.swapaxes(1, 2)
-        v = qx + (Kt @ (qu + (Huu @ move[..., None])[..., 0])[..., None])[..., 0]
+        pulled = (Huu @ move[..., None])[..., 0]
+        saved -= np.sum((qu + pulled / 2) * move, axis=1)
+        v = qx + (Kt @ (qu + pulled)[..., None])[..., 0]
         v += (Hux.swapaxes(1, 2) @ move[..., None])[..., 0]
         V = Hxx + Kt @ Huu @ K + Kt @ Hux + Hux.swapaxes(1, 2) @ K
         V = (V + V.swapaxes(1, 2)) / 2
         corrections[t] = move
         gains[t] = K
-    return corrections, gains
+    return corrections, gains, saved
 
 
 def slopes_of_inputs(
@@ -436,6 +442,8 @@ def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:
 
     Projected Newton steps: an input on its bound is held there while the slope presses it on.
     """
+    if g.shape[1] == 1:
+        return np.clip(-g / H[..., 0], low, high)
     move: Array = np.clip(np.zeros_like(g), low, high)
     for _ in range(2 * g.shape[1] + 1):
         slope = g + (H @ move[..., None])[..., 0]

@@ -7,6 +7,7 @@ is in its own coordinates. Deviations are what laws, observers and networks comp
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ class Units(ReadOnlyArrays):
     theta_ss: Array
     u_ss: Array
 
-    @property
+    @cached_property
     def shifted(self) -> bool:
         """Whether there is an operating point other than zero."""
         return bool(np.any(self.theta_ss) or np.any(self.u_ss))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch as th
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
@@ -65,8 +66,8 @@ class Residual:
 
     def _hidden(self, z: Array) -> tuple[Array, Array]:
         W1, b1, W2, b2 = self.weights[:4]
-        first = np.tanh(z @ W1 + b1)
-        return first, np.tanh(first @ W2 + b2)
+        first = _tanh(z @ W1 + b1)
+        return first, _tanh(first @ W2 + b2)
 
     def _bent(self, z: Array) -> Array:
         """Return ``Q z``, (..., batch, k, n)."""
@@ -98,6 +99,10 @@ class Residual:
         rows = flat.reshape(rows.shape) * (1 - first**2)[..., None, :]
         flat = rows.reshape(*rows.shape[:-3], -1, rows.shape[-1]) @ W1
         return np.asarray(flat.reshape(*rows.shape[:-1], -1) + found)
+
+
+def _tanh(z: Array) -> Array:
+    return np.asarray(th.tanh_(th.from_numpy(z)))  # several times as fast as numpy's here
 
 
 BEYOND_DATA = 0.25  # how far the residual reaches beyond the data, in widths of the data

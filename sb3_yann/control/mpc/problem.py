@@ -88,7 +88,7 @@ class MPCProblem(ReadOnlyArrays):
         MPCProblem.__init__(found, **fields_in_deviations(self))
         return found
 
-    @property
+    @cached_property
     def has_rate_bounds(self) -> bool:
         """Whether the change of an input is bounded."""
         return bool(np.any(np.isfinite([self.rate.du_min, self.rate.du_max])))
@@ -176,6 +176,8 @@ class MPCProblem(ReadOnlyArrays):
         the fixed bounds.
         """
         fixed = self.u_min, self.u_max
+        if not self.has_rate_bounds and not self.parametric_bounds:
+            return fixed
         low, high = (np.clip(side, *fixed) for side in self.limits_at("u", thetas))
         high = np.maximum(low, high)
         if not self.has_rate_bounds:
