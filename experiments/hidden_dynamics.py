@@ -95,7 +95,7 @@ class Plant(gym.Env[Array, Array]):
         self.unit = unit
         self.noise = noise
         self.action_space = gym.spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, unit.shape, np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, unit.shape, np.float32)
 
     def _shown(self) -> Array:
         noise = self.noise * self.unit * self.np_random.standard_normal(len(self.unit))

@@ -240,7 +240,7 @@ class Hidden(TextbookEnv):
         self.C = C
         self.last = last
         free = np.full(len(C), np.inf)
-        self.observation_space = spaces.Box(-free, free, dtype=np.float64)
+        self.observation_space = spaces.Box(-free, free, dtype=np.float32)
 
     @property
     def outputs(self) -> Array:
@@ -279,7 +279,7 @@ class Column(gym.Env[Array, Array]):
         self.sensor = sensor
         self.poles = np.exp(-1 / self.constants)
         free = np.full(2, np.inf)
-        self.observation_space = spaces.Box(-free, free, dtype=np.float64)
+        self.observation_space = spaces.Box(-free, free, dtype=np.float32)
         self.action_space = spaces.Box(self.u_rest - 0.5, self.u_rest + 0.5, dtype=np.float64)
 
     def reset(

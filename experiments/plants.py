@@ -92,9 +92,8 @@ class TextbookEnv(gym.Env[Array, Array]):
 
     def __init__(self, plant: TextbookPlant) -> None:
         self.plant = plant
-        self.observation_space = gym.spaces.Box(
-            np.array(plant.low), np.array(plant.high), dtype=np.float64
-        )
+        # float32, as when the published runs were made
+        self.observation_space = gym.spaces.Box(np.float32(plant.low), np.float32(plant.high))
         self.action_space = gym.spaces.Box(
             np.array(plant.u_low), np.array(plant.u_high), dtype=np.float64
         )

@@ -146,11 +146,11 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     ``tracking=Tracking([0], r_min, r_max)`` theta is ``[x, r]``: the set-point r is drawn uniformly
     between r_min and r_max at each reset, and held for the episode, or drawn anew every ``hold``
     steps; so are bounds that change. No :class:`SetPoint` is needed around it. The reward is minus
-    the MPC's stage cost. The state alone is float64, with more of theta it is float32, and
-    ``info["state"]`` is exact. The inputs are held for a sample, ``mpc.model.dt``, in which the
-    classical Runge-Kutta method takes ``substeps`` equal steps. ``reset(options={"state": x})``
-    begins in a state. Where it is no longer finite an episode terminates, in the last one that was,
-    with ``info["violation"]``; a warning says where f was not, and how often.
+    the MPC's stage cost, and ``info["state"]`` the state. The inputs are held for a sample,
+    ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps`` equal steps.
+    ``reset(options={"state": x})`` begins in a state. Where it is no longer finite an episode
+    terminates, in the last one that was, with ``info["violation"]``; a warning says where f was
+    not, and how often.
 
     Parameters
     ----------

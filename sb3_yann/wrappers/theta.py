@@ -36,9 +36,9 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Appends a vector between ``low`` and ``high`` to the observation.
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
-    What lies on a bound is shown inside it, where float32 would round it beyond: some laws are zero
-    outside their box. ``low`` and ``high`` (p,) are repeated for each of so many ``rows``.
-    ``appends`` are parts of `ThetaLayout` that it may hold.
+    It is float64 where the env's is. What lies on a bound is shown inside it, where float32 would
+    round it beyond: some laws are zero outside their box. ``low`` and ``high`` (p,) are repeated
+    for each of so many ``rows``. ``appends`` are parts of `ThetaLayout` that it may hold.
     """
 
     appends: tuple[str, ...] = ()
@@ -67,17 +67,18 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and "
                 "no entry of low may exceed that of high."
             )
-        self._rounded = self.low.astype(np.float32), self.high.astype(np.float32)
-        low32, high32 = self._rounded
-        self._inside = (
-            np.where(low32 < self.low, np.nextafter(low32, np.float32(np.inf)), low32),
-            np.where(high32 > self.high, np.nextafter(high32, np.float32(-np.inf)), high32),
-        )
         free = np.full(n_new, np.inf)
-        self.observation_space = spaces.Box(
-            np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(np.float32),
-            np.concatenate([free, inner.high[n_replaced:], self.high]).astype(np.float32),
-            dtype=np.float32,
+        kind: Any = np.result_type(inner.dtype, np.float32)
+        self.observation_space: Any = spaces.Box(
+            np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(kind),
+            np.concatenate([free, inner.high[n_replaced:], self.high]).astype(kind),
+            dtype=kind,
+        )
+        self._rounded = self.low.astype(kind), self.high.astype(kind)
+        low, high = self._rounded
+        self._inside = (
+            np.where(low < self.low, np.nextafter(low, np.inf), low),
+            np.where(high > self.high, np.nextafter(high, -np.inf), high),
         )
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
@@ -93,20 +94,16 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
     def _shown(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         """Return what is observed, with what was appended on its bounds or inside them."""
-        shown = self._observe(observation, u, info)
+        parts = self._observe(observation, u, info)
+        shown = np.concatenate(parts).astype(self.observation_space.dtype)
         appended = shown[len(shown) - len(self.low) :]
         for rounded, inside in zip(self._rounded, self._inside, strict=True):
             np.copyto(appended, inside, where=appended == rounded)
         return shown
 
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        """Return what is observed after an input u (m,), None at the start of an episode."""
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> list[Vector]:
+        """Return the parts of what follows an input u (m,), None at the start of an episode."""
         raise NotImplementedError
-
-
-def joined(*parts: Vector) -> Vector:
-    """Return the parts one after another, in float32."""
-    return np.concatenate(parts).astype(np.float32)
 
 
 AWrapper = TypeVar("AWrapper", bound="gym.Wrapper[Any, Any, Any, Any]")
@@ -165,14 +162,11 @@ class PastInputs(Appending):
         self.initial = np.clip(given, bounds.low, bounds.high)
         self.past: list[Array] = []
 
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> list[Vector]:
         longest = max(self.delays, default=0)
-        if u is None:
-            self.past = [self.initial] * longest
-        else:
-            self.past = [u, *self.past][:longest]
+        self.past = [self.initial] * longest if u is None else [u, *self.past][:longest]
         shown = [self.past[k][j] for j, delay in enumerate(self.delays) for k in range(delay)]
-        return joined(observation, np.array(shown, np.float64))
+        return [observation, np.array(shown, np.float64)]
 
 
 class PreviousInput(PastInputs):
@@ -193,8 +187,7 @@ class PreviousInput(PastInputs):
     """
 
     def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
-        bounds = require_vector(env, "action_space")
-        super().__init__(env, [1] * bounds.shape[0], initial)
+        super().__init__(env, [1] * require_vector(env, "action_space").shape[0], initial)
 
 
 class SetPoint(Appending):
@@ -260,20 +253,15 @@ class SetPoint(Appending):
             self._own = None if seeded else seeding.np_random(seed)[0]
         return self._shown(observation, None, info), info
 
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> list[Vector]:
         self.steps = 0 if u is None else self.steps + 1
-        if u is None:
-            self._ahead = []
-        else:
-            self._ahead.pop(0)
+        self._ahead = [] if u is None else self._ahead[1:]
         for step in range(self.steps + len(self._ahead), self.steps + self.preview + 1):
-            changes = (
-                step == 0 or self.schedule is not None or (self.hold and step % self.hold == 0)
-            )
-            self._last = self._next(step) if changes else self._last
+            due = self.schedule is not None or (self.hold and step % self.hold == 0)
+            self._last = self._next(step) if due or step == 0 else self._last
             self._ahead.append(self._last)
         self.reference = np.concatenate(self._ahead)
-        return joined(observation, self.reference)
+        return [observation, self.reference]
 
     def _next(self, step: int) -> Array:
         p = len(self.low) // (self.preview + 1)
@@ -355,7 +343,7 @@ class MeasuredDisturbance(Appending):
         self.held: Array = np.clip(np.zeros(self.low.shape), self.low, self.high)
         self.failing = np.zeros(self.low.shape, dtype=bool)
 
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> list[Vector]:
         if self.key not in info:
             raise ValueError(
                 f"info has no {self.key!r}, only {sorted(info)}. Pass the name of the entry that "
@@ -371,7 +359,7 @@ class MeasuredDisturbance(Appending):
                 NonFiniteWarning,
             )
         self.failing = failing
-        return joined(observation, self.held)
+        return [observation, self.held]
 
     def _with_preview(self, given: Array, begins: bool) -> Array:
         """Return d with its preview, (preview + 1) n_loads; the last row stays in an episode."""
@@ -480,7 +468,7 @@ class EstimateState(Appending):
         self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
         self.readings: Vector = np.full(observer.n_measured, np.nan)  # the latest, in deviations
 
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> list[Vector]:
         observer = self.observer
         measured, rest = np.split(observation.copy(), [observer.n_measured])
         measured = self.inner.to_deviations(measured) if self.inner.shifted else measured
@@ -493,15 +481,12 @@ class EstimateState(Appending):
         self.failing = failing
         measured[failing] = np.nan
         self.readings = measured
-        if u is None:
-            x_hat, d_hat = observer.reset(measured)
-        else:
-            x_hat, d_hat = observer.update(measured, u, self.load)
+        both = observer.reset(measured) if u is None else observer.update(measured, u, self.load)
         if self.measured is not None:  # acts until the next sample
             first = observer.n_measured
             self.load = self.measured.held[: observer.n_known] - self.inner.theta_ss[first:]
-        x_hat, d_hat = np.split(self.outer.to_plant(np.append(x_hat, d_hat)), [len(x_hat)])
-        return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
+        x_hat, d_hat = np.split(self.outer.to_plant(np.concatenate(both)), [len(both[0])])
+        return [x_hat, rest, np.clip(d_hat, self.low, self.high)]
 
 
 class ObserveDisturbance(EstimateState):

@@ -443,7 +443,7 @@ def test_an_observer_shows_plant_units() -> None:
         shown.append(env.step(np.float32([u]))[0])
         expected.append(np.append(*observer.update(env.unwrapped.x - X_SS, u - U_SS)))
     rest = np.array([*X_SS, *d_ss])
-    np.testing.assert_allclose(shown, np.array(expected) + rest, rtol=1e-6)
+    np.testing.assert_allclose(shown, np.array(expected) + rest, rtol=1e-12)  # in float64
 
 
 @pytest.mark.parametrize("wrap", [PreviousInput, lambda env, **u: PastInputs(env, [2], **u)])
