@@ -113,11 +113,9 @@ def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:
     same = np.eye(n)
     # All orders of a few states; of more, two are exchanged.
     orders = [[*each] for each in permutations(range(n))][1:] if n <= MOST_REORDERED else []
-    for i, j in combinations(range(n), 2) if n > MOST_REORDERED else ():
-        order = [*range(n)]
-        order[i] = j
-        order[j] = i
-        orders.append(order)
+    if n > MOST_REORDERED:
+        pairs = combinations(range(n), 2)
+        orders = [[{i: j, j: i}.get(k, k) for k in range(n)] for i, j in pairs]
     for order in orders:
         back = np.argsort(order).tolist()
         yield (

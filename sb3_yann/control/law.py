@@ -226,7 +226,8 @@ class PlantLaw(ReadOnlyArrays):
         if not any(name == "theta_ss" or name.startswith("model_") for name in data):
             return law
         given = {name[6:]: each for name, each in data.items() if name.startswith("model_")}
-        for name in ("notes", "state_names", "input_names", "units", "estimated", "time_unit"):
+        words = [name for name in given if name.endswith("_names")]
+        for name in ("notes", *words, "units", "estimated", "time_unit"):
             given[name] = given[name].tolist()
         model = LinearModel(**{**given, "dt": float(given["dt"])})
         if model.n_inputs != law.n_inputs or model.n_states > law.n_theta:

@@ -34,6 +34,7 @@ class LinearSystem(ReadOnlyArrays):
     gains: Gains | None = None
     state_names: tuple[str, ...] = field(default=(), compare=False)
     input_names: tuple[str, ...] = field(default=(), compare=False)
+    disturbance_names: tuple[str, ...] = field(default=(), compare=False)
     units: tuple[str, ...] = field(default=(), compare=False)
     estimated: tuple[int, ...] = field(default=(), compare=False)
     C: Array | None = None
@@ -63,6 +64,12 @@ class LinearSystem(ReadOnlyArrays):
     def n_disturbances(self) -> int:
         """Number of disturbances d, measured and estimated."""
         return int(self.E.shape[1])
+
+    @property
+    def disturbance_labels(self) -> list[str]:
+        """The names of the disturbances, ``d[i]`` where none is given."""
+        plain = names((0, 0, self.n_disturbances))
+        return [*self.disturbance_names, *plain[len(self.disturbance_names) :]]
 
     @property
     def measured(self) -> tuple[int, ...]:
@@ -196,7 +203,7 @@ def labels_of_outputs(C: Array, states: Sequence[str]) -> list[str]:
 
 def missing_observer(model: LinearSystem) -> str:
     """Return what a law or a policy of this model lacks; empty where nothing is estimated."""
-    which = [f"d[{i}]" for i in model.estimated]
+    which = [model.disturbance_labels[i] for i in model.estimated]
     observer = "DisturbanceObserver" if which else "StateEstimator"
     if not np.array_equal(model.shown, np.eye(model.n_states)):
         which.insert(0, "the states")

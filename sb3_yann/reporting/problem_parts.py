@@ -47,9 +47,9 @@ def plant_part(subject: Subject) -> Part:
     states, inputs = with_units(model)
     point = [[name, "state", number(x)] for name, x in zip(states, model.x_ss, strict=True)]
     point += [[name, "input", number(u)] for name, u in zip(inputs, model.u_ss, strict=True)]
-    for i, value in enumerate(model.d_ss):
+    for i, load in enumerate(model.disturbance_labels):
         kind = "estimated disturbance" if i in model.estimated else "disturbance"
-        point.append([f"d[{i}]", kind, number(value)])
+        point.append([load, kind, number(model.d_ss[i])])
     ends = zip(problem.labels(units=True), problem.theta_min, problem.theta_max, strict=True)
     soft = problem.soft.penalty
     facts = [

@@ -234,7 +234,7 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
         )
     constant = problem.layout.constant
     seen = np.concatenate([each.thetas[:, constant] for each in episodes])
-    if still := [*np.array(problem.layout.names)[constant][np.ptp(seen, axis=0) == 0]]:
+    if still := [*np.array(problem.labels())[constant][np.ptp(seen, axis=0) == 0]]:
         one = f"The log shows one value alone of {', '.join(still)}"
         said.append(f"{one}: elsewhere the MPC will act.")
     said.append(f"Residual beside the linear model: {kind}.")

@@ -171,7 +171,7 @@ def test_signals_come_last_whatever_else_theta_holds(monkeypatch: pytest.MonkeyP
         """The feed behind the previous input."""
         env = PreviousInput(Tank(), [3.0])
         box: Any = env.observation_space
-        turned = spaces.Box(box.low[[0, 2, 1]], box.high[[0, 2, 1]])
+        turned = spaces.Box(box.low[[0, 2, 1]], box.high[[0, 2, 1]], dtype=box.dtype)
         return TransformObservation(env, lambda shown: shown[[0, 2, 1]], turned)
 
     model = build(env=make(), problem=slow)

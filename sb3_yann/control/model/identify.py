@@ -168,10 +168,9 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
         )
     except ValueError as error:
         raise ValueError(log.in_names(str(error))) from None
-    model = LinearModel(**vars(found.system))
+    model = LinearModel(**{**vars(found.system), "disturbance_names": log.disturbance_names})
     if log.state_names:
-        labelled = len(log.state_names) + len(log.input_names)
-        model = model.named(log.state_names, log.input_names, log.units[:labelled])
+        model = model.named(log.state_names, log.input_names, log.units[: sum(log.sizes[:2])])
     step = found.regression
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)

@@ -266,6 +266,7 @@ def identify_outputs(
         gains=Gains.of(A, B, found.integrators, errors),
         state_names=state_names,
         input_names=log.input_names,
+        disturbance_names=log.disturbance_names,
         units={name: unit for name, unit in units if name in (*state_names, *log.input_names)},
         C=C,
         time_unit=log.time_unit,

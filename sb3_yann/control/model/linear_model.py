@@ -62,8 +62,8 @@ class LinearModel(LinearSystem):
     gains : Gains, optional
         What held inputs do in the end, with errors, for the report. Ignored and dropped as the
         notes are.
-    state_names, input_names : sequence of str, optional
-        Names for reports, n and m of them. Equality ignores them.
+    state_names, input_names, disturbance_names : sequence of str, optional
+        Names for reports, n, m and at most d of them. Equality ignores them.
     units : mapping from name to str, or sequence of n + m str, optional
         Units of states and inputs, for reports.
     estimated : sequence of int, optional
@@ -101,6 +101,7 @@ class LinearModel(LinearSystem):
         gains: Gains | None = None,
         state_names: Sequence[str] = (),
         input_names: Sequence[str] = (),
+        disturbance_names: Sequence[str] = (),
         units: Units = (),
         estimated: Sequence[int] = (),
         C: ArrayLike | None = None,
@@ -124,9 +125,12 @@ class LinearModel(LinearSystem):
             check_array("gains.values", gains.values, B.shape)
         states = as_names("state_names", state_names, n)
         inputs = as_names("input_names", input_names, u.size)
+        count = min(len(disturbance_names), d.size)  # those that offset_free adds come after them
+        loads = as_names("disturbance_names", disturbance_names, count)
         labels = [*(states or names((n,))), *(inputs or names((0, u.size)))]
-        if both := sorted({each for each in labels if labels.count(each) > 1}):
-            raise ValueError(f"{both} name a state and an input: each needs a name of its own.")
+        known = [*labels, *loads]
+        if both := sorted({each for each in known if known.count(each) > 1}):
+            raise ValueError(f"{both} name two signals: each needs a name of its own.")
         point = check_positive("dt", dt), x, u, E, d
         super().__init__(
             A,
@@ -137,6 +141,7 @@ class LinearModel(LinearSystem):
             gains=gains,
             state_names=states,
             input_names=inputs,
+            disturbance_names=loads,
             units=as_units(units, labels),
             estimated=check_indices("estimated", estimated, E.shape[1]),
             C=None if C is None else check_array("C", C, ("q", n)),

@@ -49,7 +49,7 @@ def _head(model: LinearSystem) -> list[str]:
     words = zip(counts, ("state", "input", "disturbance"), strict=True)
     sizes = ", ".join(f"{count} {word}{'s' * (count != 1)}" for count, word in words)
     if model.estimated:
-        which = ", ".join(f"d[{i}]" for i in model.estimated)
+        which = ", ".join(model.disturbance_labels[i] for i in model.estimated)
         sizes += f" (an observer estimates {which})"
     point = f"x_ss = {_vector(model.x_ss)}, u_ss = {_vector(model.u_ss)}"
     if model.n_disturbances:
@@ -60,7 +60,8 @@ def _head(model: LinearSystem) -> list[str]:
     ]
     if model.state_names or model.input_names or model.units:
         states, inputs = with_units(model)
-        head.insert(1, f"States: {', '.join(states)}. Inputs: {', '.join(inputs)}.")
+        named = {"States": states, "Inputs": inputs, "Disturbances": model.disturbance_names}
+        head.insert(1, " ".join(f"{what}: {', '.join(of)}." for what, of in named.items() if of))
     return head
 
 

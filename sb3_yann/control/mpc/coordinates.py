@@ -226,7 +226,8 @@ def steady_states(
     missed = np.abs(equations @ solution - right).max(axis=0, initial=0.0) > 1e-8 * size
     if np.any(missed):
         p = len(C)
-        which = [f"r[{i}]" if i < p else f"d[{i - p}]" for i in np.flatnonzero(missed)]
+        known = [*(f"r[{i}]" for i in range(p)), *model.disturbance_labels]
+        which = [known[i] for i in np.flatnonzero(missed)]
         rank = int(np.linalg.matrix_rank(equations, tol=1e-10))
         raise ValueError(
             f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank "

@@ -254,14 +254,17 @@ class MPCProblem(ReadOnlyArrays):
         """
         model = self.model
         found = list(self.layout.names)
+        later = ["", *(f", {k} sample{'s' * (k > 1)} ahead" for k in range(1, self.horizon + 1))]
         states, inputs = with_units(model) if units else labels_of(model)
         if model.state_names or (units and model.units):
             found[self.layout.state] = states
             p = self.layout.n_references
             for state, at in self.set_points.items():
                 for k in range(self.layout.previews[0] + 1):
-                    later = f", {k} sample{'s' * (k > 1)} ahead" if k else ""
-                    found[at + k * p] = f"set-point of {states[state]}{later}"
+                    found[at + k * p] = f"set-point of {states[state]}{later[k]}"
+        for i, name in enumerate(model.disturbance_names):
+            own = {f"d_{k}[{i}]" if k else f"d[{i}]": name + each for k, each in enumerate(later)}
+            found = [own.get(each, each) for each in found]
         if model.input_names or (units and model.units):
             previous = inputs[: self.layout.n_previous]
             found[self.layout.previous] = [f"previous {each}" for each in previous]

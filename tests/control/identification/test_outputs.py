@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -161,8 +162,9 @@ def test_a_log_gives_the_same_model_with_its_names() -> None:
 def test_a_measured_disturbance_makes_E() -> None:
     both = steps(900, 2, 3)
     y = played(both, A, B, C, 4)
-    found = identify_outputs(y, both[:, :1], dt=1, disturbances=both[:, 1:])
-    assert (found.model.n_inputs, found.model.n_disturbances) == (1, 1)
+    log = Log.from_arrays(y, both[:, :1], 1, disturbances=both[:, 1:])
+    found = identify_outputs(replace(log, disturbance_names=("feed",)))
+    assert (found.model.n_inputs, found.model.disturbance_labels) == (1, ["feed"])
     guess = found.predict(y, both[:, :1], 20, disturbances=both[:, 1:])
     best = best_possible({"A": A, "B": B, "C": C}, y, both, 0.05, 20)
     assert rms(guess - y[20:]) < 1.1 * rms(best - y[20:])
@@ -222,12 +224,8 @@ def test_more_outputs_than_states() -> None:
 
 def test_C_is_kept_by_copies_units_and_sampling() -> None:
     model = LinearModel([[0.5, 0], [0, 0.2]], [[1], [1]], dt=1, x_ss=[1, 2], u_ss=[0], C=[[1, 1]])
-    for each in (
-        copy.deepcopy(model),
-        pickle.loads(pickle.dumps(model)),
-        model.about_zero(),
-        model.named(["a", "b"]),
-    ):
+    copies = copy.deepcopy(model), pickle.loads(pickle.dumps(model))
+    for each in (*copies, model.about_zero(), model.named(["a", "b"])):
         np.testing.assert_array_equal(each.C, [[1, 1]])
     assert model != LinearModel(model.A, model.B, 1, [1, 2], [0])
     sampled = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], dt=0.5, C=[[1, 0]])

@@ -189,7 +189,7 @@ def reactor() -> LinearMPC:
         [[0.9, 0.1], [0.0, 0.8]], [[0.0], [0.5]], dt=0.1, x_ss=[2, 350], u_ss=[40],
         E=[[0.1], [0.0]], d_ss=[7],
         state_names=["conversion", "temperature"], input_names=["coolant"],
-        units={"temperature": "K"},
+        units={"temperature": "K"}, disturbance_names=["feed"],
     )  # fmt: skip
     return LinearMPC(
         model, Q=np.eye(2), R=[[0.1]], horizon=3,
@@ -211,7 +211,7 @@ def test_a_file_holds_operating_point_sampling_time_names_and_units(saved: Any) 
     model = reactor().model
     read = kind.load(path)
     assert read == law and read.model == model
-    for name in ("dt", "state_names", "input_names", "units"):
+    for name in ("dt", "state_names", "input_names", "disturbance_names", "units"):
         assert getattr(read.model, name) == getattr(model, name)
     assert read.theta_ss.tolist() == [2, 350, 350, 7, 40]
 

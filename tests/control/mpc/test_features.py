@@ -27,6 +27,7 @@ from sb3_yann import (
     Terminal,
     Tracking,
     export,
+    offset_free,
 )
 from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, bound_excess
 from sb3_yann.control.mpc.condensing import condense
@@ -74,18 +75,18 @@ def test_a_preview_of_what_stays_is_no_preview(weights: dict[str, Any]) -> None:
     assert ahead.layout.names[:9] == (
         "x[0]", "x[1]", "r[0]", "r_1[0]", "r_2[0]", "d[0]", "d_1[0]", "d_2[0]", "d_3[0]",
     )  # fmt: skip
-    named = replace(ahead, model=replace(model, state_names=["place", "speed"]))
-    assert named.labels()[2:5] == (
+    names = {"state_names": ["place", "speed"], "disturbance_names": ["wind"]}
+    named = replace(ahead, model=replace(model, **names))
+    assert named.labels()[2:7] == (
         "set-point of place", "set-point of place, 1 sample ahead",
-        "set-point of place, 2 samples ahead",
+        "set-point of place, 2 samples ahead", "wind", "wind, 1 sample ahead",
     )  # fmt: skip
+    assert offset_free(named)[0].model.disturbance_labels == ["wind", "d[1]", "d[2]"]
     theta = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (50, mpc.n_theta)) / 3
     both = theta @ ahead.layout.lift.T
     assert np.abs(mpc.online()(theta) - ahead.online()(both)).max() < 1e-9
-    assert (
-        np.abs(mpc.stage_cost(theta, theta[:, :1]) - ahead.stage_cost(both, theta[:, :1])).max()
-        < 1e-9
-    )
+    costs = mpc.stage_cost(theta, theta[:, :1]), ahead.stage_cost(both, theta[:, :1])
+    assert np.abs(np.subtract(*costs)).max() < 1e-9
 
 
 def test_a_price_moves_where_the_law_rests_and_has_no_value_without_a_discount() -> None:
