@@ -246,8 +246,7 @@ def test_a_gain_is_sure_or_hopeless_by_the_pairs() -> None:
     noise = np.tile([-1.0, 1.0], 10)
 
     def found(change: float, **options: float) -> Any:
-        policy = scores(10 * (1 + change) + noise)
-        return no_worse(policy, mpc, mpc, Tolerance(9.0), **options)
+        return no_worse(scores(10 * (1 + change) + noise), mpc, mpc, Tolerance(9.0), **options)
 
     edge = stats.t.ppf(0.95, 19) * noise.std(ddof=1) / np.sqrt(20) / 10
     assert found(-1.01 * edge).is_sure and not found(-0.99 * edge).is_sure

@@ -65,6 +65,17 @@ def test_a_step_a_tenth_of_dt_too_long_or_too_short_is_none(longer: float, lost:
     assert gone == lost and sum(map(len, parts)) == 9 - lost
 
 
+def test_stamps_that_jitter_about_one_grid_are_on_it() -> None:
+    rng = np.random.default_rng(0)
+    grid = 30.0 * np.arange(301)
+    parts, lost = without_gaps([numbered(300)], [grid + rng.integers(-4, 5, 301)], 30)
+    assert (len(parts), lost) == (1, 0)
+    with pytest.warns(UserWarning, match="differ from dt = 30 .* an episode ends at each. Put"):
+        without_gaps([numbered(300)], [grid + rng.integers(-8, 9, 301)], 30)
+    grid[150:] += 8  # the grid itself moves
+    assert 1 < len(without_gaps([numbered(300)], [grid + rng.integers(-2, 3, 301)], 30)[0]) < 5
+
+
 def test_where_more_than_half_of_the_steps_are_none_the_unit_is_another() -> None:
     def times(gaps: int) -> np.ndarray:
         return np.cumsum([0.0, *[3.0] * gaps, *[1.0] * (8 - gaps)])

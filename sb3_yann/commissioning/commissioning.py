@@ -514,9 +514,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     if not more <= min(room, MOST_ABOVE_MPC * abs(costs.mpc)):  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
-    if is_hopeless(costs):
-        return f"{costs.difference.pairs} pairs show no gain"
-    return ""
+    return f"{costs.difference.pairs} pairs show no gain" if is_hopeless(costs) else ""
 
 
 def rows_of_pairs(journal: Journal, problem: LinearMPC) -> dict[str, str]:

@@ -183,9 +183,7 @@ class Plant:
             return Alarm("not a number", f"It reads {self._not_finite(read)}.")
         if why:
             return Alarm("violation", why)
-        if watchdog is None:
-            return None
-        return watchdog.watch(known, u.astype(np.float64), read)
+        return None if watchdog is None else watchdog.watch(known, u.astype(np.float64), read)
 
     def _not_finite(self, theta: Array) -> str:
         """Return which entries are not finite, by name."""

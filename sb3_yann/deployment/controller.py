@@ -391,8 +391,7 @@ class Controller:
             part = np.where(lost.any(1), 0.0, part)[:, None]
             added = self._networks(theta * data["per_theta"], data["network_of"][region])
             sound = np.isfinite(added).all(1) | (part[:, 0] == 0)
-            added = np.where(sound[:, None], added, 0.0)
-            added = np.clip(added, -data["reach"], data["reach"])
+            added = np.clip(np.where(sound[:, None], added, 0.0), -data["reach"], data["reach"])
             total = law + np.where(part > 0, added * part, 0.0)
             action = np.clip(total, low, high)
             adds = (total != law).any(1)

@@ -261,8 +261,7 @@ def _accept(
     new, verdict = _confirm(trial, after.accepted, settings)
     if verdict.accepted:
         after = replace(after, next_seed=seeds.next, new=trial.starts)
-        after = after.with_passed(after.accepted)
-        return _Tried(after, verdict, cost, played, scores, others)
+        return _Tried(after.with_passed(after.accepted), verdict, cost, played, scores, others)
     if new is not None:
         scores = scores.extended_by(new)
         others = others.extended_by(trial.mpc_scores)

@@ -141,8 +141,7 @@ class Trial:
         logged = np.arange(count)[int(between) :: 1 + between]
         follow[logged] = np.arange(len(logged)) % len(twin.episodes)
         drawn[logged] = starts.draw(len(logged), rng, follow[logged])
-        rows = np.repeat(drawn[None], len(twin.dynamics.members), axis=0)
-        return cls(twin, rows, count, follow)
+        return cls(twin, np.repeat(drawn[None], len(twin.dynamics.members), axis=0), count, follow)
 
     def __post_init__(self) -> None:
         episodes = self.twin.episodes

@@ -82,8 +82,7 @@ def plant_part(subject: Subject) -> Part:
         ]
     )
     lacks = missing_observer(model)
-    found = (Finding("note", lacks),) if lacks else ()
-    return Part("Plant and problem", content, found)
+    return Part("Plant and problem", content, (Finding("note", lacks),) if lacks else ())
 
 
 def _matrix(M: Array) -> str:

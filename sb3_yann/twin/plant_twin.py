@@ -231,8 +231,7 @@ class PlantTwin(LearntModel):
 
     def report(self) -> str:
         """Return what the twin explains, what it does not know, and whether to trust it."""
-        text = report(self.problem, self.episodes, self.kind, self.trust)
-        return "\n".join([*self.notes, text])
+        return "\n".join([*self.notes, report(self.problem, self.episodes, self.kind, self.trust)])
 
     def plot(self, axes: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
         """Draw costs of held-out episodes, and errors of free runs; return both axes."""

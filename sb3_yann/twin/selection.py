@@ -208,8 +208,7 @@ def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
     ridge = RIDGE * (np.trace(about.T @ about) / z.shape[1] + 1e-300)
     linear = np.linalg.solve(about.T @ about + ridge * np.eye(z.shape[1]), about.T @ y)
     left = y - about @ linear
-    size = np.sqrt(np.mean(left**2, axis=0, keepdims=True))
-    return linear, size
+    return linear, np.sqrt(np.mean(left**2, axis=0, keepdims=True))
 
 
 def _of_one_seed(log: Sequence[Episode]) -> NDArray[np.intp] | None:

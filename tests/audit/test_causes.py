@@ -45,8 +45,7 @@ class Changed(gym.Wrapper):
         self.change = change
 
     def step(self, action):
-        theta = self.unwrapped.x
-        return self.change(self.unwrapped, theta, action, self.env.step(action))
+        return self.change(self.unwrapped, self.unwrapped.x, action, self.env.step(action))
 
 
 def plant(mpc=MPC, steps: int = 20) -> gym.Env:

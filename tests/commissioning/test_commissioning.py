@@ -63,8 +63,7 @@ def begun(tmp_path: Path) -> Any:
 
 def policys_turn(run: Commissioning) -> int:
     """Return the first episode of the second batch in which the policy acts."""
-    first = run.batch
-    return first + int(np.random.default_rng([run.seed, 1, 0]).integers(2))
+    return run.batch + int(np.random.default_rng([run.seed, 1, 0]).integers(2))
 
 
 class Faulty(gym.Wrapper[Any, Any, Any, Any]):

@@ -132,8 +132,7 @@ print(*Controller.load("plant.npz")([0.1, 0.2, -0.1, 3.0]))
 
 def readings(count: int = 200) -> np.ndarray:
     """A plant that moves slowly, so that a jump of the action is the controller's."""
-    k = np.arange(count)[:, None]
-    return np.sin(0.003 * k + np.arange(4)) * [0.15, 0.15, 0.15, 1.5]
+    return np.sin(0.003 * np.arange(count)[:, None] + np.arange(4)) * [0.15, 0.15, 0.15, 1.5]
 
 
 def test_a_lost_sensor_is_bridged_then_the_output_held_and_all_comes_back(tmp_path):

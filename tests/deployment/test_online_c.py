@@ -109,8 +109,7 @@ def test_a_wrong_answer_is_seen(tmp_path, monkeypatch):
     kept = cortex_m.table
 
     def broken(kind, name, values, precision):
-        off = values + 1 if name == "answers" else values
-        return kept(kind, name, off, precision)
+        return kept(kind, name, values + 1 if name == "answers" else values, precision)
 
     monkeypatch.setattr(cortex_m, "table", broken)
     assert emulate(policy_of("reactor"), tmp_path).wrong > 100

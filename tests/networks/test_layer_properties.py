@@ -29,8 +29,7 @@ def far_and_near(mpc: LinearMPC, seed: int) -> th.Tensor:
     """Points in the box and beyond, on facets, and as far away as float32 goes."""
     points = mixture(mpc, seed)[:: 1 + len(mixture(mpc, seed)) // 150]
     away = np.sign(points[:20]) * 10.0 ** np.random.default_rng(seed).uniform(3, 38, (20, 1))
-    points = np.vstack([points, away]).clip(-LARGEST, LARGEST)
-    return th.as_tensor(points, dtype=th.float32)
+    return th.as_tensor(np.vstack([points, away]).clip(-LARGEST, LARGEST), dtype=th.float32)
 
 
 @examples(15)

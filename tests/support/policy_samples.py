@@ -39,8 +39,7 @@ two_inputs = cache(two_input_mpc)  # solved once
 def with_full_buffer(algorithm=DDPG, mpc: LinearMPC | None = None, **policy_kwargs):
     """Return a model that has acted but not learnt, for `updates` to train."""
     kwargs = {"buffer_size": 200, "gradient_steps": 0, "seed": 0, "learning_rate": 1e-2}
-    model = build(algorithm, mpc, policy_kwargs, **kwargs)
-    return model.learn(100, callback=NoActionNoise())
+    return build(algorithm, mpc, policy_kwargs, **kwargs).learn(100, callback=NoActionNoise())
 
 
 def updates(model, count: int) -> None:

@@ -146,8 +146,7 @@ class SparseQP:
         """Return rows of unit length in units of the variables."""
         rows = rows.copy()
         rows[:, : self.n_z] *= self.unit
-        length = np.linalg.norm(rows[:, : self.n_z], axis=1)
-        return rows / np.maximum(length, 1e-9)[:, None]
+        return rows / np.maximum(np.linalg.norm(rows[:, : self.n_z], axis=1), 1e-09)[:, None]
 
     def _set_cost(self) -> None:
         mpc = self.mpc

@@ -218,8 +218,7 @@ class Walk(gym.Env):
 
 
 def walk(env: gym.Env, seed: int | None) -> list[float]:
-    seen = [env.reset(seed=seed)[0][0]]
-    return seen + [env.step(np.zeros(1))[0][0] for _ in range(4)]
+    return [env.reset(seed=seed)[0][0]] + [env.step(np.zeros(1))[0][0] for _ in range(4)]
 
 
 def test_a_seed_repeats_an_episode_and_another_does_not() -> None:

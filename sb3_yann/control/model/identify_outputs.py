@@ -334,8 +334,7 @@ def _in_plant_units(
         mean = np.append(mean, 1.0)
         spread = linalg.block_diag(spread, 0.0)
     noise = unit[:, None] * model.noise * unit
-    plain = Innovations(A, B, K, C, c, np.zeros(q), noise, model.sparse)
-    return plain, (mean, spread)
+    return Innovations(A, B, K, C, c, np.zeros(q), noise, model.sparse), (mean, spread)
 
 
 def _with_memory(

@@ -107,8 +107,7 @@ class ThetaLayout:
     def _known_ahead(self) -> tuple[tuple[int, int, int], ...]:
         """Return the first entry, the number and the preview of references and of loads."""
         first = self.reference.start, self.disturbance.start
-        counts = self.n_references, self._loads
-        return tuple(zip(first, counts, self.previews, strict=True))
+        return tuple(zip(first, (self.n_references, self._loads), self.previews, strict=True))
 
     def sample(self, ahead: int) -> NDArray[np.intp]:
         """Return the entries of r and d so many samples ahead, of the last that are known."""

@@ -432,8 +432,7 @@ class LinearMPC(MPCProblem):
     def _widened(self, law: PiecewiseAffine) -> PiecewiseAffine:
         """Return a law of theta without extra signals as one of theta, on its plant."""
         own = self.deviations
-        whole = law.widened(self.extra, own.theta_min, own.theta_max)
-        return whole.on_plant(*self._plant)
+        return law.widened(self.extra, own.theta_min, own.theta_max).on_plant(*self._plant)
 
     def take_laws(self, other: LinearMPC) -> None:
         """Take over the laws of the same problem without extra signals, as far as solved."""
@@ -490,8 +489,7 @@ class LinearMPC(MPCProblem):
         program = self.condensed()
         limits = self.deviations.u_min, self.deviations.u_max
         require_sane_sizes(program, *limits)
-        law = OnlineLaw.of(program, *limits, self.infeasible)
-        return law.on_plant(*self._plant)
+        return OnlineLaw.of(program, *limits, self.infeasible).on_plant(*self._plant)
 
     @property
     def _plant(self) -> tuple[Any, ...]:

@@ -89,8 +89,7 @@ class Body(gym.Env):
 
     def _observe(self) -> np.ndarray:
         q = self.data.qpos[0]
-        v = self.data.qvel[0]
-        return np.array([np.sin(q), np.cos(q), v])
+        return np.array([np.sin(q), np.cos(q), self.data.qvel[0]])
 
 
 def test_the_interface_of_mujoco_is_taken() -> None:
