@@ -92,7 +92,9 @@ class StateEstimator:
         D, d_std = _covariance("disturbance_noise", disturbance_noise, d)
         V, v_std = _covariance("measurement_noise", measurement_noise, q)
         cross = np.zeros((n, q)) if cross_noise is None else cross_noise
-        cross = np.vstack([check_array("cross_noise", cross, (n, q)), np.zeros((d, q))])
+        cross = check_array("cross_noise", cross, (n, q))
+        self.noise = {"state_noise": W, "measurement_noise": V, "cross_noise": cross}
+        cross = np.vstack([cross, np.zeros((d, q))])
         periods = [check_int("every", each) for each in np.ravel(every).tolist()]
         if len(periods) not in (1, q):
             raise ValueError(f"every = {every} must be one number, or {q}.")

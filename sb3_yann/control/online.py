@@ -238,8 +238,7 @@ class OnlineLaw(PlantLaw):
             again = np.ascontiguousarray(rows[outside])
             softened = self.dual.solve(again, soft=True)
             u[outside] = self.dual.inputs(again, softened)
-        u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
-        u = np.clip(u, self.u_min, self.u_max)
+        u = np.clip(np.nan_to_num(u, nan=0.0), self.u_min, self.u_max)  # inf - inf, far away
         # A solution keeps them by itself: whatever else is in the batch, its bits stay.
         u[outside] = self._within_range(u[outside], rows[outside])
         return u, feasible, found, softened

@@ -156,8 +156,7 @@ def _shapes(layer: Any) -> set[tuple[int, ...]]:
     kinds = ("observation_space", "action_space", "single_observation_space", "single_action_space")
     sides = [layer, *(vars(layer).get(name) for name in ("env", "venv") if hasattr(layer, name))]
     spaces = [getattr(side, kind, None) for side in sides for kind in kinds]
-    shapes = {getattr(space, "shape", None) for space in spaces}
-    return {shape for shape in shapes if shape}
+    return {shape for space in spaces if (shape := getattr(space, "shape", None))}
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:

@@ -303,8 +303,7 @@ class SimulatorTrial(PairedTrial):
         self.played = played, seeds
         if act is not None:
             self.episodes += self.simulator.learn(*self.played)
-        no_regions = np.zeros((len(played.costs), 0), dtype=bool)
-        return Scores(played.costs, played.unsafe(), no_regions)
+        return Scores(played.costs, played.unsafe(), np.zeros((len(played.costs), 0), dtype=bool))
 
     def _tolerated(self, mpc_costs: Array) -> Tolerance:
         names = BoundNames.of(self.simulator.problem)

@@ -467,8 +467,7 @@ def task_of(model: LearntModel, unit: float, priced: bool = True) -> Task:
         doubt = Disagreement(model.dynamics, DOUBT * unit)
     end = value_at_end(model.problem)
     limits = model.limits
-    box = limits.low, limits.high
-    return Task(model.problem, *box, end.P, WEIGHT * unit, doubt, end.slope)
+    return Task(model.problem, limits.low, limits.high, end.P, WEIGHT * unit, doubt, end.slope)
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,8 +76,7 @@ class Starts:
         ranges = 2 * (2 / (k + 1) / RARE) ** (1 / max(k - 1, 1)) - 1
         further = (high - low) / 2 * max(ranges - 1, 0.0)
         low = np.minimum(rows.min(0), low - further)
-        high = high + further
-        return low, np.maximum(rows.max(0), high)
+        return low, np.maximum(rows.max(0), high + further)
 
     def draw(self, count: int, rng: np.random.Generator, episodes: Any = None) -> Array:
         """Return rows (count, size) where episodes begin: in the box, the rest as logged.
@@ -201,8 +200,7 @@ class Limits:
     def violated(self, thetas: Array) -> NDArray[np.bool_]:
         """Return whether states lie beyond, for rows (..., size); NaN does."""
         x = thetas[..., self.row.state]
-        inside = (x >= self.low) & (x <= self.high)
-        return np.asarray(~inside.all(axis=-1))
+        return np.asarray(~((x >= self.low) & (x <= self.high)).all(axis=-1))
 
 
 def _planned(coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:

@@ -85,8 +85,7 @@ class RowLayout:
         part = self.problem.layout.disturbance
         if self.estimator is None or self.observer is not None:
             return slice(part.stop, part.stop)
-        known = self._n_disturbances - self.estimator.n_estimated
-        return slice(part.start + known, part.stop)
+        return slice(part.start + self._n_disturbances - self.estimator.n_estimated, part.stop)
 
     @cached_property
     def size(self) -> int:

@@ -206,8 +206,7 @@ def evidence(
     room = FLOAT32_ROUNDING * problem.theta_half
     low = problem.deviations.theta_min - room
     high = problem.deviations.theta_max + room
-    shares = np.mean((theta < low) | (theta > high), axis=0)
-    shares = shares * (not logged.made_by_law.all())
+    shares = np.mean((theta < low) | (theta > high), axis=0) * (not logged.made_by_law.all())
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(problem, log))

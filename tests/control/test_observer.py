@@ -138,10 +138,7 @@ def identified(dt: float = 1.0) -> IdentifiedOutputs:
     rng = np.random.default_rng(0)
     u = np.repeat(rng.uniform(2, 4, (200, 1)), 4, axis=0)
     env = Hidden()
-    y = []
-    y.append(env.reset()[0])
-    for each in u:
-        y.append(env.step(each)[0])
+    y = [env.reset()[0], *[env.step(each)[0] for each in u]]
     return identify_outputs(np.array(y) + 0.01 * rng.normal(size=(801, 1)), u, dt=dt)
 
 
@@ -166,13 +163,19 @@ def test_the_estimator_of_a_model_predicts_as_the_model_does() -> None:
 @pytest.mark.filterwarnings("ignore:The measurement .* is not finite")
 @pytest.mark.parametrize("lost", [-1, 2])
 def test_tracking_from_outputs_alone_settles_without_offset(lost: int) -> None:
-    model = identified().model
+    found = identified()
+    model = found.model
     n = model.n_states
     box = {"u_min": 1, "u_max": 5, "theta_min": model.x_ss - 20, "theta_max": model.x_ss + 20}
     tracking = Tracking(model.C, 45, 55)
     mpc = LinearMPC(model, Q=np.eye(n), R=[[0.1]], horizon=5, tracking=tracking, **box)
     free, observer = offset_free(mpc)
-    assert observer.n_estimated == 1
+    quiet = offset_free(mpc, estimator=found.estimator())[1]
+    assert observer.n_estimated == quiet.n_estimated == 1
+    np.testing.assert_array_equal(quiet.noise["measurement_noise"], found.noise)
+    assert np.linalg.norm(quiet.gain[n:]) < 0.5 * np.linalg.norm(observer.gain[n:])
+    with pytest.raises(ValueError, match=r"estimator reads .* measured is"):
+        offset_free(mpc, measured=np.eye(n), estimator=quiet)
     reference = 52.0
 
     def rest(law: Any, wrapped: Any) -> float:

@@ -110,8 +110,7 @@ def _chosen(left: Array, steps: int, n: int) -> int:
     """Return the shortest dead time to which that of least criterion (k, n) adds little."""
     lags = np.arange(len(left))
     criterion = steps * np.sum(np.log(left), axis=1) + np.log(steps) * n * lags
-    best = left[int(np.argmin(criterion))]
-    return int(np.argmax(np.all(best > (1 - GAIN) * left, axis=1)))
+    return int(np.argmax(np.all(left[np.argmin(criterion)] > (1 - GAIN) * left, axis=1)))
 
 
 def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]:

@@ -350,8 +350,7 @@ class Chunks:
                 lost = self.lost[:, k]
                 now = now + (lost * (x[:, k] @ C.T)) @ K.T
                 power = power + K @ (lost[:, :, None] * (C @ free[:, k]))
-        basis = (weight @ (C @ free)) * self.read[..., None]
-        basis = basis.reshape(count, length * q, n)
+        basis = ((weight @ (C @ free)) * self.read[..., None]).reshape(count, length * q, n)
         left = ((errors - self.read * (x @ C.T)) @ weight.T) * self.read
         left = left.reshape(count, length * q, 1)
         inverse = np.linalg.pinv(basis, rcond=1e-10)

@@ -173,8 +173,7 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     best = int(np.argmin([np.sum(np.log(each)) for each in each_order]))
     on_their_way = [past[lag][:, n + j] for j, delay in enumerate(delays) for lag in range(delay)]
     late = left(squares, *on_their_way)
-    both = left(squares, lagged[best])
-    return Leftover(left(), left(squares), each_order[best], both, late)
+    return Leftover(left(), left(squares), each_order[best], left(squares, lagged[best]), late)
 
 
 def _held_out(basis: Array, values: Array, parts: list[NDArray[np.int64]]) -> Array:

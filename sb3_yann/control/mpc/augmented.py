@@ -19,10 +19,11 @@ from sb3_yann._validation import (
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.groups import DisturbanceBounds, Terminal
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
-from sb3_yann.control.observer import DisturbanceObserver
+from sb3_yann.control.observer import DisturbanceObserver, StateEstimator
 
 SHARE = 0.05
 """Of the half-widths of the box of states: what a disturbance moves in a sample, at most."""
+SLOW = 0.03  # a disturbance's step from sample to sample, in the noise of its reading
 
 
 def offset_free(
@@ -30,13 +31,14 @@ def offset_free(
     d_max: ArrayLike | None = None,
     measured: ArrayLike | Sequence[int] | None = None,
     every: int | Sequence[int] = 1,
+    estimator: StateEstimator | None = None,
 ) -> tuple[LinearMPC, DisturbanceObserver]:
     """Return the MPC with a disturbance of each measured state, and the observer that estimates it.
 
     Where the plant is not its model, the MPC settles beside its set-points. A constant disturbance
     in each state accounts for that: tracked outputs then settle without offset (Pannocchia and
     Rawlings, AIChE J. 49, 2003). They must be measured. The observer takes disturbances and errors
-    of measurements for equally large, in half-widths of the box of states.
+    of measurements for equally large, in half-widths of the box of states, but with ``estimator=``.
 
     Measured disturbances of the MPC stay, before the estimated ones: the observer takes them.
 
@@ -57,6 +59,9 @@ def offset_free(
         The disturbances then act on these.
     every : int or sequence of int, default 1
         Each output is read every so many samples, as of :class:`StateEstimator`.
+    estimator : StateEstimator, optional
+        Such as ``found.estimator()`` of `identify_outputs`. Its noise, and its ``every``, are the
+        observer's, and a disturbance drifts slowly beside it: smoother where outputs are noisy.
 
     Raises
     ------
@@ -106,6 +111,13 @@ def offset_free(
     both = np.append(known.d_min, -bound), np.append(known.d_max, bound)
     found = _changed(mpc, own, DisturbanceBounds(*both, known.preview), terminal)
     noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
+    if estimator is not None:
+        check_type("estimator", estimator, StateEstimator, "a StateEstimator: found.estimator()")
+        if not np.array_equal(estimator.C, C):
+            raise ValueError(f"estimator reads {estimator.C.tolist()} x, measured is {C.tolist()}.")
+        every = estimator.every.tolist()
+        drifts = SLOW * np.sqrt(np.diag(estimator.noise["measurement_noise"]))
+        noise = {**estimator.noise, "disturbance_noise": drifts}
     return found, DisturbanceObserver(found.model, C, every=every, **noise)
 
 

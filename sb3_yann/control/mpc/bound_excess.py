@@ -141,8 +141,7 @@ class BoundNames(NamedTuple):
             return ""
         k = int(worst)
         by = f"{largest * self.half[k]:.3g} {self.units[k]}".strip()
-        kind = "soft bound" if self.soft[k] else "bound"
-        return f"{self.names[k]} exceeds its {kind} by {by}"
+        return f"{self.names[k]} exceeds its {'soft ' if self.soft[k] else ''}bound by {by}"
 
 
 class BoundExcess(NamedTuple):

@@ -271,9 +271,8 @@ def test_input_without_effect_is_warned_of_by_the_log_s_name() -> None:
     log = replace(Log.from_arrays(x, both, 1), **names)
     with pytest.warns(UserWarning, match="heater has no effect on the next state beyond chance"):
         assert "Note: heater has no effect" in identify(log).model.report()
-    still = replace(Log.from_arrays(x, 0 * both, 1), **names)
     with pytest.raises(ValueError, match=r"do not excite the plant: .*heater never changes"):
-        identify(still)
+        identify(replace(Log.from_arrays(x, 0 * both, 1), **names))
 
 
 def test_sensor_noise_is_taken_for_no_delay() -> None:

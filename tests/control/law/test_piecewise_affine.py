@@ -353,6 +353,5 @@ def test_coordinates_are_named_and_shown_as_the_plant_shows_them() -> None:
     expected = [mpc.theta_min[3] + mpc.model.x_ss[3], mpc.theta_max[3] + mpc.model.x_ss[3]]
     np.testing.assert_allclose(axes.get_ylim(), expected)
     assert mpc.explicit().plot(axes, entries=(0, 3)) is axes
-    law = problems.clipped_pendulum().explicit()
     with pytest.raises(ValueError, match=r"\['speed', 'spin'\] must be .*names of angle, speed"):
-        law.plot(entries=("speed", "spin"))
+        problems.clipped_pendulum().explicit().plot(entries=("speed", "spin"))
