@@ -69,7 +69,7 @@ def test_stamps_that_jitter_about_one_grid_are_on_it() -> None:
     rng = np.random.default_rng(0)
     grid = 30.0 * np.arange(301)
     assert len(without_gaps([numbered(300)], [grid + rng.integers(-4, 5, 301)], 30)[0]) == 1
-    with pytest.warns(UserWarning, match="differ from dt = 30 .* an episode ends at each. Put"):
+    with pytest.warns(UserWarning, match="differ from dt = 30 .* an episode ends at each"):
         without_gaps([numbered(300)], [grid + rng.integers(-8, 9, 301)], 30)
     grid[150:] += 8  # the grid itself moves
     assert 1 < len(without_gaps([numbered(300)], [grid + rng.integers(-2, 3, 301)], 30)[0]) < 5

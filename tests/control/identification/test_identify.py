@@ -351,7 +351,7 @@ BAD_DATA: list[tuple[dict[str, Any], Message]] = [
     ({"x_ss": [1]}, r"x_ss has shape \(1,\), expected \(2,\)"),
     ({"time": np.arange(400)}, r"time of episode 0 has shape \(400,\), expected \(401,"),
     ({"time": np.arange(401) % 400}, "time of episode 0 does not increase after row 39"),
-    ({"time": np.arange(401) + 0.3 * (np.arange(401) % 2)}, r"100% of .* dt = 1 by .* even ones"),
+    ({"time": np.arange(401) + 0.3 * (np.arange(401) % 2)}, r"% of .* dt = 1 by .* even ones"),
     ({"time": np.arange(401) / 60}, r"dt = 1, but a step of the log takes 0\.0166667"),
     ({"time": [np.arange(401)] * 2}, "time has 2 episodes, states has 1"),
     ({"d_ss": [0.0]}, "d_ss is given, but there are no disturbances"),
