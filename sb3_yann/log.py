@@ -540,7 +540,7 @@ def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np
     if most or np.sum(uneven & (np.abs(whole - dt) < 0.5 * dt)) > 5 + 0.02 * len(whole):
         words = (
             f"{np.mean(uneven):.0%} of the log's steps differ from dt = {dt:g} by more than a "
-            f"tenth, {middle:g} in the median: an episode ends at each, and a model needs even ones. "
+            f"tenth, {middle:g} in the median: an episode ends at each, a model needs even ones. "
             "Put the readings on a grid of dt first, as historians and pandas' resample do."
         )
         if most:
