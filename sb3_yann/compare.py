@@ -304,8 +304,7 @@ class Difference(NamedTuple):
         size = np.abs(mpc_costs)
         with np.errstate(invalid="ignore"):  # a cost may be infinite
             mean = max(float(size.mean()), 1e-300)
-            change = mean_change(more, mpc_costs)
-            return cls.of((more - change * (size - mean)) / mean, in_turns)
+            return cls.of((more - mean_change(more, mpc_costs) * (size - mean)) / mean, in_turns)
 
     def room(self, level: float) -> float:
         """Return how far from 0 the mean may be by chance, one-sided; inf for a single pair."""

@@ -437,6 +437,7 @@ def _column(path: object, name: str, header: Sequence[str]) -> str:
     found = [each for each in header if name in (each, _name_and_unit(each)[0])]
     if not found:
         hint = " Its delimiter seems to be another: pass delimiter=';'." * (";" in "".join(header))
+        hint += " It is empty." * (not header)
         raise ValueError(f"{path} has no column {name!r}; it has {list(header)}.{hint}")
     if len(found) > 1:
         raise ValueError(f"{path} has several columns {name!r}: give each its own name.")
@@ -481,11 +482,14 @@ def _time(
     """Return a time as it is given, an ISO 8601 time stamp in the unit, and which of them it is."""
     try:
         return _number(path, row, content, name), False
-    except ValueError as error:
+    except ValueError:
         try:
             stamp = datetime.fromisoformat(content[name].strip())
         except ValueError:
-            raise error from None
+            raise ValueError(
+                f"{path}, row {row + 2}: {name} is {content[name]!r}, expected a number or a time "
+                "stamp such as 2026-01-31 08:00. pandas.to_datetime(..., dayfirst=True) makes it."
+            ) from None
     if unit not in ("", *SECONDS):
         raise ValueError(
             f"{path} has time stamps, and time_unit = {unit!r}: expected one of {[*SECONDS]}, "

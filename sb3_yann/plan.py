@@ -216,8 +216,7 @@ class Task:
         """Return gradient and curvature of the price of what is over (..., k), of rows (k, n)."""
         weight = 2 * self.weight
         active = (over != 0).astype(float)
-        curvature = np.einsum("ki,...k,kj->...ij", rows, active, rows)
-        return weight * over @ rows, weight * curvature
+        return weight * over @ rows, weight * np.einsum("ki,...k,kj->...ij", rows, active, rows)
 
 
 def roll_out(

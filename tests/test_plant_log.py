@@ -127,9 +127,7 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
     assert log.lost_steps == 3 and log.state_names == ("level", "T")
     assert log.every == (1, 1) and log.with_all_states() is log
     assert log.episodes[0].disturbances.tolist() == [[7], [7]]
-    with pytest.warns(
-        UserWarning, match=r"All 10 rows of .* one episode .*\['run', 't', 'T', 'load'\]"
-    ):
+    with pytest.warns(UserWarning, match=r"All 10 rows .* one episode .*\['run', 't', 'T', 'load'"):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10)
     with pytest.raises(ValueError, match=r"begins anew in each episode, name .* episode="):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, time="t")
@@ -229,6 +227,7 @@ TWO = "level,valve\n"
     ("text", "states", "said"),
     [
         (CSV, ["h"], "no column 'h'; it has"),
+        ("", ["h"], r"it has \[\]. It is empty."),
         (CSV, "level", "list of column names"),
         (CSV.replace("1.1", "high"), ["level"], "row 3: level is 'high', expected a number"),
         (TWO, ["level"], "no rows below its"),
@@ -293,5 +292,8 @@ def test_time_stamps_are_in_the_unit_of_dt(dt, unit, found, write) -> None:
     path = write("at,T,valve", *rows)
     log = Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at", time_unit=unit)
     assert (len(log.episodes[0]), log.time_unit, log.lost_steps) == (19, found, 0)
+    path = write("at,T,valve", *rows, "13/03/2026 08:00,1,2")
+    with pytest.raises(ValueError, match=r"row 22: at is '13/03/.*a number or a time stamp"):
+        Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at")
     with pytest.raises(ValueError, match="time_unit = 'hours': expected one of"):
         Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at", time_unit="hours")

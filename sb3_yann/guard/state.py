@@ -70,8 +70,7 @@ class Evidence:
         own = known[: len(costs)]
         if len(costs) == len(known) or not np.abs(own).sum():
             return float(costs.mean())
-        more = (costs - own).sum() / np.abs(own).sum()
-        return float(known.mean() + more * np.abs(known).mean())
+        return float(known.mean() + (costs - own).sum() / np.abs(own).sum() * np.abs(known).mean())
 
     def n_played(self, scores: Scores | None) -> int:
         """Return on how many known starts but the hard ones a policy has played."""

@@ -234,8 +234,7 @@ class Trial:
         """Return what each start may cost more than with the MPC."""
         chance = self.twin.starts.chance_beyond(self.starts).ravel()
         rare = np.clip(RARE / np.maximum(chance, 1e-300), 1.0, RAREST)
-        more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
-        return np.asarray(MARGIN * self.mean + more)
+        return np.asarray(MARGIN * self.mean + AROUND * rare * np.abs(self.mpc[0]) * ~self.known)
 
     @property
     def window(self) -> int:

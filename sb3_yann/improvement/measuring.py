@@ -100,6 +100,8 @@ class Headroom:
         Steps of the env that `improve` is likely not to exceed; 0 in a twin.
     unplanned : int
         Starts from which no plan was played: steps were too few, or Ctrl-C came.
+    why : dict of str to str
+        Why "observer" or "model" were not played.
 
     Examples
     --------
@@ -127,6 +129,7 @@ class Headroom:
     reidentified: LinearMPC | None = None
     budget: int = 0
     unplanned: int = 0
+    why: dict[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def total(self) -> float:
@@ -155,8 +158,8 @@ class Headroom:
             f"Verdict: {self.verdict}. By its own stage cost, from starts of {self.source}:",
             **paired_rows(self.best_costs, self.mpc_costs),
             of_that=", ".join(parts),
-            observer=self._as_played(self.observer_played),
-            new_model=self._as_played(self.reidentified_played),
+            observer=self._as_played(self.observer_played, "observer"),
+            new_model=self._as_played(self.reidentified_played, "model"),
             steps=steps,
             next=self._advice(),
         )
@@ -167,10 +170,10 @@ class Headroom:
     def _in_twin(self) -> bool:
         return self.source == "the twin"
 
-    def _as_played(self, costs: Array | None) -> str:
+    def _as_played(self, costs: Array | None, name: str) -> str:
         """Return what came of another MPC, losses included."""
         if costs is None:
-            return "not played"
+            return f"not played: {self.why[name]}" if name in self.why else "not played"
         each = (costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
         more = np.count_nonzero(each > SAME_COST)
         return (
@@ -190,9 +193,7 @@ class Headroom:
             )
         poor = ""
         if self.lost is not None:
-            more = (
-                f"{100 * self.lost:.3g} % more than" if self.lost >= LITTLE / 10 else "as much as"
-            )
+            more = "as much as" if self.lost < LITTLE / 10 else f"{100 * self.lost:.3g} % more than"
             poor = (
                 "plans were made in a model of its episodes that is not the plant: when played, "
                 f"they cost {more} the MPC. Take more starts: n_starts=."
@@ -324,9 +325,8 @@ class _Search:
         if self.twin is not None:
             self.twin.require_trust()
             other = self.twin.problem
-            if other.layout != mpc.layout or not np.array_equal(
-                other.deviations.u_min, mpc.deviations.u_min
-            ):
+            same = np.array_equal(other.deviations.u_min, mpc.deviations.u_min)
+            if other.layout != mpc.layout or not same:
                 raise ValueError(
                     "The twin is that of another MPC's plant: fit it with PlantTwin.fit(mpc, "
                     "episodes)."
@@ -341,6 +341,7 @@ class _Search:
         self.played: dict[str, Array] = {}  # costs of each controller, losses included
         self.fair: dict[str, Array] = {}  # the MPC's where a bound is broken by more
         self.reidentified: LinearMPC | None = None
+        self.why: dict[str, str] = {}
         self.planned = np.zeros(len(seeds), dtype=bool)  # starts from which a plan was played
 
     def found(self) -> Headroom:
@@ -405,16 +406,16 @@ class _Search:
         """Play the same MPC with an observer, unless it has one or measures disturbances."""
         mpc = self.mpc
         if mpc.layout.n_disturbances:
+            self.why["observer"] = "theta of the MPC holds disturbances already"
             return
         thetas, inputs, following = self.base.steps()
-        beyond = np.abs(following - mpc.deviations.predict(thetas, inputs)).max(axis=0)[
-            mpc.layout.state
-        ]
+        beyond = np.abs(following - mpc.deviations.predict(thetas, inputs)).max(axis=0)
         unit = mpc.theta_half[mpc.layout.state]
         try:
-            largest = np.maximum(2 * beyond, 1e-6 * unit)
+            largest = np.maximum(2 * beyond[mpc.layout.state], 1e-6 * unit)
             pair = offset_free(mpc, largest)
-        except ValueError:  # a disturbance that no input can hold
+        except ValueError as error:  # a disturbance that no input can hold
+            self.why["observer"] = str(error)
             return
         if np.any(largest > SHARE * unit):  # the default would cut off what was found here
             self.d_max = np.maximum(largest, SHARE * unit)
@@ -429,8 +430,10 @@ class _Search:
             else:
                 log = as_episodes(self.mpc.deviations, self.base.pairs)
                 other = reidentified(self.mpc, Coordinates.of(RowLayout(self.mpc), log), log)
-        except ValueError:  # a model without a steady state or a Riccati solution
+        except ValueError as error:  # a model without a steady state or a Riccati solution
+            self.why["model"] = str(error)
             return
+        self.why["model"] = "these episodes tell no other one"
         if other is not self.mpc:
             self.reidentified = other
             law = of_model(self.mpc, other)
@@ -502,9 +505,8 @@ class _Search:
             note = f"{which}: their costs are those of fewer steps. {note}".strip()
         excess = self.base.excess
         if excess is not None and (beyond := np.count_nonzero(excess.largest)):
-            note = (
-                f"{note} The MPC exceeds a hard bound in {beyond} of {len(base)} episodes.".strip()
-            )
+            some = f"{beyond} of {len(base)} episodes"
+            note = f"{note} The MPC exceeds a hard bound in {some}.".strip()
         # The MPC's own where another one is not better on average.
         both = (self.fair.get(name, base) for name in ("observer", "model"))
         observer, model = (each if each.mean() < base.mean() else base for each in both)
@@ -534,6 +536,7 @@ class _Search:
             reidentified=self.reidentified,
             budget=EPISODES_OF_IMPROVE * int(self.base.lengths.max()) if self.twin is None else 0,
             unplanned=unplanned,
+            why=self.why,
         )
 
 

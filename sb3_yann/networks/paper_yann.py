@@ -102,8 +102,7 @@ def _largest(law: PiecewiseAffine) -> float:
     """Return a bound on |K theta + r| of every region over the whole box."""
     middle = (law.theta_max + law.theta_min) / 2
     half = (law.theta_max - law.theta_min) / 2
-    at_middle = np.abs(law.gains @ middle + law.offsets)
-    return float(np.max(at_middle + np.abs(law.gains) @ half))
+    return float(np.max(np.abs(law.gains @ middle + law.offsets) + np.abs(law.gains) @ half))
 
 
 def _fixed(value: Array) -> nn.Parameter:

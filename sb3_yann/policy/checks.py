@@ -283,10 +283,10 @@ def require_theta(
         extra = f" Signals for networks alone are policy_kwargs={{'extra': {more}}}." * (more > 0)
         raise ValueError(
             f"The observation has shape {shape}, but the law of the problem {takes}. Wrap the env "
-            "so that it shows all of theta: SetPoint, MeasuredDisturbance, ObserveDisturbance and "
-            f"PreviousInput in sb3_yann.wrappers append what is missing.{extra} Or pass the map "
-            "from an observation to theta: policy_kwargs={'observation': AffineObservation(matrix, "
-            "offset)}."
+            "so that it shows all of theta: SetPoint, MeasuredDisturbance, EstimateState (of "
+            "outputs), ObserveDisturbance and PreviousInput in sb3_yann.wrappers append what is "
+            f"missing.{extra} Or pass the map from an observation to theta: "
+            "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
         )
     given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"
     if shape is None or observation.n_obs != np.prod(shape):

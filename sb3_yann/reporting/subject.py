@@ -116,8 +116,7 @@ def clean(value: Any) -> Html:
     """
     if isinstance(value, Html):
         return value
-    text = "".join(c if c in "\n\t" or is_text(c) else "\ufffd" for c in str(value))
-    return Html(escape(text))
+    return Html(escape("".join(c if c in "\n\t" or is_text(c) else "\ufffd" for c in str(value))))
 
 
 def tag(name: str, *content: Any, **attributes: str) -> Html:

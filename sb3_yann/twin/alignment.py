@@ -107,8 +107,7 @@ class Logged:
         columns = np.column_stack([np.ones(len(theta)), theta, law_of(self.problem)(theta)])
         left = self.inputs - columns @ np.linalg.lstsq(columns, self.inputs, rcond=None)[0]
         variance = np.var(self.inputs, axis=0)
-        share = np.var(left, axis=0) / np.maximum(variance, 1e-300)
-        return np.where(variance > 0, share, 0.0)
+        return np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
 
     def on_law(self, shift: int = 0) -> tuple[Array, Array]:
         """Return rows of theta (N, n_theta), ``shift`` away from the inputs (N, m) beside them."""

@@ -317,8 +317,7 @@ class Dynamics:
         begin = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
         given = episode.thetas[:-1, None, row.given]
         rows, u = self._play(inputs, begin, len(episode), given)
-        costs = own.stage_cost(row.shown(rows[:-1]), u)
-        return np.asarray(costs[..., 0].sum(axis=0))
+        return np.asarray(own.stage_cost(row.shown(rows[:-1]), u)[..., 0].sum(axis=0))
 
     def _play(
         self, act: Callable[[int, Array], Array], starts: Array, steps: int, given: Array | None

@@ -309,12 +309,12 @@ def test_what_an_observer_loses_is_shown_as_a_loss() -> None:
     dear = np.array([9.0, 20.0, 43.0])
     found = Headroom(
         costs, costs, costs, costs, 0.0, 0.0, 0.0, "keep the MPC", "a simulator",
-        observer_played=dear,
+        observer_played=dear, why={"model": "it has no rest"},
     )  # fmt: skip
     text = found.report()
     assert "-0.00 %" not in text
     observer = "+20.00 % as it was played, worst start +43.33 % of its own cost; 1 of 3 cost more"
-    assert f"  observer     {observer}\n  new model    not played" in text
+    assert f"  observer     {observer}\n  new model    not played: it has no rest" in text
     some = dataclasses.replace(found, best_costs=costs - 0.2, nonlinearity=0.01, budget=8_000)
     for said in ("less than 2 %", "improve(mpc, make, max_steps=8_000) may still find some of it"):
         assert said in some.report()

@@ -105,8 +105,7 @@ class Certificate:
         laws = self.laws[regions]
         gains = laws[..., :-1]
         off = np.einsum("kvn,kn->kv", gains, points) + laws[..., -1] - inputs @ self.to_inputs.T
-        slope = np.abs(gains).sum(axis=2).max(axis=1)
-        return np.asarray(np.abs(off).max(axis=1) - 1e-10 * slope)
+        return np.asarray(np.abs(off).max(axis=1) - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1))
 
     def _conditions(self) -> Iterator[tuple[int, Optimality]]:
         """Yield the KKT conditions of each region."""

@@ -65,8 +65,11 @@ class Identified(ReadOnlyArrays):
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
-    def __str__(self) -> str:
+    def report(self) -> str:
+        """Return an account in words, that of the model."""
         return self.model.report()
+
+    __str__ = report
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
         """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E".

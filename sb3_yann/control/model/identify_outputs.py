@@ -88,12 +88,11 @@ class IdentifiedOutputs(ReadOnlyArrays):
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
-    def __str__(self) -> str:
-        return self.report()
-
     def report(self) -> str:
         """Return an account in words: poles, controllability, sampling, fit and notes."""
         return self.model.report()
+
+    __str__ = report
 
     def predict(
         self,

@@ -161,7 +161,7 @@ def test_rows_that_are_missing_are_noticed_by_their_time() -> None:
     kept = np.setdiff1d(np.arange(401), [7, 100, 101, 250])
     found = identify(x[kept], u[kept[:-1]], dt=0.5, time=time[kept])
     np.testing.assert_allclose(found.model.A, A, atol=1e-8)
-    assert "3 steps at gaps, or of another time than dt, are left out" in found.model.report()
+    assert "3 steps at gaps, or of another time than dt, are left out" in found.report()
     assert np.abs(identify(x[kept], u[kept[:-1]], dt=0.5).model.A - A).max() > 1e-3
 
 
