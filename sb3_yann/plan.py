@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback, Mask
 from sb3_yann.control import LinearMPC, lqr
+from sb3_yann.control._kernels.sweep import sweep
 from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond, mixed_half
 from sb3_yann.control.mpc.problem import Value
 from sb3_yann.rollout import Rows
@@ -215,8 +216,8 @@ class Task:
     def _squares(self, over: Array, rows: Array) -> tuple[Array, Array]:
         """Return gradient and curvature of the price of what is over (..., k), of rows (k, n)."""
         weight = 2 * self.weight
-        active = (over != 0).astype(float)
-        return weight * over @ rows, weight * np.einsum("ki,...k,kj->...ij", rows, active, rows)
+        active = (over != 0)[..., None, :]
+        return weight * over @ rows, weight * ((rows.T * active) @ rows)
 
 
 def roll_out(
@@ -357,43 +358,24 @@ def _backward(
     size = problem.n_theta
     states = problem.layout.state
     A, B = plant.jacobians(thetas[:-1], inputs, rows)
-    F = np.concatenate([A, B], axis=-1)
-    slopes, curved = task.slopes(thetas[:-1], inputs)
+    slopes, curved = (np.array(each) for each in task.slopes(thetas[:-1], inputs))
     gradient, curvature = task.penalty(thetas[1:])
+    slopes[1:, :, states] += gradient[:-1]
+    curved[1:, :, states, states] += curvature[:-1]
+    v = 2 * thetas[-1] @ task.end + task.end_slope
+    V = np.tile(2 * task.end, (len(rows), 1, 1))
+    v[:, states] += gradient[-1]
+    V[:, states, states] += curvature[-1]
     limits = task.limits(thetas[:-1])
-    low, high = (each - inputs for each in limits)
     # A bound of the rate moves with the previous input.
     still = problem.deviations.limits_at("u", thetas[:-1])
     moving = np.stack([a != b for a, b in zip(limits, still, strict=True)], axis=1)
-    v = 2 * thetas[-1] @ task.end + task.end_slope
-    V = np.tile(2 * task.end, (len(rows), 1, 1))
-    corrections = np.empty_like(inputs)
-    gains = np.empty_like(plans.gains)
-    saved = np.zeros(len(rows))
+    sides = np.stack(limits, axis=1) - inputs[:, None]
     damped = 2 * damping[:, None, None] * problem.stage_matrix[size:, size:]
-    for t in reversed(range(len(inputs))):
-        v[:, states] += gradient[t]
-        V[:, states, states] += curvature[t]
-        Ft = F[t].swapaxes(1, 2)
-        q = slopes[t] + (Ft @ v[..., None])[..., 0]
-        H = curved[t] + Ft @ V @ F[t]
-        qx = q[:, :size]
-        qu = q[:, size:]
-        Hxx = H[:, :size, :size]
-        Hux = H[:, size:, :size]
-        Huu = H[:, size:, size:]
-        move = _bounded_step(Huu + damped, qu, low[t], high[t])
-        K = _feedback(Huu + damped, Hux, move <= low[t], move >= high[t], moving[t])
-        Kt = K.swapaxes(1, 2)
-        pulled = (Huu @ move[..., None])[..., 0]
-        saved -= np.sum((qu + pulled / 2) * move, axis=1)
-        v = qx + (Kt @ (qu + pulled)[..., None])[..., 0]
-        v += (Hux.swapaxes(1, 2) @ move[..., None])[..., 0]
-        V = Hxx + Kt @ Huu @ K + Kt @ Hux + Hux.swapaxes(1, 2) @ K
-        V = (V + V.swapaxes(1, 2)) / 2
-        corrections[t] = move
-        gains[t] = K
-    return corrections, gains, saved
+    found = np.empty(inputs.shape), np.empty(plans.gains.shape), np.zeros(len(rows))
+    F = np.ascontiguousarray(np.concatenate([A, B], axis=-1))
+    sweep(F, slopes, curved, sides, moving, damped, v, V, *found)
+    return found
 
 
 def slopes_of_inputs(
@@ -434,47 +416,6 @@ def slopes_of_inputs(
 def _pulled(J: Array, v: Array) -> Array:
     """Return J' v (k, p) for J (k, q, p) and v (k, q)."""
     return np.asarray((J.swapaxes(1, 2) @ v[..., None])[..., 0])
-
-
-def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """Return the minimizers (k, m) of ``u'Hu / 2 + g'u`` in a box, for H (k, m, m), g (k, m).
-
-    Projected Newton steps: an input on its bound is held there while the slope presses it on.
-    """
-    if g.shape[1] == 1:
-        return np.clip(-g / H[..., 0], low, high)
-    move: Array = np.clip(np.zeros_like(g), low, high)
-    for _ in range(2 * g.shape[1] + 1):
-        slope = g + (H @ move[..., None])[..., 0]
-        held = ((move <= low) & (slope > 0)) | ((move >= high) & (slope < 0))
-        step = np.linalg.solve(_reduced(H, held), np.where(held, 0.0, slope)[..., None])[..., 0]
-        before = move
-        move = np.clip(move - step, low, high)
-        if np.array_equal(before, move):
-            break
-    return move
-
-
-def _feedback(H: Array, G: Array, at_low: Mask, at_high: Mask, moving: Mask) -> Array:
-    """Return the gains (k, m, n_theta) of the minimizers in a box whose sides may move.
-
-    H (k, m, m) is the curvature, G (k, m, n_theta) how the gradient changes with theta, and
-    ``moving`` (2, k, m) says whether the lower and the upper bound move with the previous input,
-    theta's last entries.
-    """
-    held = at_low | at_high
-    m = H.shape[1]
-    fixed: Array = np.zeros_like(G)
-    row, j = np.nonzero((at_low & moving[0]) | (at_high & moving[1]))
-    fixed[row, j, G.shape[2] - m + j] = 1.0
-    right = np.where(held[:, :, None], fixed, -G - H @ fixed)
-    return np.asarray(np.linalg.solve(_reduced(H, held), right))
-
-
-def _reduced(H: Array, held: Mask) -> Array:
-    """Return H (k, m, m) with the rows and columns of inputs that are held replaced by ones."""
-    free = ~held[:, :, None] & ~held[:, None, :]
-    return np.where(free, H, held[:, :, None] * np.eye(H.shape[1]))
 
 
 def initial_guesses(
