@@ -570,8 +570,7 @@ class Planning:
             return 0.0
         begun, plan, _ = self.plans[row]
         thetas = plan.thetas[: until - begun]
-        inputs = plan.inputs[: until - begun]
-        costs = self.task.problem.deviations.stage_cost(thetas, inputs)
+        costs = self.task.problem.deviations.stage_cost(thetas, plan.inputs[: until - begun])
         return self._kept[row] + float(np.sum(costs))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 from typing import Any
 
 import gymnasium as gym
@@ -41,6 +41,8 @@ SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
 FAR = 3.5  # times as far or as little as the model says: a nonlinear plant alone varies more
 SIGN_STEPS = 10  # steps for which it is pushed where outputs are read
+UNLIKE = 0.7  # cosine of answers to pushes and the model's, below which they are others
+ALIKE = 0.95
 LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
 EXPLAINED_REWARD = 0.95
 """Share of the rewards' variance from which on they are taken for minus the stage cost."""
@@ -205,6 +207,9 @@ def warn_of_signs(
         return np.array(found)
 
     unmoved: dict[int, Array] = {}
+    told = np.array([response[..., j] @ C.T for j in range(len(names))])
+    answers = np.zeros_like(told)
+    said = list[str]()
     for j, name in enumerate(names):
         gains = []
         for i in starts:
@@ -214,11 +219,13 @@ def warn_of_signs(
                 if i not in unmoved:
                     first = theta(played.observations[i][1:2])[:, states]
                     unmoved[i] = first if estimating is None else hold(i, action)
-                effect = weight * (hold(i, pushed) - unmoved[i])
+                change = hold(i, pushed) - unmoved[i]
             except Exception:  # of a brittle simulator: what it says under the MPC counts
-                return
+                break
             by = np.diff(inputs(np.array([action, pushed])), axis=0)[0, j]
-            expected = weight * (response[..., j] @ C.T) * by
+            answers[j] += change / by
+            effect = weight * change
+            expected = weight * told[j] * by
             expected[~np.isfinite(effect)] = 0  # readings that come now and then
             effect = np.nan_to_num(effect)
             size = float(np.sum(expected**2))
@@ -228,16 +235,41 @@ def warn_of_signs(
             continue
         found = f"{np.median(gains):.2g} times as far in {when}, from {len(gains)} starts"
         if max(gains) < 0:
-            warn(
+            said.append(
                 f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "
                 "the wrong way. Look at the sign and the order of the actions, and at B.",
             )
         elif min(gains) > FAR or (0 < min(gains) and max(gains) < 1 / FAR):
-            warn(
+            said.append(
                 f"{name} moves the env otherwise than the model's B says: {found}. Is a step of "
                 f"the env the model's dt, {model.step_length}, and the input in the "
                 "same unit? Else identify the model anew.",
             )
+    swapped = _swapped(told, answers) if estimating is not None else ""
+    for words in [swapped] if swapped else said:
+        warn(words)
+
+
+def _swapped(told: Array, answers: Array) -> str:
+    """Return in which other order alone outputs answer pushes (m, steps, q) as they are told to."""
+
+    def likeness(shown: Sequence[int], taken: Sequence[int]) -> float:
+        both = np.stack([answers[:, :, shown], told[[*taken]]]) / units
+        both = both.reshape(2, len(told), -1)
+        sizes = np.maximum(np.linalg.norm(both, axis=-1).prod(axis=0), 1e-300)
+        return float(np.min(both.prod(axis=0).sum(axis=-1) / sizes))
+
+    m, _, q = told.shape
+    units = np.maximum(np.linalg.norm(told, axis=(0, 1)), 1e-300)
+    orders = [*product(permutations(range(q)), permutations(range(m)))] if max(q, m) <= 4 else []
+    found = max(orders, key=lambda each: likeness(*each), default=None)
+    if found is None or not likeness(range(q), range(m)) < UNLIKE < ALIKE < likeness(*found):
+        return ""
+    return (
+        f"The env seems to show the model's outputs in the order {np.argsort(found[0]).tolist()}, "
+        f"and to take its inputs in the order {[*found[1]]}: so it answers pushes as the model "
+        "says, and as it is it does not. Sort what it shows, or takes, as the model has it."
+    )
 
 
 def _push(env: gym.Env[Any, Any], action: Array, j: int) -> Array:
@@ -289,8 +321,7 @@ def explained(gain: Array, rewards: Array, known: Mask) -> float:
 
 def _centered(values: Array, known: Mask) -> Array:
     """Return the known values (steps,) less the mean of their episodes, the columns."""
-    kept = np.where(known, values, 0.0)
-    mean = kept.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.asarray((values - mean)[known])
 
 

@@ -387,8 +387,7 @@ def _description(data: ControllerArrays, about: str, identity: str, units: list[
     listed = ET.SubElement(kind, "SourceFiles")
     for unit in units:
         ET.SubElement(listed, "File", name=unit)
-    logs = ET.SubElement(root, "LogCategories")
-    ET.SubElement(logs, "Category", name="logStatusError")
+    ET.SubElement(ET.SubElement(root, "LogCategories"), "Category", name="logStatusError")
     if data["dt"]:
         step = repr(float(data["dt"]))
         ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=step)

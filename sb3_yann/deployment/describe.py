@@ -462,8 +462,7 @@ def _no_networks(law: PiecewiseAffine) -> dict[str, Any]:
 def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
     """Return the networks of a layer that are not zero, and which of them each region has."""
     network = layer.network
-    nodes = network.first.nodes.detach().double().cpu().numpy()
-    first = nodes.sum(1)
+    first = network.first.nodes.detach().double().cpu().numpy().sum(1)
     rest = [each.detach().double().cpu().numpy() for each in network.weights()[1:]]
     layers = [first, *rest]
     pinned = network.pinned[:, 0].cpu().numpy() > 0

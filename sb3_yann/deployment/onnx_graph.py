@@ -167,8 +167,7 @@ def _locate(
     op = graph.op
     constant = graph.constant
     starts = data["starts"]
-    rows = len(data["b"])
-    counts = np.diff([*starts, rows])
+    counts = np.diff([*starts, len(data["b"])])
     A = np.zeros((len(starts), counts.max(), theta_size := data["A"].shape[1]))
     b = np.full(A.shape[:2], np.inf)  # rows that never bind fill up the shorter regions
     for i, (start, count) in enumerate(zip(starts, counts, strict=True)):

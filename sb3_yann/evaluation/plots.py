@@ -223,8 +223,7 @@ def plot_surface(
     plane = _Plane(problem, entries, frame)
     u = plane.values(policy)
     axes = axes_or_new(axes, 5.4, 4.2)
-    mesh = plane.draw(axes, u, (u.min(), u.max()))
-    axes.figure.colorbar(mesh, ax=axes, label=plane.name)
+    axes.figure.colorbar(plane.draw(axes, u, (u.min(), u.max())), ax=axes, label=plane.name)
     return axes
 
 
@@ -512,8 +511,7 @@ def plot_gains(runs: Runs, axes: Axes | None = None) -> Axes:
     those of two controllers, from the same starts.
     """
     (first, before), (second, after) = runs.items()
-    change = np.sort(after.costs - before.costs)
-    share = 100 * change / (abs(float(before.costs.mean())) or 1.0)
+    share = 100 * np.sort(after.costs - before.costs) / (abs(float(before.costs.mean())) or 1.0)
     axes = axes_or_new(axes, 6.4, 2.6)
     colors = [COLORS[2] if each <= 0 else COLORS[1] for each in share]
     axes.bar(np.arange(1, len(share) + 1), share, color=colors, width=0.8)

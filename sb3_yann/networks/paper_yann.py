@@ -40,8 +40,7 @@ class PaperYann(nn.Module):
         p = law.n_regions
         m = law.n_inputs
         n = law.n_theta
-        q = law.n_halfspaces
-        counts = np.diff([*law.starts, q])
+        counts = np.diff([*law.starts, law.n_halfspaces])
         owner = np.repeat(np.eye(p), counts, axis=1)  # (p, q): which region a half-space bounds
         sign = np.array([1.0, -1.0])
         gains = np.concatenate([s * law.gains.reshape(p * m, n) for s in sign])

@@ -19,12 +19,7 @@ from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.mpc.invariant_sets import KeptSet
 from sb3_yann.control.online import Law
-from sb3_yann.networks.zero_output import (
-    Activation,
-    RowAdam,
-    ZeroOutputNetwork,
-    register_constants,
-)
+from sb3_yann.networks.zero_output import Activation, RowAdam, ZeroOutputNetwork, register_constants
 from sb3_yann.units import FLOAT32_ROUNDING, KEPT_ROUNDING
 
 ChangeBounds = tuple[Array, Array]

@@ -214,11 +214,9 @@ def _beyond(subject: Subject) -> Finding:
     begins = np.array([each[0] for each in subject.shown_loops[OF_MPC].observations])[:, part]
     low = begins.min(axis=0)
     high = begins.max(axis=0)
-    names = with_units(problem.model)[0]
-    box = ", ".join(map("{} {:.4g} to {:.4g}".format, names, low, high))
+    box = ", ".join(map("{} {:.4g} to {:.4g}".format, with_units(problem.model)[0], low, high))
     states = problem.units.to_plant(subject.samples)[:, part]
-    beyond = states[((states < low) | (states > high)).any(axis=1)]
-    loops = subject.loops_from(beyond)
+    loops = subject.loops_from(states[((states < low) | (states > high)).any(axis=1)])
     mpc, policy = (Scores(loops[who].costs, loops[who].unsafe()) for who in (OF_MPC, OF_POLICY))
     text = f"Episodes begin at {box}."
     count = len(mpc.costs)

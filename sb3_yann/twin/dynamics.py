@@ -315,8 +315,7 @@ class Dynamics:
             return u[:, None]
 
         begin = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
-        given = episode.thetas[:-1, None, row.given]
-        rows, u = self._play(inputs, begin, len(episode), given)
+        rows, u = self._play(inputs, begin, len(episode), episode.thetas[:-1, None, row.given])
         return np.asarray(own.stage_cost(row.shown(rows[:-1]), u)[..., 0].sum(axis=0))
 
     def _play(

@@ -318,8 +318,7 @@ def _fitted(
         coordinates = replace(coordinates, low=box.low, high=box.high, units=box.units)
     parts = pieces(log, FOLDS)
     blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
-    rng = np.random.default_rng(seed)
-    draws = rng.integers(len(blocks), size=(n_members - 1, len(blocks)))
+    draws = np.random.default_rng(seed).integers(len(blocks), size=(n_members - 1, len(blocks)))
     drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
     kept = without_each_fold(parts)
     # The model as it is comes first, to compare with, whether it may be chosen or not.
@@ -350,8 +349,7 @@ def _fitted(
     elif choice.setting is not None:
         members = [ridge(coordinates, each, [choice.setting])[0] for each in drawn]
     elif choice.name == "none":
-        zero = Residual.zero(len(coordinates.scale), problem.model.n_states)
-        members = [zero] * n_members
+        members = [Residual.zero(len(coordinates.scale), problem.model.n_states)] * n_members
     dynamics = Dynamics(problem, coordinates, tuple(members))
     trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
     found = judges(coordinates, parts, choice, runs.scores[chosen]) if choice.by_fold else ()

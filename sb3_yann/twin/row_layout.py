@@ -131,8 +131,7 @@ class RowLayout:
     def inputs(self) -> Any:
         """Where in ``[row, u]`` stands what the plant's next state depends on, (k,)."""
         number = np.arange(self.size + self.problem.model.n_inputs)
-        parts = self.problem.layout
-        d = number[parts.disturbance] if self.observer is None else number[:0]
+        d = number[self.problem.layout.disturbance] if self.observer is None else number[:0]
         return np.concatenate([number[self.state], d, number[self.size :]])
 
     @cached_property

@@ -497,7 +497,6 @@ def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, 
     The drift acts as a constant disturbance does.
     """
     drifting = LinearModel(A, B, problem.model.dt, E=drift[:, None])
-    x_unit = problem.theta_half[problem.layout.state]
-    weights = problem.Q, problem.R, x_unit, problem.u_half
+    weights = problem.Q, problem.R, problem.theta_half[problem.layout.state], problem.u_half
     found = steady_states(drifting, problem.tracking.C, *weights)
     return found.x[:, -1], found.u[:, -1]

@@ -213,9 +213,7 @@ def test_all_of_theta_and_something_beside_it_is_too_much() -> None:
     as_episodes(loaded(), whole)
     with pytest.raises(ValueError, match=r"\['references'\] is given, but states are all of theta"):
         as_episodes(loaded(), whole, [0.0])
-    with pytest.raises(
-        ValueError, match="states have 3 columns, the problem 1 states, and theta 5"
-    ):
+    with pytest.raises(ValueError, match="states have 3 columns, the problem 1 states, and theta"):
         as_episodes(loaded(), [(np.zeros((8, 3)), np.zeros((7, 1)))])
 
 

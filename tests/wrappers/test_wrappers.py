@@ -134,9 +134,7 @@ def test_the_last_disturbance_that_is_known_stays() -> None:
     assert env.step(np.zeros(1))[0][2:].tolist() == [3, 3, 3]
     with pytest.raises(ValueError, match=r"shape \(0,\), expected \(3, 1\)"):
         env.step(np.zeros(1))
-    with pytest.raises(
-        ValueError, match=r"shape \(3, 1\), expected \(5, 1\), a row for this sample"
-    ):
+    with pytest.raises(ValueError, match=r"shape \(3, 1\), expected \(5, 1\), a row for this"):
         MeasuredDisturbance(Record(), 0, 9, preview=4).reset()
 
 

@@ -116,8 +116,7 @@ class Certificate:
         for size, members in batches(
             map(len, sets), lambda size: (v + size) * (v + size + rows + n + 1)
         ):
-            effort = effort_of_conditions(rows + n, v + size, v + size)
-            self.timer.tick(len(members) * effort)
+            self.timer.tick(len(members) * effort_of_conditions(rows + n, v + size, v + size))
             found = optimality(self.program, [sets[k] for k in members])
             yield from zip(members, found, strict=True)
 

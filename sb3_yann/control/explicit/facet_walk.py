@@ -195,8 +195,7 @@ class Conditions:
     def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
         self.timer = timer
         self.outer_A, self.outer_b = program.theta_rows()
-        moving = np.flatnonzero(np.any(program.G, axis=1))
-        self._bound_feasible_set(program, moving)
+        self._bound_feasible_set(program, np.flatnonzero(np.any(program.G, axis=1)))
         timer.tick()
         L = np.linalg.cholesky(program.H)
         self.back = np.linalg.inv(L).T

@@ -262,8 +262,7 @@ def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> lis
     length[constant] = np.maximum(noise[constant], 1e-300)
     rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
     rows[constant, :n] = 0.0
-    reach = np.abs(rows[:, :, :n]).sum(axis=2)
-    binding = rows[:, :, n] < reach
+    binding = rows[:, :, n] < np.abs(rows[:, :, :n]).sum(axis=2)
     return [
         Optimality(
             active=members[i],

@@ -293,8 +293,7 @@ def _require_feasible(program: ParametricQP, timer: BudgetTimer) -> None:
     rows = np.hstack([program.G, -program.S])
     rows = np.hstack([rows, np.linalg.norm(rows, axis=1, keepdims=True)])
     bounds = [(None, None)] * v + [(-1, 1)] * n + [(None, 1)]
-    cost = np.append(np.zeros(v + n), -1.0)
-    ball = _linprog(cost, rows, program.w, bounds, timer)
+    ball = _linprog(np.append(np.zeros(v + n), -1.0), rows, program.w, bounds, timer)
     if ball.status != 0 or ball.x[-1] < 1e-9:
         raise ValueError(
             "The MPC problem is infeasible: no theta in its box has inputs that keep every bound "

@@ -108,8 +108,7 @@ def _left(gram: Array, delays: list[int], n: int) -> Array:
 
 def _chosen(left: Array, steps: int, n: int) -> int:
     """Return the shortest dead time to which that of least criterion (k, n) adds little."""
-    lags = np.arange(len(left))
-    criterion = steps * np.sum(np.log(left), axis=1) + np.log(steps) * n * lags
+    criterion = steps * np.sum(np.log(left), axis=1) + np.log(steps) * n * np.arange(len(left))
     return int(np.argmax(np.all(left[np.argmin(criterion)] > (1 - GAIN) * left, axis=1)))
 
 

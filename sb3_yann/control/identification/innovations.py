@@ -254,8 +254,7 @@ class Chunks:
             count = -(-len(each) // CHUNK)
             edges = np.linspace(0, len(each) + 1, count + 1).round().astype(int)
             driven = np.vstack([each.driven, np.zeros((1, each.driven.shape[1]))])
-            ends = pairwise(edges)
-            parts += [(each.states[a:b], driven[a:b]) for a, b in ends if b - a > 1]
+            parts += [(each.states[a:b], driven[a:b]) for a, b in pairwise(edges) if b - a > 1]
         shape = len(parts), max(len(y) for y, _ in parts)
         self.y = np.zeros((*shape, parts[0][0].shape[1]))
         self.v = np.zeros((*shape, parts[0][1].shape[1]))

@@ -232,8 +232,7 @@ class Search:
         read = np.isfinite(shown)
         steps, q = shown.shape
         price = 2 * np.log(np.log(max(steps, 16)))
-        errors = np.where(read, shown - guess, 0.0)
-        noise = mean_square(errors, read) + FLOOR * np.eye(q)
+        noise = mean_square(np.where(read, shown - guess, 0.0), read) + FLOOR * np.eye(q)
         size = log_determinant(noise, read.sum(axis=0))
         return float(size + price * model.n_parameters / steps)
 
@@ -284,8 +283,7 @@ def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Epis
     """
     y = [each.states for each in episodes]
     driven = [each.driven for each in episodes]
-    gaps = np.mean(~np.isfinite(np.concatenate(y)[:, slow]))
-    longest = 8 / max(1 - gaps, 1e-3)
+    longest = 8 / max(1 - np.mean(~np.isfinite(np.concatenate(y)[:, slow])), 1e-3)
     constants = np.exp2(np.arange(max(3, int(np.log2(longest)) + 1), dtype=np.float64))
     parts = [_filtered(a[:, ~slow], b, constants) for a, b in zip(y, driven, strict=True)]
     rows = np.concatenate(parts)

@@ -287,8 +287,7 @@ def error_system(
                          [-steady.u @ every[layout.now], np.eye(m)]])  # fmt: skip
     if is_rated:
         from_now = np.vstack([from_now, np.hstack([-previous, np.eye(m)])])
-    weight = linalg.block_diag(*weights[: 2 + is_rated])
-    W = from_now.T @ weight @ from_now
+    W = from_now.T @ linalg.block_diag(*weights[: 2 + is_rated]) @ from_now
 
     to_input = steady.u @ every[layout.last]
     changes = np.flatnonzero(layout.next != np.arange(layout.size))

@@ -183,8 +183,7 @@ class MPCProblem(ReadOnlyArrays):
         if not self.has_rate_bounds:
             return low, high
         before = thetas[..., self.layout.previous]
-        sides = self.limits_at("du", thetas)
-        slowest = [np.clip(before + side, *fixed) for side in sides]
+        slowest = [np.clip(before + side, *fixed) for side in self.limits_at("du", thetas)]
         return np.clip(low, *slowest), np.clip(high, *slowest)
 
     @property
@@ -527,8 +526,7 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
     closed[:n, n] = B @ held
     own = play.T @ stage @ play
     still = np.zeros((n + 1, 1))
-    model = LinearModel(closed, still, problem.model.dt)
-    P = lqr.policy_value(model, own, one, still.T, gamma)
+    P = lqr.policy_value(LinearModel(closed, still, problem.model.dt), own, one, still.T, gamma)
     return Value(P[:n, :n], 2 * P[:n, n], float(P[n, n]))
 
 

@@ -160,8 +160,7 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
 
 
 def _values(problem: MPCProblem, law: Law, feasible: Array) -> Iterator[str]:
-    inputs = ", ".join(labels_of(problem.model)[1])
-    u = inputs if problem.model.input_names else "u"
+    u = ", ".join(labels_of(problem.model)[1]) if problem.model.input_names else "u"
     units = problem.units
     # In parentheses: rich would take names in brackets for its markup.
     yield f"The law at a few parameters ({', '.join(problem.labels())}):"
