@@ -339,7 +339,8 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str:
         return (
             f"two steps from the same state {x.tolist()} end in {first.tolist()} and "
             f"{again.tolist()}: setting it fails, or the plant is random or has states besides "
-            "these (linearize it without its noise, or identify it: LinearModel.from_data)"
+            "these (linearize it without its noise, its equations by LinearModel.from_dynamics, "
+            "with d_ss= of a load, or identify it: LinearModel.from_data)"
         )
     pushed = simulator.next_state(other, u + 0.1 * simulator.way(u))
     if np.array_equal(moved, other) and np.array_equal(pushed, other):

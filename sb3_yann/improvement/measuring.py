@@ -49,14 +49,14 @@ CURE_IN_TWIN = (
     "improve(mpc, PlantTwin.fit(mpc, log, observer=observer))."
 )
 """How an observer is added, where there is an env, and where there is a log alone."""
+BEYOND_LINEAR = "most of it is beyond a linear model"
 ADVICE = {
     "keep the MPC": f"little was found to gain over the MPC, less than {100 * WORTH:g} %. It is no "
     "bound: improve(mpc, {source}) may still find some of it, or more.",
     "add ObserveDisturbance first": "that brings most of it: {observer}",
     "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
     "headroom(...).reidentified.",
-    "learn": "most of it is beyond a linear model: improve(mpc, {source}), or DDPG under an "
-    "ImprovementGuard.",
+    "learn": BEYOND_LINEAR + ": improve(mpc, {source}), or DDPG under an ImprovementGuard.",
 }
 UNKNOWN = "not known"
 """The verdict where what was found may be chance, and where nothing was found in a poor model."""
@@ -144,14 +144,17 @@ class Headroom:
 
     def report(self) -> str:
         """Return the figures, and what to do, in words."""
-        parts = (
-            f"{100 * part + 0.0:+.2f} % {name}"
-            for name, part in (
-                ("with a disturbance observer", -self.offset),
-                ("more with a re-identified model", -self.model_error),
-                ("more by nonlinearity and constraints", -self.nonlinearity),
+        parts = [
+            f"{-100 * part + 0.0:+.2f} % {how} {name}"
+            if costs is not None
+            else f"{name}: not played"
+            for part, costs, how, name in (
+                (self.offset, self.observer_played, "with", "a disturbance observer"),
+                (self.model_error, self.reidentified_played, "more with", "a re-identified model"),
             )
-        )
+        ]
+        rest = "nonlinearity and constraints" if self._rivals_played else "all the rest"
+        parts.append(f"{-100 * self.nonlinearity + 0.0:+.2f} % more by {rest}")
         where = "twin" if self._in_twin else "env"
         steps = f"{self.steps:,} of the {where}. {self.note}".strip() if self.steps else self.note
         return summary_lines(
@@ -165,6 +168,10 @@ class Headroom:
         )
 
     __str__ = report
+
+    @property
+    def _rivals_played(self) -> bool:
+        return self.observer_played is not None and self.reidentified_played is not None
 
     @property
     def _in_twin(self) -> bool:
@@ -203,6 +210,8 @@ class Headroom:
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
         observer = CURE_IN_TWIN if self._in_twin else CURE
         advice = ADVICE[self.verdict].format(source=source, observer=observer)
+        if not self._rivals_played:
+            advice = advice.replace(BEYOND_LINEAR, "what a better linear model brings is not known")
         if self.d_max is not None:  # the disturbances of this plant
             largest = ", ".join(f"{each:.3g}" for each in self.d_max)
             advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")

@@ -68,8 +68,8 @@ def loops_part(subject: Subject) -> Part:
     averages = ("mean cost", np.mean), ("median cost", np.median), ("worst cost", np.max)
     values = [(name, float(of(mpc.costs)), float(of(policy.costs))) for name, of in averages]
     shares = (_stage_costs(subject.problem, each) for each in (mpc, policy))
-    names = "mean stage cost of states", "mean stage cost of inputs off their rest"
-    values += zip(names, *shares, strict=True)
+    parts = zip(("states", "inputs off their rest", "moves of inputs"), *shares, strict=True)
+    values += [(f"mean stage cost of {name}", *both) for name, *both in parts if any(both)]
     rows = [[name, f"{old:.6g}", f"{new:.6g}", _change(old, new)] for name, old, new in values]
     for name, before, after in (
         ("steps that violate a limit", mpc.violations.sum(), policy.violations.sum()),
@@ -137,14 +137,21 @@ def loops_part(subject: Subject) -> Part:
     return Part(title, content, (finding,))
 
 
-def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float]:
-    """Return what an episode costs with inputs at u_s of theta, and what inputs off u_s add."""
+def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float, float]:
+    """Return what an episode costs at rest at u_s of theta, with inputs off u_s, and moving."""
     theta, u, _ = loops.steps()  # in deviations
     stage_cost = problem.deviations.stage_cost
-    of_states = stage_cost(theta, theta @ problem.error_system.to_input.T)
-    of_inputs = stage_cost(theta, u) - of_states
-    count = len(loops.costs)
-    return float(of_states.sum()) / count, float(of_inputs.sum()) / count
+
+    def steady(held: Array) -> float:
+        still = theta.copy()
+        if problem.layout.n_previous:
+            still[..., problem.layout.previous] = held
+        return float(stage_cost(still, held).sum()) / len(loops.costs)
+
+    at_rest = steady(theta @ problem.error_system.to_input.T)
+    off_rest = steady(u)
+    whole = float(stage_cost(theta, u).sum()) / len(loops.costs)
+    return at_rest, off_rest - at_rest, whole - off_rest
 
 
 def _change(old: float, new: float) -> str:

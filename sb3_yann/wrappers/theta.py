@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, NonFiniteWarning, check_int, check_type, check_vector, warn
 from sb3_yann.control import DisturbanceObserver, StateEstimator
-from sb3_yann.units import Units
+from sb3_yann.units import FLOAT32_ROUNDING, Units
 
 Vector = NDArray[np.floating[Any]]
 Env = gym.Env[Vector, Vector]
@@ -160,6 +160,12 @@ class PastInputs(Appending):
             )
         given = check_vector("initial", initial, len(bounds.low))
         self.initial = np.clip(given, bounds.low, bounds.high)
+        off = np.abs(given - self.initial) > FLOAT32_ROUNDING * np.maximum(np.abs(given), 1)
+        if np.any(late & off):
+            raise ValueError(
+                f"initial = {given.tolist()} is not between the env's {bounds.low.tolist()} and "
+                f"{bounds.high.tolist()}. Give the inputs in their order and units."
+            )
         self.past: list[Array] = []
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> list[Vector]:

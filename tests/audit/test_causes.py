@@ -123,9 +123,6 @@ def test_a_reward_or_observation_of_another_meaning_is_named(wrong) -> None:
     assert text in finding.message
 
 
-# --- what is no mismatch --------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("make", [two_input_mpc, asymmetric_pendulum_mpc])
 def test_the_problem_s_own_cost_is_no_mismatch(make, capsys) -> None:
     audit = audited(plant(make()), make(), verbose=1)

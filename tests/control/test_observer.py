@@ -110,9 +110,6 @@ def test_a_measured_disturbance_is_told_and_no_part_of_the_estimate() -> None:
         DisturbanceObserver(dataclasses.replace(model, estimated=())).update(x, u, load)
 
 
-# ---- Estimates from outputs alone ----
-
-
 A = np.array([[0.9, 0.3], [0.0, 0.7]])
 B = np.array([[0.0], [0.5]])
 

@@ -127,9 +127,6 @@ print(*Controller.load("plant.npz")([0.1, 0.2, -0.1, 3.0]))
     assert np.allclose(float(printed), controller([0.1, 0.2, -0.1, 3.0]), rtol=1e-14)
 
 
-# ---- Faults ----
-
-
 def readings(count: int = 200) -> np.ndarray:
     """A plant that moves slowly, so that a jump of the action is the controller's."""
     return np.sin(0.003 * np.arange(count)[:, None] + np.arange(4)) * [0.15, 0.15, 0.15, 1.5]
@@ -248,9 +245,6 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path):
     with pytest.raises(ValueError, match="weights hold NaN"):
         export(policy, tmp_path / "plant.c")
     assert list(tmp_path.iterdir()) == []
-
-
-# ---- What is refused ----
 
 
 def test_damaged_files_and_wrong_shapes_are_named(tmp_path):

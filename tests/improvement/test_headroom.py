@@ -315,6 +315,7 @@ def test_what_an_observer_loses_is_shown_as_a_loss() -> None:
     assert "-0.00 %" not in text
     observer = "+20.00 % as it was played, worst start +43.33 % of its own cost; 1 of 3 cost more"
     assert f"  observer     {observer}\n  new model    not played: it has no rest" in text
+    assert "a re-identified model: not played, +0.00 % more by all the rest" in text
     some = dataclasses.replace(found, best_costs=costs - 0.2, nonlinearity=0.01, budget=8_000)
     for said in ("less than 2 %", "improve(mpc, make, max_steps=8_000) may still find some of it"):
         assert said in some.report()

@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import guard_samples
 import twin_samples
 import unit_samples
+from general_problems import servo
 from guard_samples import Slide, make_guard
 from sample_plants import LinearPlant
 from sb3_yann import (
@@ -30,6 +31,7 @@ from sb3_yann import (
     LinearMPC,
     NoActionNoise,
     PlantTwin,
+    RateLimits,
     offset_free,
     report,
     reporting,
@@ -38,7 +40,7 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement.confirmation import Check
 from sb3_yann.improvement.improving import Improvement
 from sb3_yann.reporting import evidence_parts, problem_parts
-from sb3_yann.wrappers import PlantEnv
+from sb3_yann.wrappers import PlantEnv, PreviousInput
 from sb3_yann_envs import problems
 from weights import last_layer, unpin
 
@@ -316,11 +318,20 @@ def test_starts_beyond_those_of_episodes_are_a_finding_of_their_own(takes) -> No
 
 
 def check_that_costs_add_up(page: str) -> None:
-    cost, states, inputs = (
-        float(re.findall(f"{row}</td><td[^>]*>([^<]+)", page)[0])
-        for row in ("mean cost", "cost of states", "inputs off their rest")
-    )
-    assert states > 0 < inputs and states + inputs == pytest.approx(cost, rel=1e-4)
+    rows = "mean cost", "cost of states", "inputs off their rest", "moves of inputs"
+    found = [re.findall(f"{row}</td><td[^>]*>([^<]+)", page) for row in rows]
+    cost, *parts = (float(each[0]) for each in found if each)
+    assert min(parts) > 0 and sum(parts) == pytest.approx(cost, rel=1e-4)
+
+
+def test_what_moves_cost_is_no_cost_of_states() -> None:
+    mpc = servo(tracking=None, rate=RateLimits(R_du=[[2.0]]))
+    env = TimeLimit(PreviousInput(LinearPlant(servo(tracking=None))), 5)
+    loops = evaluate(lambda theta: 0.5 - theta[-1:], env, range(2))
+    theta, u, _ = loops.steps()
+    x, before = np.split(theta, [2], axis=1)
+    wanted = np.sum((x @ mpc.Q) * x), np.sum(mpc.R * u**2), np.sum(2 * (u - before) ** 2)
+    assert evidence_parts._stage_costs(mpc, loops) == pytest.approx(np.array(wanted) / 2)
 
 
 class OwnStarts(gym.Wrapper):

@@ -212,6 +212,7 @@ DICT = gym.spaces.Dict({"a": gym.spaces.Discrete(2)})
             ValueError,
             r"initial has shape \(2,\), expected \(1,\)",
         ),
+        (lambda: PreviousInput(Counter(), initial=[4]), ValueError, r"= \[4.0\] is not between"),
         (lambda: ObserveDisturbance(Counter(), 3, [0], [1]), TypeError, "observer = 3 must be"),
         (
             lambda: StageCost(Counter(), two_input_mpc()),
