@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback, Mask
 from sb3_yann.control import LinearMPC, lqr
-from sb3_yann.control._kernels.sweep import sweep
 from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond, mixed_half
 from sb3_yann.control.mpc.problem import Value
 from sb3_yann.rollout import Rows
@@ -352,6 +351,8 @@ def _backward(
     plant: TwinPlant, task: Task, plans: Plans, rows: Rows, damping: Array
 ) -> tuple[Array, Array, Array]:
     """Return corrections (T, k, m), gains (T, k, m, n_theta), and what those should save (k,)."""
+    from sb3_yann.control._kernels.sweep import sweep  # compiled, or loaded, when it is needed
+
     problem = task.problem
     thetas = plans.thetas
     inputs = plans.inputs
