@@ -42,7 +42,7 @@ SIGN_STARTS = 5
 FAR = 3.5  # times as far or as little as the model says: a nonlinear plant alone varies more
 SIGN_STEPS = 10  # steps for which it is pushed where outputs are read
 UNLIKE = 0.7  # cosine of answers to pushes and the model's, below which they are others
-ALIKE = 0.95
+ALIKE = 0.95  # the same, above which they are the model's in another order
 LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
 EXPLAINED_REWARD = 0.95
 """Share of the rewards' variance from which on they are taken for minus the stage cost."""

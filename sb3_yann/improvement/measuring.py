@@ -49,7 +49,7 @@ CURE_IN_TWIN = (
     "improve(mpc, PlantTwin.fit(mpc, log, observer=observer))."
 )
 """How an observer is added, where there is an env, and where there is a log alone."""
-BEYOND_LINEAR = "most of it is beyond a linear model"
+BEYOND_LINEAR = "most of it is beyond a linear model"  # said only where such models were played
 ADVICE = {
     "keep the MPC": f"little was found to gain over the MPC, less than {100 * WORTH:g} %. It is no "
     "bound: improve(mpc, {source}) may still find some of it, or more.",
