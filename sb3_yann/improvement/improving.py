@@ -17,6 +17,7 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
@@ -335,7 +336,7 @@ def improve(
             )
     check_int("seed", seed, 0)
     check_bool("confine", confine)
-    with shown(progress_bar, parts=True):
+    with shown(progress_bar, parts=True), threadpool_limits(1, "blas"):
         if isinstance(model, LinearMPC):
             with preserve_rng():  # a seed of Stable-Baselines3 is a global one
                 model = DDPG(

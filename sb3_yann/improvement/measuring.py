@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import Array, check_int
@@ -317,7 +318,7 @@ def headroom(
     if max_steps is not None:
         check_int("max_steps", max_steps)
     search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), max_steps)
-    with shown(progress_bar, parts=True), warnings.catch_warnings():
+    with shown(progress_bar, parts=True), threadpool_limits(1, "blas"), warnings.catch_warnings():
         warnings.simplefilter("ignore", OnlineLawWarning)
         return search.found()
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import shown
 from sb3_yann._validation import Array, check_bool, check_int
@@ -208,7 +209,7 @@ class PlantTwin(LearntModel):
             warn_of_estimates(problem, log)
         log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)
         settings = residuals, n_members, updates, seed, units_confirmed, notes
-        with shown(progress_bar):
+        with shown(progress_bar), threadpool_limits(1, "blas"):
             found = _fitted(row, log, *settings)
             hidden = RowLayout(problem, observer, hidden=True)
             if found.trust.lacks_alone and row.observer is None and hidden.observer is not None:

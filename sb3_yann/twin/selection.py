@@ -16,7 +16,8 @@ import numpy as np
 import torch as th
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, optimize
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
@@ -30,9 +31,9 @@ from sb3_yann.twin.log import Episode, pieces
 from sb3_yann.units import FLOAT32_ROUNDING
 
 HIDDEN = 48  # units in each of two hidden layers
-ROWS_OF_STEP = 256  # rows in a step of Adam
+CURVATURES = 50  # pairs that L-BFGS remembers
 WINDOWS = 32  # windows of a log in a step of Adam
-FIT_RATE = 5e-3  # of Adam at first, for single steps; it falls to zero
+FIT_RATE = 1e-3  # of Adam at first; it falls to zero
 
 RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
 
@@ -50,8 +51,8 @@ def fit_ensemble(
     A linear part is fitted by least squares, the networks to what it leaves of single steps. With
     ``ahead`` above 1 all of it is then fitted to windows of so many steps, along which the model
     goes on from its own predictions: a fit to single steps takes noise of the sensors for dynamics.
-    ``updates`` are steps of Adam for single steps; before windows half as many, and for them a
-    fifth.
+    A tenth of ``updates`` are iterations of L-BFGS for single steps; before windows half as many,
+    and a fifth are steps of Adam for them.
 
     Where an estimator's memory stands for the plant's state, what a step leaves is of loads as
     well, which theta tells and the MPC answers: a fit would take their answer for their cause. So
@@ -65,7 +66,7 @@ def fit_ensemble(
     dtype = th.float64 if ahead == 1 else th.float32
     alike = _of_one_seed(logs[0]) if coordinates.row.is_estimate else None
     networks = _Networks(pairs, alike, FLOAT32_ROUNDING * coordinates.units, generator, dtype)
-    networks.fit_steps(pairs, updates if ahead == 1 else updates // 2)
+    networks.fit_steps(pairs, updates // (10 if ahead == 1 else 20))
     if ahead > 1:
         networks.fit_windows(coordinates, logs, ahead, updates // 5)
     return networks.residuals()
@@ -122,24 +123,40 @@ class _Networks:
 
     def __call__(self, z: th.Tensor) -> th.Tensor:
         """Return what the networks make of z (members, batch, k)."""
-        W1, b1, W2, b2, W3, b3, L = self.weights
-        z = (z - self.center) / self.width
-        first = th.tanh(z @ W1 + b1)
-        out: th.Tensor = (th.tanh(first @ W2 + b2) @ W3 + b3 + z @ L) * self.unit
-        return out
+        return _network(self.weights, (z - self.center) / self.width) * self.unit
 
-    def fit_steps(self, pairs: list[list[Array]], updates: int) -> None:
-        """Fit them to single steps."""
-        z, y = (self.tensor(_same_length([each[i] for each in pairs])) for i in (0, 1))
-        count = z.shape[1] if self.alike is None else len(self.alike)
-        for _ in self._steps(FIT_RATE, updates):
-            chosen = th.randint(count, (ROWS_OF_STEP,), generator=self.generator)
-            if self.alike is None:
-                errors = self(z[:, chosen]) - y[:, chosen]
-            else:
-                first, other = (self(z[:, rows]) - y[:, rows] for rows in self.alike[chosen].T)
-                errors = first - other
-            ((errors / self.unit) ** 2).mean().backward()  # type: ignore[no-untyped-call]
+    def fit_steps(self, pairs: list[list[Array]], iterations: int) -> None:
+        """Fit them to single steps: each by itself, and on all rows, by L-BFGS."""
+        with bar("networks of a model", total=len(pairs) * iterations, timed=True) as doing:
+            for i, (z, y) in enumerate(pairs):
+                self._fit_steps(i, z, y, iterations, doing)
+
+    def _fit_steps(self, i: int, z: Array, y: Array, iterations: int, doing: Any) -> None:
+        """Fit network i to pairs z (rows, k), y (rows, n)."""
+        weights = [each.detach()[i].requires_grad_() for each in self.weights]
+        rows = (self.tensor(z) - self.center[i]) / self.width[i]
+        wanted = self.tensor(y) / self.unit[i]
+
+        def loss(flat: Array) -> tuple[float, Array]:
+            vector_to_parameters(self.tensor(flat), weights)
+            errors = _network(weights, rows) - wanted
+            if self.alike is not None:
+                errors = errors[self.alike[:, 0]] - errors[self.alike[:, 1]]
+            value = (errors**2).mean()
+            slopes = th.autograd.grad(value, weights)
+            return value.item(), parameters_to_vector(slopes).double().numpy()
+
+        found = optimize.minimize(
+            loss,
+            parameters_to_vector(weights).detach().double().numpy(),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": iterations, "maxcor": CURVATURES, "ftol": 0.0},
+            callback=lambda _: doing.update(),
+        )
+        vector_to_parameters(self.tensor(found.x), weights)
+        for each, fitted in zip(self.weights, weights, strict=True):
+            each.data[i] = fitted
 
     def fit_windows(
         self, coordinates: Coordinates, logs: Sequence[Sequence[Episode]], ahead: int, updates: int
@@ -163,7 +180,7 @@ class _Networks:
         )
         turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
         per_turn = th.where(turn > 0, 1 / turn, 0.0)
-        for _ in self._steps(FIT_RATE / 5, updates):
+        for _ in self._steps(FIT_RATE, updates):
             chosen = th.randint(data.shape[1], (WINDOWS,), generator=self.generator)
             window = data[:, chosen]
             x = window[..., :n, 0]
@@ -199,6 +216,13 @@ class _Networks:
             parts.append(th.zeros((len(L), L.shape[1], L.shape[1] * L.shape[2])))
             arrays = [each.double().numpy().copy() for each in parts]
         return [Residual([each[i] for each in arrays]) for i in range(len(arrays[0]))]
+
+
+def _network(weights: Sequence[th.Tensor], z: th.Tensor) -> th.Tensor:
+    """Return what networks of standardized z (..., batch, k) are, (..., batch, n)."""
+    W1, b1, W2, b2, W3, b3, L = weights
+    first = th.tanh(z @ W1 + b1)
+    return th.tanh(first @ W2 + b2) @ W3 + b3 + z @ L
 
 
 def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
