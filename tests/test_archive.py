@@ -38,6 +38,7 @@ def test_arrays_come_back_to_the_bit(path: Path) -> None:
         assert found[name].flags.f_contiguous == array.flags.f_contiguous
 
 
+@pytest.mark.nightly
 def test_every_flipped_bit_is_refused_or_changes_nothing(path: Path) -> None:
     content = path.read_bytes()
     refused = 0

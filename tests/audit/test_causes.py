@@ -350,9 +350,8 @@ def test_what_a_violation_or_a_termination_costs_does_not_count() -> None:
 
 
 def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
-    plain = Rewarded(stage)
-    held = SetPoint(Rewarded(stage), -1, 1)
-    assert below(gym.wrappers.TimeLimit(held, 9), SetPoint) and not below(plain, SetPoint)
+    held = gym.wrappers.TimeLimit(SetPoint(Rewarded(stage), -1, 1), 9)
+    assert below(held, SetPoint) and not below(Rewarded(stage), SetPoint)
     tracking = dataclasses.replace(mpc(), tracking=Tracking([0], -1, 1))
     headroom(tracking, held, n_starts=2)  # a warning would be an error
 

@@ -166,7 +166,7 @@ def events(path: Any) -> list[dict[str, Any]]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_commissioning_that_stops_after_a_batch_goes_on_as_if_it_had_not(
     tmp_path, monkeypatch
 ) -> None:

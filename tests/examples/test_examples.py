@@ -79,7 +79,7 @@ def test_an_example_fits_a_page(path) -> None:
     assert len(path.read_text(encoding="utf-8").splitlines()) < 80
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
     printed = run("from_a_log", tmp_path)
     assert "Verdict: trusted." in (tmp_path / "out" / "twin.txt").read_text(encoding="utf-8")
@@ -97,7 +97,7 @@ def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
     assert (tmp_path / "out" / "from_a_log.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_three_tags_become_a_page_and_code(tmp_path) -> None:
     printed = run("outputs_only", tmp_path)
     assert "order 2" in printed and "act for [3] samples" in printed

@@ -106,9 +106,9 @@ def test_each_plant_shows_the_theta_of_its_mpc(name, tmp_path, monkeypatch) -> N
     assert env.observation_space.contains(env.step(np.float32(case.mpc.online()(theta)))[0])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_compares_with_the_mpc_on_the_same_episodes(monkeypatch) -> None:
-    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=1000))
+    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=500))
     monkeypatch.setattr(learning, "TESTS", range(2000, 2004))
     plans = execute(Run("pH", PLANNED, 40, 0))
     law = CASES["pH"]().mpc.explicit()

@@ -256,7 +256,7 @@ def test_what_is_saved_is_not_done_again(results) -> None:
     assert all(same(first[run], again[run]) and same(first[run], outcome(run)) for run in RUNS)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_failing_run_is_reported_and_the_others_are_kept(results, capfd) -> None:
     def fails(run: Run) -> Outcome:
         if run.seed == 1:

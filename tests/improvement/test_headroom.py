@@ -408,6 +408,7 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
     assert verdict_of(*parts, doubt=doubt) == verdict
 
 
+@pytest.mark.nightly
 def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
     mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=Terminal())
     two_rounds = {"n_starts": 2, "max_steps": 5700}

@@ -39,6 +39,7 @@ from weights import is_mpc
 
 UNSEEN = range(900, 930)
 SIMULATED = {kind: {"simulator": True} for kind in (SAC, TQC, PPO)}
+NIGHTLY = pytest.mark.nightly
 module = importlib.import_module("sb3_yann.improvement.improving")
 
 
@@ -70,7 +71,7 @@ def better() -> bytes:
 # ------------------------------------------------------------------------------- in a simulator
 
 
-@pytest.mark.parametrize("kind", [DDPG, TD3, SAC, TQC, PPO])
+@pytest.mark.parametrize("kind", [DDPG, TD3, SAC, TQC, pytest.param(PPO, marks=NIGHTLY)])
 def test_a_policy_gains_on_starts_that_it_has_not_seen(kind, tmp_path) -> None:
     th.manual_seed(3)
     model = model_of(kind=kind, **SIMULATED.get(kind, {}))
@@ -431,7 +432,7 @@ def test_a_policy_of_a_twin_gains_on_the_plant(capsys, monkeypatch) -> None:
     assert bits(model) == weights and found.checks == again.checks
 
 
-@pytest.mark.parametrize("source", ["simulator", "twin"])
+@pytest.mark.parametrize("source", ["simulator", pytest.param("twin", marks=NIGHTLY)])
 def test_in_plant_units_it_finds_the_same(source) -> None:
     if source == "twin":
         plain, found = (pickle.loads(in_twin(make))[1] for make in (Spring, Elsewhere))

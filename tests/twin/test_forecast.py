@@ -169,7 +169,7 @@ class Motor(Sampled):
         return np.array([place, speed])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_networks(
     monkeypatch,
 ) -> None:
@@ -179,10 +179,10 @@ def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_ne
     logged = evaluate(mpc.law(), make, range(100, 130)).pairs
     before = evaluate(mpc.law(), make, TESTS).costs
     for kinds in (("none", "linear", "quadratic"), ("none", "network")):
-        twin = PlantTwin.fit(mpc, logged, residuals=kinds)
+        twin = PlantTwin.fit(mpc, logged, residuals=kinds, updates=1500)
         assert twin.trusted
         model = DDPG("YannPolicy", Motor(mpc), device="cpu", seed=0)
-        found = improve(model, twin)
+        found = improve(model, twin, n_starts=10, rounds=2, updates=1500)
         assert found.accepted == ("network" in kinds)
     costs = evaluate(model, make, TESTS).costs
     assert costs.mean() < 0.99 * before.mean() and np.all(costs < before)

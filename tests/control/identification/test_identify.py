@@ -103,7 +103,7 @@ def test_rates_of_what_integrates_have_intervals_that_hold(plant: str, noise: fl
     assert len(inside) > 30 and np.mean(inside) > 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_hold_the_truth_as_often_as_they_say_under_process_noise() -> None:
     draws = [identify(*record(i, process=0.02)[:2], dt=1, held_out=0) for i in range(200)]
     share = np.mean([coverage(found) for found in draws], axis=0)

@@ -233,7 +233,7 @@ def test_C_is_kept_by_copies_units_and_sampling() -> None:
 
 
 def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
-    u = steps(2000, 2, 0)
+    u = steps(1200, 2, 0)
     y = played(u, A, B, C, 1)
     y[np.arange(len(y)) % 10 > 0, 1] = np.nan
     found = identify_outputs(y, u, dt=0.5)
@@ -250,7 +250,7 @@ def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
     assert found.estimator().every.tolist() == [1, 10]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_of_poles_and_gains_hold_the_truth_nearly_as_often_as_they_say() -> None:
     plant = {"A": np.array([[0.9, 0.05], [0.0, 0.8]]), "B": np.array([[0.5, 0.0], [0.0, 0.3]])}
     C = np.array([[1.0, 0.0]])
