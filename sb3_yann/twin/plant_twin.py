@@ -157,7 +157,7 @@ class PlantTwin(LearntModel):
         n_members : int, default 5
             The first is fitted to all episodes, the others to as many drawn from them.
         updates : int, default 3000
-            Steps of Adam of networks.
+            Of networks: a twentieth are iterations of L-BFGS, then a fifth are steps of Adam.
         seed : int, default 0
             Of the draws of episodes, and of the weights that networks start from.
         units_confirmed : bool, default False
