@@ -336,7 +336,7 @@ def improve(
             )
     check_int("seed", seed, 0)
     check_bool("confine", confine)
-    with shown(progress_bar, parts=True), threadpool_limits(1, "blas"):
+    with shown(progress_bar, parts=True), threadpool_limits(1):
         if isinstance(model, LinearMPC):
             with preserve_rng():  # a seed of Stable-Baselines3 is a global one
                 model = DDPG(

@@ -318,7 +318,7 @@ def headroom(
     if max_steps is not None:
         check_int("max_steps", max_steps)
     search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), max_steps)
-    with shown(progress_bar, parts=True), threadpool_limits(1, "blas"), warnings.catch_warnings():
+    with shown(progress_bar, parts=True), threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore", OnlineLawWarning)
         return search.found()
 

@@ -209,7 +209,7 @@ class PlantTwin(LearntModel):
             warn_of_estimates(problem, log)
         log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)
         settings = residuals, n_members, updates, seed, units_confirmed, notes
-        with shown(progress_bar), threadpool_limits(1, "blas"):
+        with shown(progress_bar), threadpool_limits(1):
             found = _fitted(row, log, *settings)
             hidden = RowLayout(problem, observer, hidden=True)
             if found.trust.lacks_alone and row.observer is None and hidden.observer is not None:
