@@ -67,6 +67,8 @@ def check_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Arra
         wanted = ", ".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]},"
         hint = " Write a matrix as rows, [[...], [...]], or np.diag([...])."
         hint *= array.ndim < len(shape) == 2
+        if name == "Q" and array.ndim == 2:
+            hint = " It weighs states: for a weight Q of outputs y = C x, pass C.T @ Q @ C."
         raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).{hint}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")

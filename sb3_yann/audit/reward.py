@@ -249,6 +249,7 @@ class CostAudit(BaseCallback):
         if count < MIN_STEPS:  # what is not finite has had its own warning
             return
         if not self.order_checked:
+            self.policy.states_checked = True
             warn_of_order(self.policy.problem, theta, u, following)
         line = Line.through(-compared.cost, compared.rewards)
         cause, explanation = self._vec_normalize_switched_on()

@@ -50,14 +50,13 @@ CURE_IN_TWIN = (
     "improve(mpc, PlantTwin.fit(mpc, log, observer=observer))."
 )
 """How an observer is added, where there is an env, and where there is a log alone."""
-BEYOND_LINEAR = "most of it is beyond a linear model"  # said only where such models were played
 ADVICE = {
     "keep the MPC": f"little was found to gain over the MPC, less than {100 * WORTH:g} %. It is no "
     "bound: improve(mpc, {source}) may still find some of it, or more.",
     "add ObserveDisturbance first": "that brings most of it: {observer}",
     "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
     "headroom(...).reidentified.",
-    "learn": BEYOND_LINEAR + ": improve(mpc, {source}), or DDPG under an ImprovementGuard.",
+    "learn": "{why}: improve(mpc, {source}), or DDPG under an ImprovementGuard.",
 }
 UNKNOWN = "not known"
 """The verdict where what was found may be chance, and where nothing was found in a poor model."""
@@ -210,9 +209,10 @@ class Headroom:
             return f"nothing was found, but {poor}"
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
         observer = CURE_IN_TWIN if self._in_twin else CURE
-        advice = ADVICE[self.verdict].format(source=source, observer=observer)
+        why = "most of it is beyond a linear model"
         if not self._rivals_played:
-            advice = advice.replace(BEYOND_LINEAR, "what a better linear model brings is not known")
+            why = "what a better linear model brings is not known"
+        advice = ADVICE[self.verdict].format(source=source, observer=observer, why=why)
         if self.d_max is not None:  # the disturbances of this plant
             largest = ", ".join(f"{each:.3g}" for each in self.d_max)
             advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")

@@ -79,6 +79,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
     THEIRS: ClassVar[tuple[str, ...]] = ("n_critics",)  # not all SB3 policies have
     CRITIC: ClassVar[type[YannCritic]] = YannCritic
     guarded = False  # while an `ImprovementGuard` is at work
+    states_checked = False  # once what an env shows was compared with the model
     actor: YannActor
     actor_target: YannActor
     critic: YannCritic
@@ -299,9 +300,10 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         return predicted
 
     def set_training_mode(self, mode: bool) -> None:
-        """Do what SB3 asks for at the start of each rollout, and name random actions in it."""
+        """Do what SB3 asks for as a rollout begins; name random actions and misread states."""
         if not mode and sys._getframe(1).f_code.co_name == "collect_rollouts":
             sb3_hooks.warn_of_random_actions(self._algorithm)
+            sb3_hooks.warn_of_misread_states(self, self._algorithm)
         super().set_training_mode(mode)
 
     def unscale_action(self, scaled_action: Array) -> Array:

@@ -21,6 +21,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_yann._validation import NonFiniteWarning, warn
+from sb3_yann.control.mpc.misreading import STEPS_PER_STATE, misread_states
+
+FIRST_STEPS = 200  # steps of a learn after which what the env shows is compared with the model
 
 
 def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
@@ -173,6 +176,33 @@ def warn_of_random_actions(algorithm: Any) -> None:
             "limits or not. For the policy's own from the first step on, pass learn(..., "
             f"callback=NoActionNoise()), or learning_starts=0 to the {type(algorithm).__name__}."
         )
+
+
+def warn_of_misread_states(policy: Any, algorithm: Any) -> None:
+    """Warn, once, where an env's first steps are the model's in other units or another order.
+
+    It reads what the replay buffer holds, at the start of a rollout: no step more is taken. A guard
+    and a `CostAudit` look themselves.
+    """
+    buffer = getattr(algorithm, "replay_buffer", None)
+    if policy.states_checked or not isinstance(buffer, ReplayBuffer):
+        return
+    count = max(FIRST_STEPS, STEPS_PER_STATE * policy.problem.model.n_states)
+    rows = -(-count // buffer.n_envs)
+    if buffer.size() < rows or buffer.optimize_memory_usage:
+        return
+    policy.states_checked = True
+    if policy.guarded:
+        return
+    normalize = algorithm.get_vec_normalize_env()  # the buffer holds what it has not touched
+    thetas = []
+    for each in (buffer.observations[:rows], buffer.next_observations[:rows]):
+        seen = each if normalize is None else normalize.normalize_obs(each)
+        theta = policy.theta(seen.reshape(-1, *buffer.obs_shape))
+        thetas.append(theta.double().cpu().numpy())
+    u = policy.inputs(policy.unscale_action(buffer.actions[:rows].reshape(len(thetas[0]), -1)))
+    if words := misread_states(policy.problem, thetas[0], u, thetas[1]):
+        warn(words)
 
 
 def watch_buffer(model: BaseAlgorithm) -> None:

@@ -14,7 +14,6 @@ from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_yann._archive import digest_of
 from sb3_yann._validation import Array
-from sb3_yann.audit.meaning import misread_states
 from sb3_yann.compare import (
     COST_ROUNDING,
     INPUT_STEP,
@@ -27,6 +26,7 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
+from sb3_yann.control.mpc.misreading import misread_states
 from sb3_yann.evaluation import change_in_percent, plots
 from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of

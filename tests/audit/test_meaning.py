@@ -27,10 +27,9 @@ from sb3_yann.wrappers import EstimateState, StageCost
 from sb3_yann_envs import problems
 
 A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.2], [0.1, 0.0, 0.5]])
+BOX = {"theta_min": -9, "theta_max": 9}
 MODEL = LinearModel(A, [[0], [0], [1]], dt=1.0, state_names=["a", "b", "c"])
-MPC = LinearMPC(
-    MODEL, Q=np.eye(3), R=[[1]], horizon=2, theta_min=-9, theta_max=9, u_min=-1, u_max=1
-)
+MPC = LinearMPC(MODEL, Q=np.eye(3), R=[[1]], horizon=2, u_min=-1, u_max=1, **BOX)
 
 
 class Shuffled(Sampled):
@@ -76,11 +75,7 @@ def test_another_order_is_told_with_what_to_show(order: list[int]) -> None:
     names = [MODEL.state_names[i] for i in order]
     assert f"in the order {names}, which is not the MPC's, ['a', 'b', 'c']: so the" in message
     assert f"Show x[{back}] of what the plant shows" in message
-    assert not told(
-        gym.wrappers.TransformObservation(
-            Shuffled(order), lambda x: x[back], Shuffled.observation_space
-        )
-    )
+    assert not told(gym.wrappers.TransformObservation(Shuffled(order), lambda x: x[back], None))
 
 
 def test_another_order_is_told_where_the_plant_rests_beside_its_model() -> None:
@@ -154,12 +149,23 @@ def test_the_page_to_sign_fails_where_units_are_others(factor: int, tmp_path) ->
     assert any("seems to show h times 100" in row for row in failed) == (factor == 100)
 
 
-def test_a_cost_audit_tells_it_too() -> None:
+@pytest.mark.parametrize("factor", [1, 100])
+@pytest.mark.parametrize("audit", [[], [CostAudit(steps=50)]])
+def test_learning_alone_and_a_cost_audit_tell_it_once(audit: list[Any], factor: int) -> None:
+    env = StageCost(Tanks(lambda x: x * [factor, 1]), IN_PLANT_UNITS)
     options = {"problem": IN_PLANT_UNITS}
-    env = StageCost(Tanks(lambda x: x * [100, 1]), IN_PLANT_UNITS)
     model = DDPG("YannPolicy", env, policy_kwargs=options, seed=0, learning_starts=10**6)
-    with pytest.warns(UserWarning, match="seems to show h times 100"):
-        model.learn(60, callback=[NoActionNoise(), CostAudit(steps=50)])
+    found = said(lambda: model.learn(220, callback=[NoActionNoise(), *audit]), "seems to show")
+    assert ["show h times 100:" in each for each in found] == [True] * (factor == 100)
+
+
+def test_a_factor_that_explains_more_than_the_order_is_named() -> None:
+    model = LinearModel([[0.5, 0.5], [0.1, 0.9]], [[1], [1]], dt=1.0)
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
+    theta, u = np.split(np.random.default_rng(0).normal(size=(40, 3)), [2], axis=1)
+    after = 0.6 * mpc.predict(theta, u)  # no such plant: the factor alone leaves too much
+    with pytest.warns(UserWarning, match=r"show x\[1\] times 1e\+03"):
+        warn_of_order(mpc, theta * [1, 1e3], u, after * [1, 1e3])
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 3.0])
@@ -169,14 +175,10 @@ def test_noise_and_a_wrong_model_are_no_other_order(noise: float, gain: float) -
 
 
 def test_of_two_states_that_are_alike_neither_order_is_reported() -> None:
-    twins = LinearModel(np.eye(2) / 2, [[1], [1]], dt=1.0)
-    mpc = LinearMPC(twins, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
+    model = LinearModel(np.eye(2) / 2, [[1], [1]], dt=1.0)
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
     theta = np.random.default_rng(0).normal(size=(40, 2))
-    u = np.zeros((40, 1))
-    warn_of_order(mpc, theta, u, theta[:, ::-1] / 2)  # a warning would be an error
-
-
-BOX = {"theta_min": -9, "theta_max": 9}
+    warn_of_order(mpc, theta, np.zeros((40, 1)), theta[:, ::-1] / 2)  # a warning is an error
 
 
 def test_of_six_states_two_that_are_exchanged_are_reported() -> None:
@@ -241,13 +243,10 @@ def against(run: Callable[[], object]) -> list[str]:
     return said(run, "against the sign")
 
 
-def of_signs(plant: Callable[[], Plant]) -> list[str]:
-    return against(lambda: guarded(STEERED, lambda: StageCost(plant(), STEERED)))
-
-
 @pytest.mark.parametrize("gains", [(1, -0.6), (-2, 1)])
 def test_a_guard_names_an_input_of_the_other_sign(gains: Any) -> None:
-    (message,) = of_signs(lambda: Plant(gains))
+    make = lambda: StageCost(Plant(gains), STEERED)  # noqa: E731
+    (message,) = against(lambda: guarded(STEERED, make))
     name = ["valve", "heater"][int(np.argmin(gains))]
     assert message.startswith(f"{name} moves the env against the sign of the model's B: ")
     assert f"{min(gains):.2g} times as far in a step, from 4 starts" in message

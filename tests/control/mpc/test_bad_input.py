@@ -52,7 +52,7 @@ BAD_DYNAMICS: list[tuple[dict[str, Any], Message]] = [
 
 
 BAD_PROBLEMS: list[tuple[dict[str, Any], Message]] = [
-    ({"Q": np.eye(3)}, r"Q has shape \(3, 3\), expected \(2, 2\)"),
+    ({"Q": np.eye(3)}, r"Q has shape \(3, 3\), expected \(2, 2\)\. .* pass C\.T @ Q @ C"),
     ({"Q": [[1, NAN], [0, 1]]}, "Q holds NaN"),
     ({"Q": [[1, 2], [0, 1]]}, r"Q is not symmetric: .* Pass \(Q \+ Q.T\) / 2"),
     ({"Q": [[1, 2], [2, 1]]}, "Q must be positive semi-definite, .* is -1"),
