@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.compare import EXCESS_ROOM, less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import (
     labels_of,
@@ -107,11 +107,13 @@ def constraints_part(subject: Subject) -> Part:
     head = ["quantity", "lower", "upper", "kind", "acts in the plan"]
     head += [f"{name}: {what}" for name in loops for what in ("range", "steps beyond")]
     rows = []
+    bounds = BoundNames.of(problem)
+    half = dict(zip(bounds.names, bounds.half, strict=True))
     for name, key, of, k, kind, series in _bounds(problem):
         share = 100 * acting[key] / max(len(solvable), 1)
         low, high = (side[k] for side in problem.limits[of])
         row = [name, number(low), number(high), kind, f"{share:.1f} %"]
-        rounding = 1e-6 * (high - low if np.isfinite(high - low) else 1.0)
+        room = EXCESS_ROOM * half.get(key.removeprefix("the rate of "), 0.0)
         for episodes in subject.shown_loops.values():
             parts = [np.zeros(0)]
             beyond = 0
@@ -119,7 +121,7 @@ def constraints_part(subject: Subject) -> Part:
                 values = series(x, u)[:, k]
                 below, above = problem.limits_at(of, x[: len(values)])  # at run time
                 parts.append(values)
-                out = (values < below[..., k] - rounding) | (values > above[..., k] + rounding)
+                out = (values < below[..., k] - room) | (values > above[..., k] + room)
                 beyond += int(out.sum())
             values = np.concatenate(parts)
             row += [f"{number(np.nanmin(values))} to {number(np.nanmax(values))}", str(beyond)]
@@ -127,7 +129,8 @@ def constraints_part(subject: Subject) -> Part:
     last = problem.terminal.set[1]
     sentences = [
         "The plan is the optimal one of the MPC; its share is that of the solvable points among "
-        f"{len(plans)} drawn at random from the box of parameters.",
+        f"{len(plans)} drawn at random from the box of parameters. A step beyond is one by more "
+        f"than {EXCESS_ROOM:g} half-widths, as for violations.",
         f"The terminal set has {len(last)} half-spaces." if len(last) else "No terminal set.",
     ]
     findings = _bound_findings(problem, loops) if loops else ()
