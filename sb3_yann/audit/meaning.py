@@ -132,7 +132,8 @@ def warn_of_signs(
                 gains.append(float(np.sum(effect * expected)) / size)
         if not starts or len(gains) < len(starts):
             continue
-        found = f"{np.median(gains):.2g} times as far in {when}, from {len(gains)} starts"
+        starts_in_words = f"{len(gains)} start{'s' * (len(gains) > 1)}"
+        found = f"{np.median(gains):.2g} times as far in {when}, from {starts_in_words}"
         if max(gains) < 0:
             said.append(
                 f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "

@@ -148,6 +148,7 @@ class Simulator:
         seeds = self.new_seeds(1)
         played = self.play(of_law(self.problem), seeds)
         if self.needed(later) > self.counted.most:
+            self._warn(played, seeds)
             raise OutOfStepsError
         self.learn(played, seeds)
         each = self.usual // 2
@@ -199,13 +200,17 @@ class Simulator:
         require_repeated(problem, self.envs, seeds[0], played.costs[0])
         if not checked:
             return played
-        warn_of_order(problem, *played.steps())
+        self._warn(played, seeds)
         warn_of_box(problem, starts)
-        with self.envs.acquire(1) as (one,):
-            warn_of_signs(problem, one, seeds, played)
         if not self.unaware:
             warn_of_own_reward(problem, played)
         return played
+
+    def _warn(self, played: Trajectories, seeds: Sequence[int]) -> None:
+        """Warn where states or inputs mean something else than in the problem."""
+        warn_of_order(self.problem, *played.steps())
+        with self.envs.acquire(1) as (one,):
+            warn_of_signs(self.problem, one, seeds, played)
 
     def excite(self, count: int) -> None:
         """Learn from so many episodes of the MPC with random inputs on top, from new starts.

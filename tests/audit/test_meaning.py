@@ -18,6 +18,7 @@ from sb3_yann import (
     NoActionNoise,
     StateEstimator,
     headroom,
+    improve,
     report,
 )
 from sb3_yann.audit.meaning import warn_of_box, warn_of_order
@@ -260,8 +261,9 @@ def test_another_gain_and_dead_time_are_no_other_sign_and_far_ones_are_told(gain
     assert [each.split(" than")[0] for each in told] == [v for k, v in far.items() if k == gains]
 
 
-def test_headroom_tells_it_too() -> None:
+def test_headroom_tells_it_too_and_improve_though_its_steps_are_few() -> None:
     assert len(against(lambda: headroom(STEERED, lambda: Plant((-1, -1)), n_starts=3))) == 2
+    assert len(against(lambda: improve(STEERED, lambda: Plant((-1, -1)), max_steps=60))) == 2
 
 
 @pytest.mark.parametrize(
@@ -283,6 +285,5 @@ def test_an_estimator_that_goes_where_its_model_goes_hides_no_sign_and_no_order(
 
 
 def test_a_plant_that_is_not_linear_has_the_signs_of_its_model() -> None:
-    model = DDPG("YannPolicy", "ClippedPendulum-v0", seed=0, learning_starts=10**6)
-    guard = ImprovementGuard("ClippedPendulum-v0", n_eval_episodes=6, n_final_starts=2)
-    assert not against(lambda: model.learn(20, callback=[NoActionNoise(), guard]))
+    make = lambda: gym.make("ClippedPendulum-v0")  # noqa: E731
+    assert not against(lambda: guarded(problems.clipped_pendulum(), make))
