@@ -19,7 +19,8 @@ from sb3_yann.control.linear_system import (
     missing_observer,
     with_units,
 )
-from sb3_yann.control.mpc.bound_excess import BoundNames, costs_of
+from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, costs_of
+from sb3_yann.env_pool import one_env
 from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
 from sb3_yann.reporting.subject import (
     OF_MPC,
@@ -38,6 +39,7 @@ from sb3_yann.reporting.subject import (
     tag,
 )
 from sb3_yann.rollout import Trajectories
+from sb3_yann.wrappers.theta import EstimateState, below
 
 
 def plant_part(subject: Subject) -> Part:
@@ -134,7 +136,26 @@ def constraints_part(subject: Subject) -> Part:
         f"The terminal set has {len(last)} half-spaces." if len(last) else "No terminal set.",
     ]
     findings = _bound_findings(problem, loops) if loops else ()
+    if unseen := _unseen(subject):
+        which = ", ".join(unseen)
+        text = f"No sensor shows {which}: what counts are estimates, and the plant may be beyond "
+        findings = *findings, Finding("note", text + "the bounds where no estimate is.")
     return Part("Constraints register", join([paragraph(*sentences), table(head, rows)]), findings)
+
+
+def _unseen(subject: Subject) -> list[str]:
+    """Return the bounded states and outputs that an estimator tells from others."""
+    if subject.env is None:
+        return []
+    with one_env(subject.env) as env:
+        between = below(env, EstimateState)
+    if between is None:
+        return []
+    C = between.observer.C
+    rows = Bounds.of(subject.problem).C
+    seen: Any = np.isclose(rows @ np.linalg.pinv(C) @ C, rows).all(axis=1)
+    names = BoundNames.of(subject.problem).names
+    return [name for name, shown in zip(names, seen, strict=False) if not shown]
 
 
 def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple[Finding, ...]:

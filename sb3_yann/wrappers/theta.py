@@ -410,6 +410,9 @@ def _require_known(observer: StateEstimator, measured: MeasuredDisturbance | Non
         )
 
 
+CLIPPED = 50  # steps for which an estimate is beyond its range, after which it is no transient
+
+
 class EstimateState(Appending):
     """Puts the estimated state in place of the measured outputs, and appends the disturbance d.
 
@@ -471,6 +474,7 @@ class EstimateState(Appending):
         self.inner = Units(np.concatenate([observer.C @ model.x_ss, model.d_ss[known]]), model.u_ss)
         self.outer = Units(np.concatenate([model.x_ss, model.d_ss[estimated]]), model.u_ss)
         self.load: Array | None = None
+        self.clipped: NDArray[np.intp] = np.zeros(observer.n_estimated, dtype=np.intp)
         self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
         self.readings: Vector = np.full(observer.n_measured, np.nan)  # the latest, in deviations
 
@@ -492,7 +496,15 @@ class EstimateState(Appending):
             first = observer.n_measured
             self.load = self.measured.held[: observer.n_known] - self.inner.theta_ss[first:]
         x_hat, d_hat = np.split(self.outer.to_plant(np.concatenate(both)), [len(both[0])])
-        return [x_hat, rest, np.clip(d_hat, self.low, self.high)]
+        shown = np.clip(d_hat, self.low, self.high)
+        self.clipped = np.where((shown != d_hat) & (u is not None), self.clipped + 1, 0)
+        for i in np.flatnonzero(self.clipped == CLIPPED):
+            warn(
+                f"For {CLIPPED} steps the estimated d[{i}] has been beyond its range, "
+                f"{self.low[i]:g} to {self.high[i]:g}: more than that acts, and the plant settles "
+                "beside its targets. Widen it: offset_free(mpc, d_max=...)."
+            )
+        return [x_hat, rest, shown]
 
 
 class ObserveDisturbance(EstimateState):

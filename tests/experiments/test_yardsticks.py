@@ -13,15 +13,8 @@ from sample_plants import Recorder
 from sb3_yann_envs import clipped_pendulum, cstr, problems
 
 ENVS = ["CSTR-v0", "ClippedPendulum-v0"]
-BUILDERS = {
-    "ddpg": sb3_ddpg,
-    "td3": sb3_td3,
-    "residual": residual_rl,
-    "quiet residual": partial(residual_rl, noise=0.0),
-    "cloned": cloned,
-    "sac": partial(maximum_entropy, algorithm="SAC"),
-    "tqc": partial(maximum_entropy, algorithm="TQC"),
-}
+BUILDERS = [sb3_ddpg, sb3_td3, residual_rl, partial(residual_rl, noise=0.0), cloned]
+BUILDERS += [partial(maximum_entropy, algorithm=name) for name in ("SAC", "TQC")]
 
 
 def recorder(env_id: str) -> Recorder:
@@ -34,18 +27,14 @@ def random_states(env: gym.Env, count: int = 200) -> np.ndarray:
     return rng.uniform(space.low, space.high, (count, *space.shape)).astype(np.float32)
 
 
-@pytest.fixture
-def quick_cloning(monkeypatch) -> None:
+@pytest.mark.nightly
+@pytest.mark.parametrize("build", BUILDERS)
+@pytest.mark.parametrize("env_id", ENVS)
+def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, build, monkeypatch) -> None:
     monkeypatch.setattr(yardsticks, "CLONING_STEPS", 20)
     monkeypatch.setattr(yardsticks, "CLONING_SEEDS", range(500, 502))
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", BUILDERS)
-@pytest.mark.parametrize("env_id", ENVS)
-def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_cloning) -> None:
     env = recorder(env_id)
-    learner = BUILDERS[name](lambda: env, 0)
+    learner = build(lambda: env, 0)
     states = random_states(env)
     before, _ = learner.policy.predict(states)
     learner.model.learn(150, callback=learner.callbacks)
@@ -54,14 +43,9 @@ def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_
     learner.model.learn(150, callback=learner.callbacks, reset_num_timesteps=False)
     after, _ = learner.policy.predict(states, deterministic=True)
     assert len(env.pairs) == learner.model.num_timesteps == 300
-    assert after.shape == (len(states), 1)
-    assert after.dtype == np.float32
-    assert np.any(after != before)
-    assert np.all(np.abs(after) <= env.action_space.high)
-    executed = env.recorded()[1]
-    assert np.all(np.abs(executed) <= env.action_space.high)
-    one, _ = learner.policy.predict(states[0])
-    np.testing.assert_allclose(one, after[0], rtol=1e-4, atol=1e-4)
+    assert after.shape == (len(states), 1) and np.any(after != before)
+    for actions in (after, env.recorded()[1]):
+        assert np.all(np.abs(actions) <= env.action_space.high)
 
 
 @pytest.mark.parametrize("env_id", ENVS)

@@ -7,6 +7,7 @@ from functools import cache, partial
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -32,6 +33,7 @@ from sb3_yann import (
     NoActionNoise,
     PlantTwin,
     RateLimits,
+    StateEstimator,
     offset_free,
     report,
     reporting,
@@ -40,7 +42,7 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement.confirmation import Check
 from sb3_yann.improvement.improving import Improvement
 from sb3_yann.reporting import evidence_parts, problem_parts
-from sb3_yann.wrappers import PlantEnv, PreviousInput
+from sb3_yann.wrappers import EstimateState, PlantEnv, PreviousInput
 from sb3_yann_envs import problems
 from weights import last_layer, unpin
 
@@ -441,6 +443,9 @@ def test_the_page_says_that_an_observer_is_no_part_of_the_policy(tmp_path) -> No
     for said in (text, Improvement((), -0.02, True, model=model).report()):
         assert "Costs and bounds are those of the estimates, not of the plant." in said
     assert "measured disturbance" not in text
+    bounded = replace(twin_samples.problem(), x_max=[2.0, 2.0])
+    env = EstimateState(Slide(), StateEstimator(bounded.model, [[1.0, 0.0]]))
+    assert problem_parts._unseen(SimpleNamespace(env=env, problem=bounded)) == ["x[1]"]
 
 
 class Untouchable(Wrapper):

@@ -77,6 +77,7 @@ def test_the_twin_s_env_is_the_wrapped_plant_step_by_step() -> None:
     assert clipped > 5
 
 
+@pytest.mark.filterwarnings("ignore:For 50 steps")
 @pytest.mark.parametrize("begin", [0, 20])
 def test_the_log_tells_what_was_measured_and_estimated(begin) -> None:
     mpc, observer = offset_free_problem()

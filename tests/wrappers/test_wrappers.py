@@ -267,6 +267,15 @@ def test_a_measurement_that_is_not_finite_is_named_and_predicted() -> None:
     assert np.all(np.isfinite(observation))
 
 
+def test_an_estimate_that_stays_beyond_its_range_is_told_once() -> None:
+    model = LinearModel(np.eye(2) / 2, [[1.0], [0.0]], dt=1, E=np.eye(2))
+    env = ObserveDisturbance(Counter(), DisturbanceObserver(model), [-0.5, -99], [0.5, 99])
+    env.reset()
+    with pytest.warns(UserWarning, match=r"d\[0\] .* -0.5 to 0.5: .*d_max=") as found:
+        [env.step(np.zeros(1)) for _ in range(150)]
+    assert len(found) == 1
+
+
 def test_inputs_on_their_way_are_shown_newest_first() -> None:
     env = PastInputs(gym.make("CSTR-v0"), [3], initial=[0.5])
     assert env.reset(seed=0)[0][4:].tolist() == [0.5, 0.5, 0.5]
