@@ -167,6 +167,7 @@ def test_an_observer_that_pays_from_one_start_of_three_is_not_known_to_pay() -> 
     assert "may be chance on so few starts" in found.report()
 
 
+@pytest.mark.filterwarnings("ignore:For 50 steps")  # of the env below
 def test_a_disturbance_beyond_the_default_is_reported() -> None:
     plant = partial(Heater, load=0.6)
     found = headroom(heater(), plant, n_starts=3, max_steps=NO_PLANS)
