@@ -121,9 +121,9 @@ def constraints_part(subject: Subject) -> Part:
             beyond = 0
             for x, u in episodes.pairs:
                 values = series(x, u)[:, k]
-                below, above = problem.limits_at(of, x[: len(values)])  # at run time
+                lower, upper = problem.limits_at(of, x[: len(values)])  # at run time
                 parts.append(values)
-                out = (values < below[..., k] - room) | (values > above[..., k] + room)
+                out = (values < lower[..., k] - room) | (values > upper[..., k] + room)
                 beyond += int(out.sum())
             values = np.concatenate(parts)
             row += [f"{number(np.nanmin(values))} to {number(np.nanmax(values))}", str(beyond)]
