@@ -30,18 +30,23 @@ class Gains(ReadOnlyArrays):
     Attributes
     ----------
     values, errors : ndarray, shapes (n, m)
-        With their standard errors, zeros where nothing is known.
+        Of the model as it is, with their standard errors, zeros where nothing is known.
     degrees : ndarray of int, shape (n, m)
         0: the value is a steady-state gain. 1: the state integrates, by so much in a sample.
         2: what it moves in a sample grows by so much in each.
     integrators : int
         Poles that are 1, or cannot surely be told from it: those nearest to 1.
+    beside, beside_errors : ndarray, shapes (n, m)
+        Gains of what other poles do, which are all where an integrator is a load that no input
+        moves. Of a state that integrates, gains of a pole that is not 1.
     """
 
     values: Array
     errors: Array
     degrees: NDArray[np.int64]
     integrators: int
+    beside: Array
+    beside_errors: Array
 
     @classmethod
     def of(cls, A: Array, B: Array, integrators: int, errors: Iterable[Array] = ()) -> Gains:
@@ -50,15 +55,16 @@ class Gains(ReadOnlyArrays):
         found[2] *= integrators > 1
         widths = np.array([*errors] or np.zeros(found.shape))
         P = np.abs(projector(A, integrators))
-        parts = np.abs(found[1:]) - ROUNDING * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
-        moves_on, speeds_up = parts > FOLLOWS * widths[1:]
+        parts = np.abs(found[1:3]) - ROUNDING * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
+        moves_on, speeds_up = parts > FOLLOWS * widths[1:3]
         speeds_up &= LONG * parts[1] > parts[0]
         # What one input moves on and on, another may move on too: its interval tells.
         moves_on |= np.any(moves_on | speeds_up, axis=1, keepdims=True) & (widths[1] > 0)
         degrees = np.where(speeds_up, 2, moves_on.astype(int))
         pick = np.expand_dims(degrees, 0)
         values, own = (np.take_along_axis(each, pick, 0)[0] for each in (found, widths))
-        return cls(values, own, degrees, integrators)
+        beside = (np.where(degrees, each[0], each[3]) for each in (found, widths))
+        return cls(values, own, degrees, integrators, *beside)
 
 
 def projector(A: Array, integrators: int) -> Array:
@@ -84,27 +90,18 @@ def settled(A: Array, P: Array) -> Array:
     return np.asarray(np.linalg.solve(one - A + P, one - P))
 
 
+def _on_circle(A: Array) -> int:
+    return int(np.sum(np.abs(np.linalg.eigvals(A) - 1) < ON_CIRCLE))
+
+
 def responses(A: Array, B: Array, integrators: int) -> Array:
-    """Return steady-state gains without integrators, their slopes, and their growth, (3, n, m)."""
+    """Return steady-state gains, slopes of integrators, their growth, and the gains without them.
+
+    Shape (4, n, m). A pole that is 1 has no part in the first.
+    """
     P = projector(A, integrators)
-    return np.array([settled(A, P) @ B, P @ B, (A @ P - P) @ B])
-
-
-def response_terms(A: Array, B: Array, integrators: int) -> list[list[tuple[Array, Array]]]:
-    """Return what changes the `responses` to first order: sums of ``left @ [dA dB] @ right``."""
-    P = projector(A, integrators)
-    R = settled(A, P)
-    N = A @ P - P
-    still = np.zeros((B.shape[1], B.shape[1]))
-    one = np.eye(B.shape[1])
-
-    def term(left: Array, by_A: Array, by_B: Array = still) -> tuple[Array, Array]:
-        return left, np.vstack([by_A, by_B])
-
-    gain = [term(R, R @ B, one), term(-R @ R, P @ B), term(-P, R @ R @ B)]
-    slope = [term(P, R @ B, one), term(R, P @ B), term(-N, R @ R @ B), term(-R @ R, N @ B)]
-    growth = [term(np.eye(len(A)), P @ B), *((A @ left - left, right) for left, right in slope)]
-    return [gain, slope, growth]
+    own = settled(A, projector(A, _on_circle(A)))
+    return np.array([own @ B, P @ B, (A @ P - P) @ B, settled(A, P) @ B])
 
 
 def count_integrators(A: Array, deviation: Callable[[Array], float] = lambda R: 0.0) -> int:

@@ -445,7 +445,7 @@ def refined(model: Innovations, chunks: Chunks) -> Innovations:
 
 
 def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, int, Array]:
-    """Return poles (n,), largest first, their errors, integrators, errors of responses (3, q, k).
+    """Return poles (n,), largest first, their errors, integrators, errors of responses (4, q, k).
 
     To first order, by the inverse of the normal equations (Ljung, *System Identification*, section
     9.4). What only changes the states' coordinates has no effect on either. Where errors of the

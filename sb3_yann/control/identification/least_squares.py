@@ -16,7 +16,7 @@ from sb3_yann.control.gains import (
     WIDE,
     Gains,
     count_integrators,
-    response_terms,
+    responses,
 )
 from sb3_yann.control.linear_system import combination, names
 from sb3_yann.log import Episode, split_episodes
@@ -203,6 +203,9 @@ def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
     return values[order], errors[order]
 
 
+STEP = 1e-3  # of a standard deviation, in which responses are linear
+
+
 def gains_of(found: Regression, n: int, m: int) -> Gains:
     """Return what m held inputs do to n states in the end, with errors by the delta method."""
     A, B = np.split(found.coefficients[:, : n + m], [n], axis=1)
@@ -212,18 +215,21 @@ def gains_of(found: Regression, n: int, m: int) -> Gains:
         return float(np.sqrt(max(np.trace(R @ found.covariance @ R.T @ part[:n, :n]), 0.0)))
 
     count = count_integrators(A, deviation)
-    errors = []
-    for terms in response_terms(A, B, count):
-        pairs = [
-            np.outer(
-                np.sum((left @ found.covariance) * other, axis=1),
-                np.sum(right * (part @ by), axis=0),
-            )
-            for left, right in terms
-            for other, by in terms
-        ]
-        errors.append(np.sqrt(np.abs(np.sum(pairs, axis=0))))
-    return Gains.of(A, B, count, errors)
+    errors = np.zeros((4, n, m))
+    for of_rows in _root(found.covariance):
+        for of_columns in _root(part):
+            by = STEP * np.outer(of_rows, of_columns)  # independent of the others
+            more, less = (responses(A + d[:, :n], B + d[:, n:], count) for d in (by, -by))
+            errors += ((more - less) / (2 * STEP)) ** 2
+    return Gains.of(A, B, count, np.sqrt(errors))
+
+
+def _root(covariance: Array) -> Array:
+    """Return columns, as rows, whose outer products sum up to a covariance."""
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.maximum(np.outer(scale, scale), 1e-300))
+    kept = values > 1e-15 * values[-1]
+    return np.asarray((scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T)
 
 
 def pole_note(values: Array, errors: Array, noise: str = "process noise") -> str:

@@ -61,7 +61,7 @@ class Structure:
     curvature: Array = field(default_factory=lambda: np.zeros(0))  # (q,), share of the errors
     poles: tuple[Array, Array] = (np.zeros(0),) * 2  # with errors
     integrators: int = 0
-    gain_errors: Array = field(default_factory=lambda: np.zeros((3, 0, 0)))  # (3, q, k)
+    gain_errors: Array = field(default_factory=lambda: np.zeros((4, 0, 0)))  # (4, q, k)
 
     @property
     def error(self) -> float:

@@ -248,7 +248,7 @@ def identify_outputs(
     system = system_of(step, (n, m, d), (None, None, None), log.dt, [0] * m)
     drift = step.predict(np.concatenate([system.x_ss, system.u_ss, system.d_ss])[None])[0]
     A, B, E, C, K = _with_memory(model, m, found.delays)
-    errors = np.zeros((3, *B.shape))
+    errors = np.zeros((4, *B.shape))
     if np.array_equal(model.C, np.eye(q, n)):  # the first states are the outputs
         errors[:, :q] = found.gain_errors[..., :m] * scale[:q, None] / scale[q : q + m]
     state_names = _state_names(log, model, found.delays)

@@ -14,7 +14,6 @@ from sb3_yann.control.gains import (
     UNTOLD,
     Gains,
     count_integrators,
-    settled,
 )
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
@@ -186,7 +185,9 @@ def _gains(model: LinearSystem) -> list[str]:
     pace, time = (model.dt, model.time_unit) if model.time_unit else (1.0, "sample")
     rates = "", f" per {time}", f" per {time}²"
 
-    def effects(values: Array, width: Array, degrees: NDArray[np.int64]) -> list[str]:
+    def effects(
+        values: Array, width: Array, degrees: NDArray[np.int64], rows: NDArray[np.int64]
+    ) -> list[str]:
         found = []
         for j, name in enumerate(with_units(model)[1]):
             each = []
@@ -203,18 +204,22 @@ def _gains(model: LinearSystem) -> list[str]:
     stable = np.all(np.abs(_beside(model, gains)) < 1 - ON_CIRCLE)
     verb = "does in the end" if stable else "would balance"
     lines = [f"What one unit more of an input, held, {verb}:"]
-    lines += effects(values, width, gains.degrees)
-    if np.any(gains.degrees):
+    lines += effects(values, width, gains.degrees, rows)
+    moves_on = np.any(gains.degrees, axis=1)
+    if np.any(moves_on[rows]):
         lines.append(
             f"  What integrates moves on, by so much per {time}: it has no steady-state gain."
         )
-        if np.abs(np.linalg.eigvals(model.A) - 1).min() > ON_CIRCLE:
-            own = settled(model.A, np.zeros_like(model.A)) @ model.B
-            lines.append(
-                "  A load that drifts, and is not measured, looks like that too. If it is one, the "
-                "gains are about:"
-            )
-            lines += effects(own, np.zeros_like(own), np.zeros_like(gains.degrees))
+    # The gains beside a pole that may be 1 say more, or nothing.
+    told = rows[(moves_on | np.all(gains.beside_errors < gains.errors, axis=1))[rows]]
+    if gains.integrators and told.size and np.abs(np.linalg.eigvals(model.A) - 1).min() > ON_CIRCLE:
+        lines.append(
+            "  A pole that may be 1 may be a load that drifts, and is not measured: then gains are "
+            "about:"
+        )
+        lines += effects(
+            gains.beside, NORMAL * gains.beside_errors, np.zeros_like(gains.degrees), told
+        )
     if np.any(width):
         unsure = np.argwhere((np.abs(values) <= width) & (width > 0))
         none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in unsure)

@@ -68,7 +68,7 @@ def test_steady_gains_have_errors_and_one_that_may_be_zero_is_named() -> None:
     off = [np.linalg.solve(np.eye(2) - each.A, each.B) - G for each in draws]
     share = np.mean(np.abs(off) <= 1.96 * np.array([each.gains.errors for each in draws]), axis=0)
     assert np.all(np.abs(share - 0.95) < 0.062), share
-    known = Gains.of(A, B, 0, [np.array([[5.0], [0.1]])] * 3)
+    known = Gains.of(A, B, 0, [np.array([[5.0], [0.1]])] * 4)
     told = LinearModel(A, B, dt=1, gains=known).report()
     assert f"x[0] {G[0, 0]:+.4g} ± 9.8, x[1] {G[1, 0]:+.4g} ± 0.2." in told
     assert "Not distinguishable from zero: u[0] on x[0]." in told

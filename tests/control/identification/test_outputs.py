@@ -274,4 +274,4 @@ def test_an_output_that_integrates_has_a_rate_and_no_gain() -> None:
     assert gains is not None and gains.integrators == 1 and np.all(gains.degrees == 1)
     assert np.all(np.abs(gains.values - tank["B"]) <= 1.96 * gains.errors)
     assert "may integrate" in found.report() and "per sample" in found.report()
-    assert "A load that drifts, and is not measured, looks like that too" in found.report()
+    assert "A pole that may be 1 may be a load that drifts, and is not measured" in found.report()
