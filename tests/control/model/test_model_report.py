@@ -34,7 +34,7 @@ def rotating(size: float, period: float) -> LinearModel:
         (of_poles(0.5, 1.1), "Unstable: 1 of 2 poles grow, the largest magnitude of a pole is 1.1"),
     ],
 )
-def test_a_mode_is_told_in_time_and_in_samples_and_stability(model: LinearModel, words: str) -> None:
+def test_modes_are_told_in_time_and_in_samples(model: LinearModel, words: str) -> None:
     assert words in model.report()
 
 
