@@ -73,7 +73,7 @@ class NoActionNoise(BaseCallback):
 class ControlDiagnostics(BaseCallback):
     """Records what SB3 does not: how far the policy is from its MPC, and whether limits held.
 
-    Scalars, over the steps that no dump has shown yet where nothing else is said:
+    Scalars, over the ended episodes that no dump has shown yet where nothing else is said:
 
     - ``yann/distance_from_mpc_mean``, ``yann/distance_from_mpc_max``: distance of the executed
       action from the MPC's, as a fraction of the input range (largest over the inputs).
@@ -110,22 +110,13 @@ class ControlDiagnostics(BaseCallback):
         observations = np.asarray(self.model._last_obs)  # still s_t: SB3 advances it later
         # In [-1, 1]; on-policy algorithms call them otherwise.
         actions = self.locals.get("buffer_actions", self.locals["actions"])
-        layer = self.policy.actor.mu
-        with th.no_grad():
-            theta = self.policy.theta(observations)
-            law = layer.law(theta).cpu().numpy()
-            regions = layer.regions(theta)
-        distances = np.max(np.abs(actions - law), axis=1) / 2
-        known = np.isfinite(distances)  # the law knows none where an observation is not finite
-        self._regions.extend(regions[known].tolist())
-        self._distances.extend(distances[known])
         dones = self.locals["dones"]
         infos = self.locals["infos"]
         self.violations += sum(bool(info.get("violation", False)) for info in infos)
         for i, episode in enumerate(self._episodes):
             episode.append((observations[i], actions[i], self.locals["rewards"][i]))
             if dones[i]:
-                self._record_critic_error(episode, infos[i])
+                self._record_episode(episode, infos[i])
                 episode.clear()
         if np.any(dones):
             self._record()
@@ -140,8 +131,15 @@ class ControlDiagnostics(BaseCallback):
         self.logger.record("yann/violations", self.violations)
         self._recorded = len(self._distances)
 
-    def _record_critic_error(self, episode: list[tuple[Any, ...]], info: dict[str, Any]) -> None:
+    def _record_episode(self, episode: list[tuple[Any, ...]], info: dict[str, Any]) -> None:
         observations, actions, rewards = (np.array(part) for part in zip(*episode, strict=True))
+        # At every step the law would take a tenth of the time of training.
+        theta = self.policy.theta(observations)
+        law = self.policy.actor.mu.law(theta).cpu().numpy()
+        distances = np.max(np.abs(actions - law), axis=1) / 2
+        known = np.isfinite(distances)  # the law knows none where an observation is not finite
+        self._regions.extend(self.policy.actor.mu.regions(theta)[known].tolist())
+        self._distances.extend(distances[known])
         value = 0.0
         if info.get("TimeLimit.truncated", False):
             last = np.asarray(info["terminal_observation"])[None]

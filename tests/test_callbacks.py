@@ -105,8 +105,8 @@ def test_violations_count_and_the_critic_error_compares_q_with_the_return_that_f
     model, _ = noisy(env=Ending(gym.make("ClippedPendulum-v0"), 3, reward=-1.0), gamma=0.5)
     states: list[np.ndarray] = []
     diagnostics = ControlDiagnostics()
-    record = diagnostics._record_critic_error
-    diagnostics._record_critic_error = lambda episode, info: (  # type: ignore[method-assign]
+    record = diagnostics._record_episode
+    diagnostics._record_episode = lambda episode, info: (  # type: ignore[method-assign]
         states.extend(step[0] for step in episode),
         record(episode, info),
     )[-1]
