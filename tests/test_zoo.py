@@ -109,8 +109,8 @@ class Run:
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param(("ddpg", "CSTR-v0"), id="ddpg-CSTR", marks=pytest.mark.slow),
-        pytest.param(("td3", "ClippedPendulum-v0"), id="td3-pendulum", marks=pytest.mark.nightly),
+        pytest.param(("ddpg", "CSTR-v0"), id="ddpg-CSTR", marks=pytest.mark.nightly),
+        pytest.param(("td3", "ClippedPendulum-v0"), id="td3-pendulum", marks=pytest.mark.slow),
     ],
 )
 def run(request, tmp_path_factory) -> Run:
@@ -149,6 +149,7 @@ def test_tensorboard_gets_the_diagnostics_of_control(run) -> None:
     assert found["yann/violations"][-1] == 0
 
 
+@pytest.mark.nightly
 def test_training_continues_from_a_saved_model(run) -> None:
     before = run.model()
     run.train("-n", "5", "-i", str(run.log() / f"{run.env_id}.zip"))

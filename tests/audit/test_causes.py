@@ -353,7 +353,7 @@ def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
     held = gym.wrappers.TimeLimit(SetPoint(Rewarded(stage), -1, 1), 9)
     assert below(held, SetPoint) and not below(Rewarded(stage), SetPoint)
     tracking = dataclasses.replace(mpc(), tracking=Tracking([0], -1, 1))
-    headroom(tracking, held, n_starts=2)  # a warning would be an error
+    headroom(tracking, held, n_starts=2, max_steps=100)  # a warning would be an error
 
 
 def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:

@@ -36,7 +36,7 @@ from weights import is_mpc
 
 def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioning:
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
-    options = {"batch": 5, "updates": 400, "max_correction": 0.2} | options
+    options = {"batch": 5, "updates": 200, "max_correction": 0.2} | options
     return Commissioning(model, env, log_path=path, **options)
 
 
@@ -137,12 +137,13 @@ def test_only_accepted_policies_act(begun, tmp_path) -> None:
 
 
 def test_a_kill_at_any_moment_changes_nothing(tmp_path, monkeypatch) -> None:
-    whole = commission(tmp_path / "whole.jsonl")
+    short = {"batch": 3, "updates": 100}
+    whole = commission(tmp_path / "whole.jsonl", **short)
     whole.run(2)
     path = tmp_path / "cut.jsonl"
     played = 0
     while True:
-        run = commission(path)
+        run = commission(path, **short)
         assert len(run.episodes) == played
         env = Cart()
         count = 0
@@ -163,15 +164,15 @@ def test_a_kill_at_any_moment_changes_nothing(tmp_path, monkeypatch) -> None:
             played += 1
             with path.open("ab") as file:
                 file.write(b'{"event": "epis')  # the write that was cut off
-    assert played == 14
+    assert played == 8
     assert run.batches == whole.batches or str(run.batches) == str(whole.batches)
     for one, other in zip(run.episodes, whole.episodes, strict=True):
         np.testing.assert_array_equal(one.thetas, other.thetas)
     theta = np.float32([[0.5, 0.2], [-1.0, 0.1]])
     np.testing.assert_array_equal(run.model.predict(theta)[0], whole.model.predict(theta)[0])
-    again = commission(path)
+    again = commission(path, **short)
     np.testing.assert_array_equal(again.model.predict(theta)[0], whole.model.predict(theta)[0])
-    assert again.run(2) == again.batches and len(again.episodes) == 15
+    assert again.run(2) == again.batches and len(again.episodes) == 9
 
 
 def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(begun, monkeypatch) -> None:

@@ -32,7 +32,7 @@ pytestmark = needs_compiler
 def test_double_is_the_controller(name, compiler, tmp_path):
     policy = policy_of(name)
     compiled = Compiled(policy, tmp_path, compiler=compiler)
-    obs = observations(policy, 10_000)
+    obs = observations(policy, 3_000)
     controller = compiled.controller
     # On a facet of a law whose networks jump there, rounding chooses.
     kept = insensitive(controller, obs, "double")
@@ -49,7 +49,7 @@ def test_double_is_the_controller(name, compiler, tmp_path):
 def test_float_is_the_controller_where_it_is_steady(name, tmp_path):
     policy = policy_of(name)
     compiled = Compiled(policy, tmp_path, "float")
-    obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)
+    obs = observations(policy, 3_000).astype(np.float32).astype(np.float64)
     kept = insensitive(compiled.controller, obs, "float")
     assert len(kept) > 0.4 * len(obs)
     actions, _ = compiled.at(kept)
@@ -220,7 +220,7 @@ int main(int argc, char **argv)
 
 def sanitizers(folder) -> list[str]:
     (folder / "one.c").write_text("int main(void) { return 0; }\n")
-    flags = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    flags = ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     built = [COMPILERS[0], *flags, "one.c", "-o", "one"]
     found = subprocess.run(built, cwd=folder, capture_output=True)
     if found.returncode or subprocess.run([str(folder / "one")], capture_output=True).returncode:

@@ -48,7 +48,7 @@ def controller_of(given, folder: Path, **options) -> Controller:
 def test_it_is_the_policy(name, tmp_path):
     policy = policy_of(name)
     controller = controller_of(policy, tmp_path)
-    obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)  # as SB3 takes it
+    obs = observations(policy, 3_000).astype(np.float32).astype(np.float64)  # as SB3 takes it
     scale = 2 * controller.data["action_scale"]
     # In float64 by torch, which is an evaluation of its own.
     with th.no_grad():

@@ -28,7 +28,7 @@ def both(name, folder, precision="double"):
 @pytest.mark.parametrize("name", CASES)
 def test_a_graph_is_the_controller(name, precision, tmp_path):
     controller, run = both(name, tmp_path, precision)
-    obs = observations(policy_of(name), 10_000)
+    obs = observations(policy_of(name), 3_000)
     if precision == "float":
         obs = obs.astype(np.float32).astype(np.float64)
     kept = insensitive(controller, obs, precision)

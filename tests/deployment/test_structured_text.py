@@ -58,6 +58,7 @@ def test_plcopen_holds_the_same_block(tmp_path):
     assert named == ["obs", "elapsed", "request", "has_manual", "manual"]
 
 
+@pytest.mark.nightly  # it takes a millisecond for each letter
 def test_blark_parses_it(tmp_path):
     parse = pytest.importorskip("blark.parse").parse_source_code
     export(policy_of("references and rates"), tmp_path / "plant.st")

@@ -68,7 +68,7 @@ def test_windows_do_not_take_noise_of_the_sensors_for_dynamics() -> None:
     box = coordinates(noise)
     errors = []
     for ahead in (1, 20):
-        members = fit_ensemble(box, [seen], seed=0, ahead=ahead, updates=1000)
+        members = fit_ensemble(box, [seen], seed=0, ahead=ahead, updates=600)
         dynamics = Dynamics(problem(), box, tuple(members))
         runs = [dynamics.replay(e, np.array([0, 20, 40]), 20)[0, :, -1] for e in unseen]
         actual = [e.thetas[[20, 40, 60]] for e in unseen]

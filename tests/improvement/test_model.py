@@ -240,7 +240,7 @@ def test_a_policy_descends_to_what_costs_less_and_breaks_no_rule() -> None:
     layer = DDPG(
         YannPolicy, Cart(), policy_kwargs={"problem": problem(), "networks": "shared"}
     ).actor.mu
-    saved = refine(layer, teacher, 500)
+    saved = refine(layer, teacher, 150)
     played = teacher.play(layer)
     assert saved > 0 and saved == teacher.saved(played.costs)
     assert not teacher.objection(played)

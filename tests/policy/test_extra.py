@@ -138,7 +138,7 @@ def test_networks_learn_from_extra_signals_and_travel_with_the_model(
 ) -> None:
     """What was learnt depends on the feed; saved and loaded it is the same, and goes on."""
     model = build(kind, critic_warmup=0)
-    model.learn(300, callback=NoActionNoise())
+    model.learn(120, callback=NoActionNoise())
     ways = th.tensor([[9.0, FEED[0]], [9.0, FEED[1]]]).double()
     with th.no_grad():
         values = model.critic(ways, th.zeros(2, 1))[0]
@@ -182,8 +182,7 @@ def test_signals_come_last_whatever_else_theta_holds(monkeypatch: pytest.MonkeyP
     halved = observations() * [0.5, 1]
     expected = tank().explicit().plant_input(observations()[:, :1])
     np.testing.assert_allclose(mapped.predict(halved)[0], expected, atol=6e-5)
-    quicker = {"n_starts": 10, "rounds": 2, "updates": 1000}
-    found = improve(model, make, **quicker)
+    found = improve(model, make, n_starts=6, rounds=1, updates=500)
     assert found.accepted and found.change < -0.05
 
 
@@ -241,12 +240,12 @@ def test_improve_learns_what_a_signal_does(tmp_path: Any, monkeypatch: pytest.Mo
     told = LinearModel([[0.8]], [[0.5]], dt=1.0, x_ss=[10], u_ss=[3], E=[[0.02]], d_ss=[295])
     oracle = replace(tank(), model=told, disturbances=DisturbanceBounds(*FEED))
     model = build(problem=mpc, extra=0)
-    found = improve(model, Tank, n_starts=10, rounds=2, updates=1500)
+    found = improve(model, Tank, n_starts=10, rounds=1, updates=600)
     law = mpc.law().plant_input
     rng = np.random.default_rng(100)
     log = evaluate(lambda x: np.clip(law(x) + rng.uniform(-1, 1), 0, 6), Tank, range(100, 115))
     twin = PlantTwin.fit(mpc, log.pairs, residuals=["linear"])
-    learnt = improve(mpc, twin, n_starts=10, rounds=2, updates=1500)
+    learnt = improve(mpc, twin, n_starts=10, rounds=1, updates=600)
     assert found.accepted and learnt.accepted
     acting = mpc.law(), oracle.law(), found.model, learnt.model
     base, least, *costs = (evaluate(each, Tank, range(40)).costs.sum() for each in acting)

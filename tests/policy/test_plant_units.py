@@ -176,7 +176,7 @@ def test_a_plant_that_lacks_a_part_of_theta_is_told_of_the_wrappers() -> None:
 # ---- No setting carries a unit: the same plant in other units is learnt the same way ----
 
 
-EPISODES = 5
+EPISODES = 3
 STEPS = 100
 
 
@@ -249,7 +249,7 @@ def trained(cost: float = 1.0, x: tuple[float, ...] = (1, 1, 1, 1), u: float = 1
     [{"cost": 1e-3}, {"x": (1e3, 1e-2, 7.0, 0.1)}, {"u": 100.0}],
     ids=["cost / 1000", "states", "inputs"],
 )
-def test_other_units_give_the_same_actions_through_five_training_episodes(units) -> None:
+def test_other_units_give_the_same_actions_through_training_episodes(units) -> None:
     expected, model = trained()
     found, other = trained(**units)
     span = np.ptp(expected)

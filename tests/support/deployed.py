@@ -174,7 +174,7 @@ def self_test(
 ) -> subprocess.CompletedProcess[str]:
     """Build the self-test of exported C code under sanitizers, and run it."""
     sources = [str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c")]
-    guards = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    guards = ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     build = [compiler or COMPILERS[0], *STRICT, *guards, *sources]
     subprocess.run([*build, "-lm", "-o", str(folder / "test")], check=True)
     return subprocess.run([folder / "test"], capture_output=True, text=True)

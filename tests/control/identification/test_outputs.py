@@ -102,7 +102,7 @@ def test_dead_time_is_told_from_order() -> None:
     a = np.array([[0.9, 0.2], [-0.2, 0.9]])
     b = np.array([[0.0], [0.5]])
     c = np.array([[1.0, 0.5]])
-    u = steps(1200, 1, 2)
+    u = steps(800, 1, 2)
     found = identify_outputs(played(u, a, b, c, 3, delay=5), u, dt=1)
     assert (found.order, found.delays, found.model.n_states) == (2, (5,), 7)
     prompt = identify_outputs(played(u, a, b, c, 3), u, dt=1)
@@ -117,7 +117,7 @@ def test_dead_time_is_told_from_order() -> None:
 def test_a_record_that_begins_at_rest_hides_no_dead_time() -> None:
     rng = np.random.default_rng(4006)
     plant, _ = random_plant(rng)
-    u = inputs(2000, 2, rng)
+    u = inputs(1200, 2, rng)
     found = identify_outputs(plant.record(u, rng), u, dt=1)
     assert (found.order, found.delays) == (len(plant.A), (7, 4))
     assert plant.delays.tolist() == [7, 4]
@@ -125,7 +125,7 @@ def test_a_record_that_begins_at_rest_hides_no_dead_time() -> None:
 
 def test_an_integrator_keeps_its_pole() -> None:
     a = np.array([[1.0, 0.3], [0.0, 0.8]])
-    u = steps(1500, 1, 4) - 3
+    u = steps(800, 1, 4) - 3
     found = identify_outputs(played(u, a, 0.2 * np.eye(2)[:, 1:], np.eye(1, 2), 5), u, dt=1)
     assert np.max(np.abs(np.linalg.eigvals(found.model.A))) == pytest.approx(1, abs=0.01)
 
@@ -201,7 +201,7 @@ def test_an_input_without_effect_is_named() -> None:
 
 
 def test_a_curved_plant_is_not_taken_for_dead_time() -> None:
-    u = steps(1500, 1, 1) - 3
+    u = steps(800, 1, 1) - 3
     x = np.zeros(1)
     y = [np.zeros(1)]
     rng = np.random.default_rng(2)
@@ -236,7 +236,7 @@ def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
     u = steps(1200, 2, 0)
     y = played(u, A, B, C, 1)
     y[np.arange(len(y)) % 10 > 0, 1] = np.nan
-    found = identify_outputs(y, u, dt=0.5)
+    found = identify_outputs(y, u, dt=0.5, order=3, delay=0)
     assert found.every == (1, 10) and "Read now and then: y[1] every 10" in found.report()
     fresh = steps(800, 2, 5)
     z = played(fresh, A, B, C, 6)
