@@ -395,6 +395,9 @@ def _other_pace(log: Logged) -> Iterator[str]:
 
 def _against_plant(log: Logged, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where inputs that the law does not prove act otherwise than the model says."""
+    if said := _by_innovations(log):
+        yield said
+        return
     fit = _Effects.of(log, 0)
     B = log.problem.model.B
     unit = log.unit
@@ -410,16 +413,51 @@ def _against_plant(log: Logged, proven: NDArray[np.bool_]) -> Iterator[str]:
         caused = other.follows.min() > 0.7 or np.min(np.sum(weights * other.B.T, axis=1)) > 1 / 3
         ratio = np.diag(other.covariance) / np.diag(fit.covariance)
         if (s == -1 or caused) and ratio.min() < 0.5 and ratio.max() < 1.5:
-            yield (
-                f"The next states follow the inputs of {ROW_NAMES[s]} (they leave "
-                f"{100 * ratio.min():.3g} % of what the inputs of the same row leave). Move the "
-                "inputs by a row; if the plant acts so late, give the model its dead time."
-            )
+            yield f"The next states follow {_moved(s, ratio.min())}"
             return
     yield from _against_gains(log, fit, weights, proven)
     driven = fit.follows.min() > 0.7 and not np.any(proven)  # in closed loop noise moves the zero
     if driven and not (log.problem.layout.has_constants or log.units_confirmed):
         yield from _resting(log, fit)
+
+
+def _by_innovations(log: Logged) -> str:
+    """Return in which other row an estimator, which knows the plant by its model, needs the inputs.
+
+    Its innovations are those of the log, less what a linear filter makes of the moved inputs.
+    """
+    estimator = log.row.estimator
+    state = log.problem.layout.state
+    if estimator is None or np.any(estimator.every > 1):
+        return ""
+    seen = estimator.gain[: log.problem.model.n_states]
+    if np.linalg.matrix_rank(seen) < len(estimator.C):
+        return ""
+    back = np.linalg.pinv(seen)
+    left = []
+    for s in (0, -1, 1):
+        found = []
+        for each in log.episodes:
+            theta = log.row.shown(each.thetas)
+            errors = theta[1:] - log.problem.deviations.predict(theta[:-1], each.actions)
+            z = np.zeros(len(estimator.A))
+            for k in range(1, len(each) - 1):
+                z = estimator.A @ z + estimator.B @ (each.actions[k + s] - each.actions[k])
+                found.append(back @ errors[k, state] - estimator.C_aug @ z)
+                z -= estimator.gain @ estimator.C_aug @ z
+        left.append(np.var(found, axis=0))
+    for s, ratio in zip((-1, 1), left[1:] / np.maximum(left[0], 1e-300), strict=True):
+        if ratio.min() < 0.5 and ratio.max() < 1.5:
+            return f"The outputs follow {_moved(s, ratio.min())}"
+    return ""
+
+
+def _moved(s: int, ratio: float) -> str:
+    return (
+        f"the inputs of {ROW_NAMES[s]} (they leave {100 * ratio:.3g} % of what the inputs of the "
+        "same row leave). Move the inputs by a row; if the plant acts so late, give the model its "
+        "dead time."
+    )
 
 
 def _against_gains(

@@ -326,7 +326,12 @@ def test_a_log_of_outputs_is_a_log_of_the_estimates(log: Any) -> None:
     shown = told.dynamics.row.shown
     for one, other in zip(told.episodes, known.episodes, strict=True):
         np.testing.assert_allclose(shown(one.thetas), shown(other.thetas), atol=2e-6)
-    assert told.trusted == known.trusted
+    assert told.trusted == known.trusted and "outputs follow" not in told.report()
+    for row, early, late in (("before", 1, 0), ("after", 0, 1)):
+        parts = [slice(late, len(each) - early) for each in r]
+        pairs = [(y[a], u[early : len(u) - late]) for (y, u), a in zip(outputs, parts, strict=True)]
+        moved = PlantTwin.fit(MPC, pairs, references=[each[1:] for each in r], **options)
+        assert f"The outputs follow the inputs of the row {row}" in moved.report()
     outputs[0][0][7] = np.nan
     lacking = PlantTwin.fit(MPC, outputs, references=r, **options)
     assert np.isfinite(lacking.episodes[0].thetas).all()
