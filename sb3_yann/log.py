@@ -238,6 +238,7 @@ class Log:
     ) -> Log:
         """Return the log of records, cut at gaps and where a step takes another time."""
         dt = check_positive("dt", dt)
+        _warn_of_other_units(records, [names.get(f"{of}_names", ()) for of in ("state", "input")])
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
@@ -463,6 +464,43 @@ def _warn_of_marks(path: object, names: Sequence[str], table: Array) -> None:
                 f"{path}: {name} is {column[marks][far][0]:g} in {np.count_nonzero(far)} rows, far "
                 "from all others. If that stands for no reading, leave these cells empty."
             )
+
+
+UNITS = (
+    *((factor, 0.0) for factor in (1000.0, 100.0, 60.0, 10.0, 0.1, 1 / 60, 0.01, 0.001)),
+    *((1.0, shift) for shift in (-273.15, 273.15)),
+    *((1.8, 32.0), (1 / 1.8, -32 / 1.8)),
+)
+"""Units that are mistaken for each other: factors, and what is added."""
+JUMP = 5.0  # times any other step of a column that a change of its unit is, at least
+LEAST_READ = 10  # readings on either side of it
+
+
+def _warn_of_other_units(records: Sequence[Episode], names: Sequence[Sequence[str]]) -> None:
+    """Warn where a column goes on in another unit: where it jumps so far, and its steps grow so."""
+    n = records[0].states.shape[1]
+    x, u = (np.concatenate([getattr(e, part) for e in records]) for part in ("states", "inputs"))
+    labels = [*(names[0] or [f"x[{i}]" for i in range(n)])]
+    labels += names[1] or [f"u[{i}]" for i in range(u.shape[1])]
+    for i, (name, column) in enumerate(zip(labels, [*x.T, *u.T], strict=True)):
+        rows = np.flatnonzero(np.isfinite(column))
+        z = column[rows]
+        steps = np.diff(z)
+        k = int(np.argmax(np.abs(steps))) if len(steps) else 0
+        if not LEAST_READ <= k < len(steps) - LEAST_READ:
+            continue
+        before, after = (np.sqrt(np.mean(each**2)) for each in (steps[:k], steps[k + 1 :]))
+        alone = abs(steps[k]) > JUMP * np.max(np.abs(np.delete(steps, k)))
+        for factor, shift in UNITS if alone and before * after > 0 else ():
+            near = abs(z[k + 1] - factor * z[k] - shift) < 4 * max(factor * before, after)
+            # An input may well be stepped by as much as zeros of units differ.
+            if near and 0.5 < factor * before / after < 2 and (i < n or not shift):
+                reads = f"{factor:.3g} times " * (factor != 1) + "what it did"
+                reads += f" {shift:+g}" * bool(shift)
+                warn(
+                    f"From row {rows[k + 1]} of the log on, {name} reads {reads}: has its unit "
+                    "changed? Bring the whole column to one unit."
+                )
 
 
 def _number(path: object, row: int, content: dict[str, str], name: str) -> float:

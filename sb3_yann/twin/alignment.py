@@ -422,9 +422,10 @@ def _against_plant(log: Logged, proven: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _by_innovations(log: Logged) -> str:
-    """Return in which other row an estimator, which knows the plant by its model, needs the inputs.
+    """Return in which other row, or with which other sign, an estimator needs the inputs.
 
-    Its innovations are those of the log, less what a linear filter makes of the moved inputs.
+    It knows the plant by its model. Its innovations are those of the log, less what a linear filter
+    makes of the inputs' change.
     """
     estimator = log.row.estimator
     state = log.problem.layout.state
@@ -433,23 +434,51 @@ def _by_innovations(log: Logged) -> str:
     seen = estimator.gain[: log.problem.model.n_states]
     if np.linalg.matrix_rank(seen) < len(estimator.C):
         return ""
-    back = np.linalg.pinv(seen)
-    left = []
-    for s in (0, -1, 1):
+    errors = []
+    for each in log.episodes:
+        theta = log.row.shown(each.thetas)
+        left = theta[1:] - log.problem.deviations.predict(theta[:-1], each.actions)
+        errors.append(left[1:-1, state] @ np.linalg.pinv(seen).T)
+    e = np.concatenate(errors)
+
+    def shown(changes: list[Array]) -> Array:
+        """Return what inputs (T - 2, m) more in each episode add to the innovations (N, q)."""
         found = []
-        for each in log.episodes:
-            theta = log.row.shown(each.thetas)
-            errors = theta[1:] - log.problem.deviations.predict(theta[:-1], each.actions)
+        for change in changes:
             z = np.zeros(len(estimator.A))
-            for k in range(1, len(each) - 1):
-                z = estimator.A @ z + estimator.B @ (each.actions[k + s] - each.actions[k])
-                found.append(back @ errors[k, state] - estimator.C_aug @ z)
-                z -= estimator.gain @ estimator.C_aug @ z
-        left.append(np.var(found, axis=0))
-    for s, ratio in zip((-1, 1), left[1:] / np.maximum(left[0], 1e-300), strict=True):
+            for u in change:
+                z = estimator.A @ z + estimator.B @ u
+                found.append(estimator.C_aug @ z)
+                z -= estimator.gain @ found[-1]
+        return np.array(found)
+
+    inputs = [each.actions for each in log.episodes]
+    for s in (-1, 1):
+        moved = shown([u[1 + s : len(u) - 1 + s] - u[1:-1] for u in inputs])
+        ratio = np.var(e - moved, axis=0) / np.maximum(np.var(e, axis=0), 1e-300)
         if ratio.min() < 0.5 and ratio.max() < 1.5:
             return f"The outputs follow {_moved(s, ratio.min())}"
+    constant = [np.ones_like(u) for u in inputs]  # of inputs that count from elsewhere
+    one = np.eye(inputs[0].shape[1])
+    columns = [shown([u[1:-1] * on for u in of]) for of in (inputs, constant) for on in one]
+    scale = np.maximum(e.std(axis=0), 1e-300)
+    F = (np.array(columns) / scale).reshape(len(columns), -1).T
+    y = (e / scale).ravel()
+    found = np.linalg.lstsq(F, y, rcond=1e-9)[0]
+    left = np.var(y - F @ found)
+    wide = STANDARD_ERRORS * np.sqrt(left * np.abs(np.diag(np.linalg.pinv(F.T @ F))))
+    for j, name in enumerate(log.names[1]):
+        gain = 1 + found[j]
+        if gain < -0.1 - wide[j] and left < MUCH_BETTER * np.var(y):
+            return _against_sign(name, f"{gain:.3g} ± {wide[j]:.2g} times")
     return ""
+
+
+def _against_sign(name: str, measured: str) -> str:
+    return (
+        f"The logged {name} moves the plant against the sign of the model's B ({measured} its "
+        "effect). Compare its sign (is a valve logged as closed, not open?), its column and rows."
+    )
 
 
 def _moved(s: int, ratio: float) -> str:
@@ -495,10 +524,7 @@ def _against_gains(
         far = not LEAST_GAIN < gain < 1 / LEAST_GAIN and abs(gain - 1) > error
         far = far and bool(left < MUCH_BETTER * before)
         if gain + error < 0 and gain < -0.1:
-            yield (
-                f"The logged {names[j]} moves the plant against the sign of the model's B "
-                f"({measured} its effect). Compare its sign and rows."
-            )
+            yield _against_sign(names[j], measured)
         elif far and not log.units_confirmed:
             yield (
                 f"The logged {names[j]} moves the plant {measured} as much as the model says: "

@@ -332,6 +332,8 @@ def test_a_log_of_outputs_is_a_log_of_the_estimates(log: Any) -> None:
         pairs = [(y[a], u[early : len(u) - late]) for (y, u), a in zip(outputs, parts, strict=True)]
         moved = PlantTwin.fit(MPC, pairs, references=[each[1:] for each in r], **options)
         assert f"The outputs follow the inputs of the row {row}" in moved.report()
+    closed = PlantTwin.fit(MPC, [(y, -u) for y, u in outputs], references=r, **options)
+    assert "u[0] moves the plant against the sign" in closed.report()
     outputs[0][0][7] = np.nan
     lacking = PlantTwin.fit(MPC, outputs, references=r, **options)
     assert np.isfinite(lacking.episodes[0].thetas).all()

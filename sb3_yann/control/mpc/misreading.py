@@ -10,6 +10,7 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.log import UNITS
 
 WRONG = 0.5
 """Share of the states' movement in a step that the model leaves open, at least, as they are shown.
@@ -19,12 +20,6 @@ RIGHT = 0.05
 and no wrong model does that."""
 STEPS_PER_STATE = 10  # steps for each state that must be seen
 MOST_REORDERED = 5  # states of which all orders are tried; of more, two are exchanged
-UNITS = (
-    *((factor, 0.0) for factor in (1000.0, 100.0, 60.0, 10.0, 0.1, 1 / 60, 0.01, 0.001)),
-    *((1.0, shift) for shift in (-273.15, 273.15)),
-    *((1.8, 32.0), (1 / 1.8, -32 / 1.8)),
-)
-"""Units that are mistaken for each other: factors, and what is added."""
 Reading = tuple[Array, Array]
 """A matrix M (n, n) and an offset v (n,): what is shown as x, in plant units, may mean M x + v."""
 
