@@ -110,6 +110,8 @@ def test_references_one_after_another_are_a_schedule_whose_last_one_stays() -> N
     env = SetPoint(Counter(), [0], [9], schedule=[3, 1, 4], preview=2)
     assert env.reset()[0][2:].tolist() == [3, 1, 4]
     assert env.step(np.zeros(1))[0][2:].tolist() == [1, 4, 4]
+    with pytest.raises(ValueError, match=r"would be ignored. .* schedule=\[r\]"):
+        env.reset(options={"set_point": [3]})
     ends = SetPoint(Counter(), [0], [9], schedule=[3, 1, 4].__getitem__, preview=2)
     ends.reset()
     with pytest.raises(ValueError, match=r"schedule\(3\) ends in .* pass the sequence itself"):
