@@ -19,7 +19,17 @@ from sb3_yann.improvement import Headroom
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.reporting import evidence_parts as evidence
 from sb3_yann.reporting import problem_parts as problem
-from sb3_yann.reporting.subject import Html, Part, Subject, clean, page, paragraph, table, tag
+from sb3_yann.reporting.subject import (
+    Finding,
+    Html,
+    Part,
+    Subject,
+    clean,
+    page,
+    paragraph,
+    table,
+    tag,
+)
 from sb3_yann.rollout import as_seeds
 from sb3_yann.twin import PlantTwin
 
@@ -138,10 +148,9 @@ def _subject(
 def _body(title: str, parts: Sequence[Part]) -> list[Html]:
     """Return heading, summary, contents, the parts themselves, and a table for signatures."""
     written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    rows = []
+    findings = list[tuple[Finding, Html | str]]()
     links = []
     sections = list[Html]()
-    counts = Counter[str]()
     for part in parts:
         k = len(sections) + 1
         place: Html | str = ""
@@ -150,10 +159,13 @@ def _body(title: str, parts: Sequence[Part]) -> list[Html]:
             links.append(tag("li", tag("a", part.title, href=f"#part-{k}")))
             heading = tag("h2", f"{k}. {part.title}", id=f"part-{k}")
             sections.append(tag("section", heading, part.content))
-        for found in part.findings:
-            verdict = tag("span", found.verdict, class_=found.verdict)
-            rows.append([verdict, found.text, place])
-            counts[found.verdict] += 1
+        findings += [(found, place) for found in part.findings]
+    counts = Counter(found.verdict for found, _ in findings)
+    findings.sort(key=lambda each: each[0].verdict not in ("failed", "look"))  # these come first
+    rows = [
+        [tag("span", found.verdict, class_=found.verdict), found.text, place]
+        for found, place in findings
+    ]
     summary = f"{counts['passed']} checks passed, {counts['failed']} failed."
     if counts["look"]:
         summary += f" {counts['look']} to look at: a person decides."

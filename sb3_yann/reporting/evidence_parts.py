@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -16,6 +16,7 @@ from sb3_yann._archive import digest_of
 from sb3_yann._validation import Array
 from sb3_yann.compare import (
     COST_ROUNDING,
+    EXCESS_ROOM,
     INPUT_STEP,
     RULE,
     Difference,
@@ -26,6 +27,7 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
+from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.control.mpc.misreading import misread_states
 from sb3_yann.evaluation import change_in_percent, plots
 from sb3_yann.guard import Decision
@@ -132,9 +134,25 @@ def loops_part(subject: Subject) -> Part:
         "Episodes in which the policy violates more than the MPC, ends sooner, or has no finite "
         f"cost: {bad} of {count}.",
     )
+    findings = [finding, *_exceeded(subject.problem, loops)]
     if words := misread_states(subject.problem, *mpc.steps()):
-        return Part(title, content, (finding, make_finding(False, words)))
-    return Part(title, content, (finding,))
+        findings.append(make_finding(False, words))
+    return Part(title, content, tuple(findings))
+
+
+def _exceeded(problem: LinearMPC, loops: Mapping[str, Trajectories]) -> Iterator[Finding]:
+    """Yield by how much a limit is exceeded, whoever acts: the MPC is no measure of that."""
+    said = []
+    for who, played in loops.items():
+        assert played.excess is not None
+        largest = played.excess.largest
+        k = int(np.argmax(largest))
+        bad = int(np.sum((played.violations > 0) | (largest > EXCESS_ROOM)))
+        words = BoundNames.of(problem).in_words(float(played.excess.worst[k]), float(largest[k]))
+        if bad:
+            said.append(f"{who}, in {bad} of {len(largest)}{f': {words}' * bool(words)}")
+    if said:
+        yield Finding("look", f"Episodes exceed a limit with the {'; with the '.join(said)}.")
 
 
 def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float, float]:

@@ -254,8 +254,8 @@ class SetPoint(Appending):
         """Start an episode, with another reference: a seed draws the same one again."""
         if asked := {"set_point", "reference", "schedule"} & {*(kwargs.get("options") or ())}:
             raise ValueError(
-                f"options = {kwargs['options']!r} of reset: {asked} would be ignored. A reference r "
-                "is held by SetPoint(env, low, high, schedule=[r])."
+                f"options = {kwargs['options']!r} of reset: {asked} would be ignored. A reference "
+                "r is held by SetPoint(env, low, high, schedule=[r])."
             )
         observation, info = self.env.reset(**kwargs)
         seed = kwargs.get("seed")

@@ -164,6 +164,20 @@ def test_every_decision_is_there_with_its_reason() -> None:
     assert [each.verdict for each in part.findings] == ["passed"]
 
 
+def test_a_limit_that_both_exceed_is_said_first() -> None:
+    subject = subject_of(guard_samples.build(), env=Slide)
+    assert len(evidence_parts.loops_part(subject).findings) == 1
+    for each in subject.loops.values():
+        each.violations[:] = 1
+        each.excess.largest[2] = 0.25
+        each.excess.worst[2] = 0
+    part = evidence_parts.loops_part(subject)
+    said = "exceed a limit with the MPC, in 8 of 8: u[0] exceeds its bound by 0.25; with the policy"
+    assert said in part.findings[1].text and part.findings[1].verdict == "look"
+    page = str(reporting._body("title", [part]))
+    assert page.index(said) < page.index("Episodes in which the policy violates more")
+
+
 def test_a_sensor_that_fails_is_the_operating_point_to_the_mpc_too() -> None:
     actions = subject_of(guard_samples.build()).act_as_mpc(np.array([[np.nan]]))
     np.testing.assert_allclose(actions, [guard_samples.LAW([0.0])], atol=1e-6)
