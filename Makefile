@@ -19,7 +19,7 @@ help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(STAMP)  ## run two examples, examples/cstr.py and examples/from_a_log.py
-	@$(PY) examples/cstr.py
+	@$(PY) examples/cstr.py --episodes 20
 	@$(PY) examples/from_a_log.py
 
 paper: $(STAMP)  ## run the paper's experiments, hours (make paper ARGS="--quick" for minutes)
@@ -77,5 +77,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV), a few minutes the first time (torch is large) ..."
 	@$(PIP) install -c constraints.txt hatchling
 	@$(PIP) install -c constraints.txt --no-build-isolation -e '.[dev]'
+	@echo "compiling the inner loops, half a minute ..."
+	@$(PY) -c 'from sb3_yann.networks._kernels import afterstate_value, yann_layer' & \
+		$(PY) -c 'from sb3_yann.control._kernels import online, polyhedra, sweep' & wait
 	@touch $@
 	@echo "installed into $(VENV)"

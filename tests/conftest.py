@@ -35,6 +35,10 @@ def same_initial_weights() -> Iterator[None]:
         yield
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    config.option.loadscopereorder = False  # pytest-xdist would begin with files of many tests
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files with slow tests first: begun last, one would hold up the end alone."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}

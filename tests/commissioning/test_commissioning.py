@@ -425,8 +425,8 @@ def test_a_plant_that_its_model_describes_keeps_the_mpc(tmp_path) -> None:
             self.x = problem().model.A @ now + problem().model.B @ np.asarray(action, float)
             return self.x.astype(np.float32), *found[1:]
 
-    found = commission(tmp_path / "record", Described()).run(3)
-    assert [each.acted for each in found] == ["MPC"] * 3
+    found = commission(tmp_path / "record", Described()).run(2)
+    assert [each.acted for each in found] == ["MPC"] * 2
 
 
 def test_a_reward_of_its_own_decides_what_is_kept() -> None:

@@ -57,9 +57,8 @@ def test_a_shrunk_correction_is_a_share_of_what_the_networks_add() -> None:
 def learnt(algorithm: Any = DDPG, **options: Any) -> Any:
     """A model whose network has moved, without learning."""
     options = {"networks": "shared", "pin_equilibrium": False, **options}
-    model = algorithm(
-        "YannPolicy", "CSTR-v0", policy_kwargs=options, device="cpu", gamma=0.98, batch_size=32
-    )
+    given = {"gamma": 0.98, "batch_size": 32} | ({"n_steps": 64} if algorithm is PPO else {})
+    model = algorithm("YannPolicy", "CSTR-v0", policy_kwargs=options, device="cpu", **given)
     model.learning_starts = 0  # PPO has none, and does not ask
     shake(network_of(model), 0.1)
     return model

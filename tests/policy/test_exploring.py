@@ -109,7 +109,7 @@ def test_critics_start_as_the_value_of_the_law() -> None:
 
 @EXPLORING
 def test_it_learns_and_a_saved_model_goes_on(algorithm, tmp_path) -> None:
-    model = build(algorithm, actor_lr_mult=1.0, critic_warmup=0).learn(96)
+    model = build(algorithm, actor_lr_mult=1.0, critic_warmup=0).learn(32)
     assert not model.policy.actor.mu.network.is_zero()
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", env=model.get_env(), device="cpu")
@@ -119,7 +119,7 @@ def test_it_learns_and_a_saved_model_goes_on(algorithm, tmp_path) -> None:
         one = model.predict(obs, deterministic=deterministic)[0]
         th.manual_seed(1)
         assert np.array_equal(one, loaded.predict(obs, deterministic=deterministic)[0])
-    loaded.learn(64, reset_num_timesteps=False)
+    loaded.learn(32, reset_num_timesteps=False)
     model.policy.save(tmp_path / "policy")
     alone = type(model.policy).load(tmp_path / "policy")
     assert np.array_equal(

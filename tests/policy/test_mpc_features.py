@@ -106,11 +106,12 @@ SERVOS: dict[str, dict[str, Any]] = {
     "moves that cost": {"rate": RateLimits(-0.3, 0.3, [[1.0]])},
     "a bound that changes": {"parametric_bounds": ["x_max[0]"], "infeasible": "zero_input"},
 }
+SOLVED = [(name, "explicit") for name in SERVOS]
+ONLINE = [pytest.param(name, "online", marks=pytest.mark.nightly) for name in [*SERVOS][1:]]
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", ["explicit", "online"])
-@pytest.mark.parametrize("name", SERVOS)
+@pytest.mark.parametrize(("name", "kind"), [*SOLVED, ("tracking", "online"), *ONLINE])
 @pytest.mark.filterwarnings("ignore:The observation is not finite")
 def test_what_is_asked_for_beyond_its_range_counts_as_at_its_end_in_every_form(
     name: str, kind: str, tmp_path: Any
