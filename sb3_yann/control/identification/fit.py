@@ -20,13 +20,21 @@ from sb3_yann.control.identification.dead_time import (
 )
 from sb3_yann.control.identification.least_squares import (
     EXTRAPOLATED,
+    NOT_EXCITED,
     Regression,
     gains_of,
     operating_point,
     regress,
     regularized,
 )
-from sb3_yann.control.identification.residuals import LONG_PREDICTION, listed, quality_notes
+from sb3_yann.control.identification.residuals import (
+    LONG_PREDICTION,
+    TIED,
+    listed,
+    project_out,
+    quality_notes,
+    within_rounding,
+)
 from sb3_yann.control.linear_system import LinearSystem, names
 from sb3_yann.log import Episode, Log, split_episodes
 
@@ -78,6 +86,8 @@ def fit_log(
     weight = 0.0 if automatic else check_range("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
     found = regress(fitted, sizes, origin, weight)
+    if not weight:
+        _require_excited(found, fitted, n, m)
     shrunk = list[str]()
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
@@ -114,6 +124,24 @@ def require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> None
     found = frozen_rows(states, [each.driven for each in episodes])
     if found:
         raise ValueError(" ".join(words_for(found, names(sizes), states)))
+
+
+def _require_excited(found: Regression, episodes: list[Episode], n: int, m: int) -> None:
+    """Raise where an input is a law of the states, and what its rounding adds tells nothing."""
+    x, u, d = np.split(np.concatenate([each.regressors for each in episodes]), [n, n + m], axis=1)
+    known = np.column_stack([np.ones(len(x)), x, d])
+    share = np.mean(project_out(known, u) ** 2, axis=0) / np.maximum(np.var(u, axis=0), 1e-300)
+    own = slice(n, n + m)
+    unsure = np.abs(found.coefficients) < UNSURE * found.standard_errors
+    tied = within_rounding(known, u) & (share < TIED) & np.all(unsure[:, own], axis=0)
+    if tied.any():
+        raise ValueError(
+            f"u[{np.argmax(tied)}] is a function of the states, to within their rounding, and what "
+            f"rounding adds does not tell its effect: a feedback law alone sets it. {NOT_EXCITED}"
+        )
+
+
+UNSURE = 3.0  # standard errors within which an effect may be none
 
 
 def system_of(

@@ -27,7 +27,12 @@ from sb3_yann.control.identification.innovations import (
     with_lags,
 )
 from sb3_yann.control.identification.least_squares import NOT_EXCITED
-from sb3_yann.control.identification.residuals import curvature_test, project_out
+from sb3_yann.control.identification.residuals import (
+    TIED,
+    curvature_test,
+    project_out,
+    within_rounding,
+)
 from sb3_yann.log import Episode, split_episodes
 
 RUN_AHEAD = 20
@@ -41,7 +46,6 @@ SURE_DELAY = 10.0
 NO_MOVE = 1e-12
 SETTLING = 30  # samples in which a filter finds the first state
 FOLLOWS = 0.1  # share of an input that its feedback law leaves, below which the notes say so
-TIED = 0.25  # the same, above which coarse steps of an input may be its test signal
 WORSE = 1.1
 """Mean square of free runs, relative to those without dead time, from which it is not taken."""
 
@@ -131,23 +135,13 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
     rest = project_out(known, now)
     left = np.mean(rest**2, axis=0) / np.maximum(alone, NO_MOVE)
     moves = alone > NO_MOVE * np.var(now, axis=0)
-    # Of a law, rounded readings leave what their rounding adds up to; a test signal is larger.
-    law = np.linalg.lstsq(known, now, rcond=None)[0]
-    grain = np.sqrt((_resolution(now) ** 2 + _resolution(known) ** 2 @ law**2) / 12)
-    small = np.all(np.abs(rest) < 6 * grain, axis=0) & (np.std(rest, axis=0) < 1.5 * grain)
-    tied = moves & ((left < NO_MOVE) | (small & (left < TIED)))
+    tied = moves & ((left < NO_MOVE) | (within_rounding(known, now) & (left < TIED)))
     if tied.any():
         raise ValueError(
             f"u[{np.argmax(tied)}] is a function of earlier outputs and inputs, to within their "
             f"rounding: a feedback law alone sets it. {NOT_EXCITED}"
         )
     return [(j, float(left[j])) for j in range(m) if moves[j] and left[j] < FOLLOWS]
-
-
-def _resolution(columns: Array) -> Array:
-    """Return the least difference of two values of each column, 0 where there are no two."""
-    steps = [np.diff(np.unique(each)) for each in columns.T]
-    return np.array([np.min(each) if len(each) else 0.0 for each in steps])
 
 
 class Search:

@@ -76,6 +76,24 @@ def curvature_test(found: Regression, episodes: list[Episode]) -> tuple[Array, A
     return np.asarray(np.where(sure & (share > CURVATURE_SHARE), share, 0.0)), after
 
 
+TIED = 0.25  # share of an input that a law leaves, above which coarse steps may be a test signal
+
+
+def within_rounding(known: Array, now: Array) -> NDArray[np.bool_]:
+    """Return which columns (N, m) are linear in those (N, k), to within the rounding of all.
+
+    Of a law, rounded readings leave what their rounding adds up to; a test signal is larger.
+    """
+    law = np.linalg.lstsq(known, now, rcond=None)[0]
+    rest = now - known @ law
+    steps = (np.diff(np.unique(each)) for each in np.hstack([now, known]).T)
+    least = np.array([min(each, default=0.0) for each in steps])
+    fine, coarse = np.split(least, [now.shape[1]])
+    grain: Array = np.sqrt((fine**2 + coarse**2 @ law**2) / 12)
+    small = np.all(np.abs(rest) < 6 * grain, axis=0) & (np.std(rest, axis=0) < 1.5 * grain)
+    return np.asarray(small)
+
+
 def project_out(basis: Array, values: Array) -> Array:
     """Return what a least-squares fit by the basis leaves of the values."""
     scale = np.linalg.norm(basis, axis=0)

@@ -1,5 +1,7 @@
 """A weakly excited log is regularized by free runs, or refused; poles come with their errors."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
@@ -172,3 +174,16 @@ def test_a_plant_at_rest_a_state_at_rest_and_a_clipped_one_are_not_frozen() -> N
     assert frozen_rows([still], [u]) == []
     clipped = np.maximum(log(hold=25)[0], -0.2)
     assert frozen_rows([clipped], [log(hold=25)[1]]) == []
+
+
+def test_a_rounded_law_of_the_states_is_refused_and_a_test_signal_is_not() -> None:
+    rng = np.random.default_rng(0)
+    for push in (0.0, 0.3):
+        x = np.ones((801, 1))
+        u = np.zeros((800, 1))
+        for k in range(800):
+            u[k] = np.round(-0.5 * x[k] + push * rng.choice([-1, 1]), 2)
+            x[k + 1] = 0.97 * x[k] + 0.1 * u[k] + 0.05 * rng.normal()
+        told = nullcontext() if push else pytest.raises(ValueError, match="within their rounding")
+        with told:
+            identify(x, u, dt=1)
