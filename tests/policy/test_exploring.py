@@ -133,7 +133,7 @@ def test_a_guard_keeps_what_is_no_worse_and_the_export_is_the_deterministic_poli
 ) -> None:
     model = build(algorithm, short(), problem=scalar_mpc(), actor_lr_mult=1.0, critic_warmup=0)
     callbacks = [
-        ImprovementGuard(short, n_eval_episodes=20, n_new_starts=5),
+        ImprovementGuard(short, n_eval_episodes=10, n_new_starts=5),
         ControlDiagnostics(),
         CostAudit(steps=20),
     ]
@@ -180,9 +180,9 @@ def test_from_the_first_step_on_actions_are_near_the_mpc_s(algorithm) -> None:
 @EXPLORING
 def test_exploring_without_a_guard_on_what_may_be_a_plant_warns_once(algorithm) -> None:
     with pytest.warns(UserWarning, match="That belongs into a simulator") as said:
-        build(algorithm, simulator=False).learn(64)
+        build(algorithm, simulator=False).learn(20)
     assert sum("That belongs" in str(each.message) for each in said) == 1
-    build(algorithm).learn(32)  # a warning would be an error
+    build(algorithm).learn(20)  # a warning would be an error
 
 
 def test_a_guard_of_before_does_not_silence_that_nobody_confirms_now() -> None:

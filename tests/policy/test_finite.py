@@ -89,15 +89,15 @@ def stored(model) -> np.ndarray:
     [("reward", np.nan, DDPG), ("observation", np.inf, DDPG), ("observation", np.nan, TD3)],
 )
 def test_one_value_that_is_not_finite_is_named_and_spoils_nothing(what, value, algorithm) -> None:
-    env = Recorder(pendulum([100], what, value))
+    env = Recorder(pendulum([30], what, value))
     model = build(env, algorithm)
-    said = told(lambda: model.learn(350, callback=NoActionNoise()), NonFiniteWarning)
-    assert said[-1 if what == "reward" else 0].startswith(f"Step 100: {what}[")
+    said = told(lambda: model.learn(120, callback=NoActionNoise()), NonFiniteWarning)
+    assert said[-1 if what == "reward" else 0].startswith(f"Step 30: {what}[")
     assert np.all(np.isfinite(env.recorded()[1]))
     assert is_finite(model)
     assert np.all(np.isfinite(stored(model)))
-    assert len(stored(model)) == (349 if what == "reward" else 348)
-    assert int(model.policy.critic_updates) == 350
+    assert len(stored(model)) == (119 if what == "reward" else 118)
+    assert int(model.policy.critic_updates) == 120
 
 
 @pytest.mark.parametrize("what", ["reward", "observation"])
@@ -156,12 +156,12 @@ def test_a_saved_copied_or_loaded_buffer_leaves_out_what_is_not_finite(tmp_path)
 def test_a_reward_too_large_for_float32_is_no_step_of_training(algorithm) -> None:
     model = build(pendulum([50], value=1e30), algorithm)
     with pytest.warns(NonFiniteWarning, match=r"gradient of the critic .* this step is not taken"):
-        model.learn(350, callback=NoActionNoise())
+        model.learn(150, callback=NoActionNoise())
     assert is_finite(model)
     moments = model.critic.optimizer.state_dict()["state"].values()
     assert all(bool(each.isfinite().all()) for state in moments for each in state.values())
     assert model.policy.refused["critic"] > 0
-    assert int(model.policy.critic_updates) == 350 - model.policy.refused["critic"]
+    assert int(model.policy.critic_updates) == 150 - model.policy.refused["critic"]
 
 
 def test_a_reward_that_is_not_finite_is_named_where_steps_of_ppo_are_refused() -> None:
