@@ -298,7 +298,6 @@ def test_set_points_are_followed_for_less_whatever_plans_gain(monkeypatch) -> No
     assert found.accepted and found.change < -0.02
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sb3_yann.CostMismatchWarning")
 def test_an_observer_is_a_part_of_the_model(monkeypatch) -> None:
     monkeypatch.setattr(module, "TRIES", 1)

@@ -46,7 +46,6 @@ def assert_every_action_is_the_law_s(model) -> None:
 
 
 # One start method after the other: each starts two processes that import PyTorch.
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 on, if threads run
 @pytest.mark.parametrize("start_method", ["fork", "spawn"])
 def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
@@ -71,7 +70,6 @@ def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
         env.close()
 
 
-@pytest.mark.slow
 def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> None:
     env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=SubprocVecEnv)
     try:

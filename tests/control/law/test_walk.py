@@ -130,7 +130,6 @@ def test_regions_that_overlap_go_by_the_largest_slack() -> None:
     assert np.array_equal(law.locate(points), nearest)
 
 
-@pytest.mark.slow
 def test_without_a_compiler_the_law_is_the_same(tmp_path: Path) -> None:
     cart().save(tmp_path / "law.npz")
     program = (
@@ -151,7 +150,6 @@ def test_without_a_compiler_the_law_is_the_same(tmp_path: Path) -> None:
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-@pytest.mark.slow
 @examples(8)
 @given(problems(), SEEDS)
 def test_regions_cover_what_is_feasible_and_nothing_else(mpc: LinearMPC, seed: int) -> None:
@@ -184,7 +182,6 @@ def test_no_two_regions_overlap(mpc: LinearMPC, seed: int) -> None:
         assert np.sum(holders > 1e-9, axis=1).max() <= 1
 
 
-@pytest.mark.slow
 @examples(8)
 @given(problems(), SEEDS, st.sampled_from([1e-9, 1e-6, 1e-3]))
 def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: float) -> None:
