@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.gains import (
-    NORMAL,
-    SURE_ERRORS,
-    WIDE,
-    Gains,
-    count_integrators,
-    responses,
-)
+from sb3_yann.control.gains import NORMAL, SURE_ERRORS, WIDE, Gains, count_integrators, responses
 from sb3_yann.control.linear_system import combination, names
 from sb3_yann.log import Episode, split_episodes
 from sb3_yann.units import FLOAT32_ROUNDING

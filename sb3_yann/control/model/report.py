@@ -7,14 +7,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.gains import (
-    NORMAL,
-    ON_CIRCLE,
-    SURE_ERRORS,
-    UNTOLD,
-    Gains,
-    count_integrators,
-)
+from sb3_yann.control.gains import NORMAL, ON_CIRCLE, SURE_ERRORS, UNTOLD, Gains, count_integrators
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
 MAY_INTEGRATE = f"may integrate: it is 1 within {SURE_ERRORS:g} standard errors"
