@@ -38,6 +38,8 @@ from sb3_yann.control.identification.residuals import (
 from sb3_yann.control.linear_system import LinearSystem, names
 from sb3_yann.log import Episode, Log, split_episodes
 
+UNSURE = 3.0  # standard errors within which an effect may be none
+
 
 @dataclass(frozen=True, eq=False)
 class LogFit:
@@ -139,9 +141,6 @@ def _require_excited(found: Regression, episodes: list[Episode], n: int, m: int)
             f"u[{np.argmax(tied)}] is a function of the states, to within their rounding, and what "
             f"rounding adds does not tell its effect: a feedback law alone sets it. {NOT_EXCITED}"
         )
-
-
-UNSURE = 3.0  # standard errors within which an effect may be none
 
 
 def system_of(
