@@ -44,9 +44,6 @@ def side_it_falls_to(starts: NDArray[np.float64], torque: float) -> NDArray[np.f
     return side
 
 
-# --- simulator ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_a_trajectory_is_gymnasiums_bit_for_bit(seed: int) -> None:
     # Actions in float64: Gymnasium multiplies a float32 torque in float32, which rounds.
@@ -72,9 +69,6 @@ def test_upright_is_a_fixed_point() -> None:
     assert reward == 0.0
 
 
-# --- the printed model -------------------------------------------------------------------------
-
-
 def test_the_linearized_dynamics_give_the_printed_model() -> None:
     plant = control.nlsys(
         lambda t, x, u, params: clipped_pendulum.dynamics(x, u), None, states=2, inputs=1, outputs=2
@@ -83,9 +77,6 @@ def test_the_linearized_dynamics_give_the_printed_model() -> None:
     model = model.sample(clipped_pendulum.DT, method="zoh")
     np.testing.assert_array_equal(np.round(model.A, 4), clipped_pendulum.PRINTED_A)
     np.testing.assert_array_equal(np.round(model.B, 4), clipped_pendulum.PRINTED_B)
-
-
-# --- spaces ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -98,9 +89,6 @@ def test_an_angle_that_rounds_to_pi_stays_in_the_space(theta: float) -> None:
     # And the observation itself is a valid start again.
     assert env.reset(options={"state": observation})[0] in env.observation_space
     assert -np.pi <= info["state"][0] <= np.pi
-
-
-# --- starts ------------------------------------------------------------------------------------
 
 
 def test_one_start_in_five_must_swing_round() -> None:

@@ -68,9 +68,6 @@ def better() -> bytes:
     return pickle.dumps((bits(model), found, model.policy.state_dict()))
 
 
-# ------------------------------------------------------------------------------- in a simulator
-
-
 @pytest.mark.parametrize("kind", [DDPG, TD3, SAC, TQC, pytest.param(PPO, marks=NIGHTLY)])
 def test_a_policy_gains_on_starts_that_it_has_not_seen(kind, tmp_path) -> None:
     th.manual_seed(3)
@@ -394,9 +391,6 @@ def test_what_is_no_simulator_or_no_model_is_refused() -> None:
             improve(model, Spring, **{name: 0})
 
 
-# ------------------------------------------------------------------------------------ in a twin
-
-
 ENOUGH = {"n_starts": 10, "rounds": 2, "updates": 300}
 
 
@@ -522,9 +516,6 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
     assert error() < 0.8 * before
     same = model.critic_target.state_dict()
     assert all(th.equal(each, same[name]) for name, each in model.critic.state_dict().items())
-
-
-# -------------------------------------------------------------------------------------- in words
 
 
 def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:

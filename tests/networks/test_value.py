@@ -41,9 +41,6 @@ def train(value: Any, rows: th.Tensor, target: th.Tensor, steps: int) -> float:
     return loss.item()
 
 
-# --- at first ----------------------------------------------------------------------------------
-
-
 @GAMMAS
 @EVERY_PROBLEM
 @BOTH
@@ -76,9 +73,6 @@ def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str, gamma: 
     )
 
 
-# --- the equilibrium ---------------------------------------------------------------------------
-
-
 @EVERY_PROBLEM
 @BOTH
 def test_value_at_rest_is_zero_and_stays_so(name: str, kind: Any) -> None:
@@ -94,9 +88,6 @@ def test_value_at_rest_is_zero_and_stays_so(name: str, kind: Any) -> None:
         assert abs(value(rest).item()) <= rounding
         train(value, rows, 0.7 * value(rows).detach() - 3, steps=steps)
     assert abs(value(rest).item()) <= rounding
-
-
-# --- training ----------------------------------------------------------------------------------
 
 
 def test_training_fits_a_cost_to_go_that_is_not_quadratic() -> None:
@@ -131,9 +122,6 @@ def test_twenty_steps_of_adam_do_not_flip_the_sign_of_the_reactors_smallest_entr
     assert change.abs().min() > 0
 
 
-# --- the model ---------------------------------------------------------------------------------
-
-
 class Halving(th.nn.Module):
     """A model with a parameter, in a module of its own."""
 
@@ -156,9 +144,6 @@ def test_model_that_is_given_says_where_the_value_is_taken() -> None:
     for model in (Halving(), lambda theta, u: theta / 2 + 0 * u):
         q = critic_of("pendulum", model=model)(rows).detach().numpy()[:, 0]
         np.testing.assert_allclose(q, -expected, rtol=1e-6)
-
-
-# --- what torch and Stable-Baselines3 see --------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -53,9 +53,6 @@ def test_points_of_a_facet_that_float32_holds_exactly_go_to_the_first_region() -
     assert law.locate(theta.numpy()).tolist() == [0, 1, 1, 1]
 
 
-# --- the bound on the correction ---------------------------------------------------------------
-
-
 @pytest.mark.parametrize("side", [-1, 1])
 def test_correction_at_its_bound_gets_the_gradient_that_leads_back_and_no_other(side: int) -> None:
     law = law_of("pendulum")
@@ -76,9 +73,6 @@ def test_law_without_input_bounds_is_refused() -> None:
     free = replace(solved("two inputs"), horizon=1, u_min=[-1, -np.inf], u_max=1)
     with pytest.raises(ValueError, match=r"u_min = \[-1\.0, -inf\].*Pass u_min and u_max"):
         YannLayer(free.explicit())
-
-
-# --- training ----------------------------------------------------------------------------------
 
 
 @EVERY_LAW

@@ -56,9 +56,6 @@ def is_positive_zero(x: th.Tensor) -> bool:
     return not bool(th.any(x != 0)) and not bool(th.any(th.signbit(x)))
 
 
-# --- zero at first -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", [th.float32, th.float64])
 @pytest.mark.parametrize("stack", [1, 3])
 @pytest.mark.parametrize("hidden", HIDDEN)
@@ -74,9 +71,6 @@ def test_output_is_zero_bit_for_bit_at_first(
         output = net(x, th.randint(stack, (200,)))
         assert output.shape == (200, 2)
         assert is_positive_zero(output)
-
-
-# --- training ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
@@ -100,9 +94,6 @@ def test_every_entry_has_moved_after_the_second_update(
     assert all(bool(entries.all()) for entries in moved)
 
 
-# --- the pinned output -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("hidden", [(16,), (16, 16)])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_pinned_output_at_zero_stays_exactly_zero(activation: str, hidden: tuple[int, ...]) -> None:
@@ -122,18 +113,12 @@ def test_pinned_output_at_zero_stays_exactly_zero(activation: str, hidden: tuple
         assert th.all(output[1::2] != 0)
 
 
-# --- bad input ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("activation", [th.sigmoid, F.softplus, th.cos, th.nn.Sigmoid()])
 def test_activation_that_is_not_zero_at_zero_is_refused(
     activation: Callable[[th.Tensor], th.Tensor],
 ) -> None:
     with pytest.raises(ValueError, match=r"activation\(0\) = (0\.5|0\.693147|1), but .*torch.tanh"):
         ZeroOutputNetwork(2, 1, activation=activation)
-
-
-# --- large stacks ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("hidden", HIDDEN)

@@ -259,9 +259,6 @@ def predicted(policy: YannPolicy, observations: np.ndarray) -> np.ndarray:
     return np.asarray(actions, np.float64)
 
 
-# --- what is no number --------------------------------------------------------------------------
-
-
 @examples(30)
 @given(random_problems(), st.data(), KINDS, ARCHITECTURES, st.sampled_from([None, np.nan]))
 def test_every_observation_of_float32_has_an_action_of_the_space(

@@ -97,9 +97,6 @@ def test_frames_stacked_by_sb3_start_as_the_law_and_train() -> None:
     model.learn(50, callback=[NoActionNoise(), ControlDiagnostics()])
 
 
-# --- the critic ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("critic", ["afterstate", "state_action"])
 @pytest.mark.parametrize("reward", [(1.0, 0.0), (0.01, 0.0), (3.0, -20.0), (250.0, 7.0)])
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(critic, reward) -> None:
@@ -162,9 +159,6 @@ def test_a_reward_that_means_nothing_is_named(kwargs, error, message) -> None:
         build(LinearPlant(MPC), None, policy_kwargs=kwargs)
 
 
-# --- saved and loaded -----------------------------------------------------------------------------
-
-
 def test_a_map_is_part_of_what_is_saved(tmp_path) -> None:
     show, observation, size = SHOWN["normalized"]
     kwargs = {"critic": CriticOptions(reward_scale=2.0, reward_offset=3.0)}
@@ -194,9 +188,6 @@ def test_maps_compose_like_functions() -> None:
         RANDOM @ outer
     with pytest.raises(TypeError):
         RANDOM @ 3
-
-
-# --- what is refused ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

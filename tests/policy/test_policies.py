@@ -71,9 +71,6 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, 
         assert th.equal(value, loaded.policy.state_dict()[name]), name
 
 
-# --- max_correction ----------------------------------------------------------------------------
-
-
 def distances(model, mpc: LinearMPC, states: np.ndarray) -> np.ndarray:
     """Distances from the MPC in float64 and from the policy that it starts as, (2, batch, m)."""
     actions, _ = model.predict(states)
@@ -127,9 +124,6 @@ def test_a_bound_is_that_of_one_model_alone(tmp_path) -> None:
     for i, (model, bound) in enumerate([(one, 0.2), (two, 0.1), (again, 0.4)]):
         model.save(tmp_path / str(i))
         assert DDPG.load(tmp_path / str(i)).policy.max_correction == bound
-
-
-# --- pin_equilibrium ---------------------------------------------------------------------------
 
 
 @POLICIES

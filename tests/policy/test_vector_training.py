@@ -82,9 +82,6 @@ def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> 
         env.close()
 
 
-# --- time limits ----------------------------------------------------------------------------------
-
-
 def stacked(n: int):
     return VecFrameStack(DummyVecEnv([lambda: plant(0.05)] * n), 3)
 
