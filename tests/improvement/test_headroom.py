@@ -411,7 +411,8 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
 
 
 @pytest.mark.nightly
-def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
+def test_a_swing_is_found_where_the_mpc_shows_none(monkeypatch) -> None:
+    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=500))
     mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=Terminal())
     two_rounds = {"n_starts": 2, "max_steps": 5700}
     found = headroom(mpc, "ClippedPendulum-v0", seed=2021, **two_rounds)
