@@ -161,6 +161,14 @@ def test_ten_starts_from_which_nothing_can_be_gained_refuse_nothing() -> None:
     assert found.accepted and len(pairs.starts.seeds) == 40
 
 
+def test_no_gain_is_accepted_by_chance_in_one_of_twenty_at_most() -> None:
+    def change(seeds, rng):  # 0 on average, no start loses more than 1 %
+        return 0.01 * (1 - rng.exponential(size=len(seeds)))
+
+    accepted = [looked(Fake(change, seed=seed))[0].accepted for seed in range(200)]
+    assert sum(accepted) <= 10
+
+
 def test_a_mean_gain_does_not_pay_for_the_worst_starts() -> None:
     found, pairs = looked(Fake(lambda seeds, rng: np.where(seeds % 10 == 3, 0.2, -0.5)))
     assert not found.accepted
@@ -179,20 +187,18 @@ def test_one_dear_start_that_gains_does_not_hide_that_all_others_lose() -> None:
     assert not found.accepted and "not sure" in found.reason
 
 
-def skewed(seeds: Any, rng: Any) -> Any:  # 0 on average, no start loses more than 1 %
-    return 0.01 * (1 - rng.exponential(size=len(seeds)))
-
-
-@pytest.mark.parametrize("change", [gains(0.0, 0.02), gains(0.0, 0.3), skewed])
-def test_of_policies_that_are_no_better_at_most_a_twentieth_is_accepted(change) -> None:
+@pytest.mark.parametrize("spread", [0.02, 0.3])
+def test_of_a_thousand_policies_that_are_no_better_at_most_a_twentieth_is_accepted(spread) -> None:
     accepted = 0
-    for seed in range(300):
-        simulator = Fake(change, seed=seed)
+    least = LOOKS[-1]
+    for seed in range(1000):
+        simulator = Fake(gains(0.0, spread), seed=seed)
         simulator.next_seed = 100 * seed
         found, pairs = looked(simulator)
         accepted += found.accepted
-        assert not found.accepted or len(pairs.starts.seeds) >= ENOUGH
-    assert accepted <= 15
+        least = min(least, len(pairs.starts.seeds)) if found.accepted else least
+    assert accepted <= 50
+    assert least >= ENOUGH
 
 
 def test_another_policy_plays_the_same_starts_and_the_mpc_does_not_again() -> None:

@@ -81,7 +81,7 @@ class Heater(Sampled):
 @pytest.fixture(autouse=True)
 def quick(monkeypatch) -> None:
     """The plants of these tests are simple: networks know them sooner."""
-    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=300))
+    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=500))
 
 
 class Counted(Heater):
@@ -186,14 +186,13 @@ def test_a_disturbance_beyond_the_default_is_reported() -> None:
 
 
 def test_the_reactor_s_figure_is_that_of_its_optimum() -> None:
-    short = partial(gym.make, "CSTR-v0", max_episode_steps=150)
-    found = headroom(problems.cstr(), short, n_starts=2, seed=2000)
-    starts = evaluate(problems.cstr().explicit(), short, range(2000, 2002)).observations
-    best = cstr_optimum([each[0] for each in starts], 150)
-    np.testing.assert_allclose(found.best_costs, best, rtol=5e-4)
+    found = headroom(problems.cstr(), "CSTR-v0", n_starts=2, seed=2000)
+    starts = evaluate(problems.cstr().explicit(), "CSTR-v0", range(2000, 2002)).observations
+    best = cstr_optimum([each[0] for each in starts])
+    np.testing.assert_allclose(found.best_costs, best, rtol=2e-3)
     assert np.all(found.best_costs <= found.mpc_costs)
     assert found.offset + found.model_error + found.nonlinearity == pytest.approx(found.total)
-    assert found.total == pytest.approx(1 - best.mean() / found.mpc_costs.mean(), rel=0.05)
+    assert found.total == pytest.approx(1 - best.mean() / found.mpc_costs.mean(), rel=0.02)
 
 
 def test_the_re_identified_mpc_is_handed_over() -> None:
@@ -214,13 +213,13 @@ def test_changes_of_a_set_point_are_not_known_before() -> None:
 
 def test_noise_is_no_headroom() -> None:
     """A plan that knew the noise to come would cost a fifth less than the MPC, which is optimal."""
-    found = headroom(heater(), partial(Heater, noise=0.1, steps=30), n_starts=10)
+    found = headroom(heater(), partial(Heater, noise=0.1), n_starts=10)
     assert found.verdict == "keep the MPC" and found.total < 0.01
 
 
 def test_the_best_of_a_random_plant_is_one_controller() -> None:
-    found = headroom(heater(), partial(Heater, noise=0.02, load=0.2, steps=30), n_starts=6)
-    assert found.verdict == "add ObserveDisturbance first" and found.offset > 0.3
+    found = headroom(heater(), partial(Heater, noise=0.02, load=0.2), n_starts=6)
+    assert found.verdict == "add ObserveDisturbance first" and found.offset > 0.4
     assert found.total < found.offset + 0.05
 
 
@@ -272,13 +271,13 @@ def test_a_simulator_may_fail_where_the_mpc_does_not_go() -> None:
         raises = False
 
     healthy, vanished = (
-        headroom(heater(), make(bend=0.1, steps=15), n_starts=2) for make in (Heater, Vanishing)
+        headroom(heater(), make(bend=0.1, steps=30), n_starts=3) for make in (Heater, Vanishing)
     )
     with pytest.warns(NonFiniteWarning, match=r"raised RuntimeError\('beyond .* counts as lost"):
-        failed = headroom(heater(), Fragile(bend=0.1, steps=15), n_starts=2)
+        failed = headroom(heater(), Fragile(bend=0.1, steps=30), n_starts=3)
     assert Fragile.failed and Vanishing.failed
     for found in (failed, vanished):
-        np.testing.assert_allclose(found.best_costs, healthy.best_costs, rtol=5e-3)
+        np.testing.assert_allclose(found.best_costs, healthy.best_costs, rtol=2e-3)
 
 
 def test_what_it_cannot_use_is_named() -> None:
@@ -411,8 +410,7 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
 
 
 @pytest.mark.nightly
-def test_a_swing_is_found_where_the_mpc_shows_none(monkeypatch) -> None:
-    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=500))
+def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
     mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=Terminal())
     two_rounds = {"n_starts": 2, "max_steps": 5700}
     found = headroom(mpc, "ClippedPendulum-v0", seed=2021, **two_rounds)

@@ -34,7 +34,7 @@ from sb3_yann.improvement import Check, Improvement, confirmation, imitation
 from sb3_yann.improvement.imitation import Teacher, fit_layer
 from sb3_yann.twin.forecast import Forecast
 from sb3_yann.wrappers import SetPoint
-from twin_samples import POLYNOMIALS, Calm, observed_env, offset_free_problem, problem
+from twin_samples import Calm, observed_env, offset_free_problem, problem
 from weights import is_mpc
 
 UNSEEN = range(900, 930)
@@ -399,7 +399,7 @@ def twin_of(make=Spring, episodes: int = 10) -> PlantTwin:
     """Return the twin of episodes of a plant's MPC."""
     mpc = make().observation_space.problem
     played = evaluate(mpc.explicit(), make, range(episodes))
-    return PlantTwin.fit(mpc, played.pairs, residuals=POLYNOMIALS)
+    return PlantTwin.fit(mpc, played.pairs, updates=1000)
 
 
 @cache
@@ -421,7 +421,7 @@ def test_a_policy_of_a_twin_gains_on_the_plant(capsys, monkeypatch) -> None:
     assert lines[-1].endswith("no objection")
     assert any("in the twin: policy -" in line and ", plans -" in line for line in lines)
     assert any("change on the plant, by " in line for line in lines)
-    assert relative(model).mean() < 0.995 and relative(model).max() < 1.02
+    assert relative(model).mean() < 0.995 and relative(model).max() < 1.01
     weights, again = pickle.loads(in_twin())
     assert bits(model) == weights and found.checks == again.checks
 

@@ -78,7 +78,7 @@ def test_workers_of_dask_play_the_same_episodes() -> None:
     distributed = pytest.importorskip("distributed")
     problem = model_of().policy.problem
     ours = Simulator(problem, Spring, 0).play(of_law(problem), SEEDS)
-    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
+    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
     with cluster, distributed.Client(cluster), joblib.parallel_config("dask", n_jobs=2):
         theirs = Simulator(problem, Spring, 0).play(of_law(problem), SEEDS)
     assert same(ours, theirs)

@@ -124,7 +124,7 @@ def test_a_twin_that_knows_no_lag_promises_nothing_that_the_plant_does_not_keep(
     if not fitted.trusted:
         return
     model = DDPG("YannPolicy", fitted.env(), policy_kwargs={"problem": MPC}, device="cpu", seed=1)
-    if improve(model, fitted, updates=300, seed=1).accepted:
+    if improve(model, fitted, updates=1000, seed=1).accepted:
         seeds = range(5000, 5100)
         ours = evaluate(model, lambda: copy.copy(plant), seeds).costs
         assert ours.mean() < evaluate(MPC.explicit(), lambda: copy.copy(plant), seeds).costs.mean()

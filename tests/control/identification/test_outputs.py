@@ -150,7 +150,7 @@ def test_records_with_gaps_give_nearly_the_same_model(found: IdentifiedOutputs) 
 def test_a_log_gives_the_same_model_with_its_names() -> None:
     u = steps(400, 2, 0)
     y = played(u, A, B, C, 1)
-    plain = identify_outputs(y, u, dt=0.5, order=3, delay=0)
+    plain = identify_outputs(y, u, dt=0.5)
     log = Log(Log.from_arrays(y, u, 0.5).episodes, 0.5, ("T", "level"), ("steam", "feed"))
     named = identify_outputs(log, order=3, delay=0)
     np.testing.assert_array_equal(named.model.A, plain.model.A)
