@@ -655,7 +655,7 @@ class _Work:
         scenarios = Scenarios.like(model, chosen + others, self.rng, midway)
         usual = len(scenarios) - midway
         teacher = Teacher(scenarios, self.seed + number, len(chosen), usual)
-        teacher.show()
+        teacher.show(self.act() if number else None)
         return model, teacher
 
     def _rounds(
@@ -702,7 +702,7 @@ class _Work:
                 continue
             same = Teacher(Scenarios.like(model, played), self.seed)
             if asks:
-                same.show()
+                same.show(self.act())  # plans may begin with what the policy does
                 if -found.logged >= PROMISED * same.gain:
                     break
             # Where the simulator shows less than the model says, there is more to learn.

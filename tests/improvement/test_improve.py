@@ -169,8 +169,19 @@ def test_ten_starts_that_show_no_gain_leave_it_to_the_confirmation(monkeypatch) 
         found, rest = check(trial, *given, final=final)
         return found if final else replace(found, change=1e-3, accepted=False), rest
 
+    show = Teacher.show
+    guessed = []  # by plans of a round: whether they may begin with what the policy does by then
+
+    def recorded(teacher, act=None, played=None):
+        if played is None:
+            rows = teacher.scenarios.starts[:, : problem().n_theta]
+            guessed.append(act is not None and not np.allclose(act(rows), teacher.law(rows)))
+        show(teacher, act, played)
+
     monkeypatch.setattr(module.SimulatorTrial, "check", none_gains)
-    assert improve(problem(), Spring, **FEW).accepted
+    monkeypatch.setattr(Teacher, "show", recorded)
+    assert improve(problem(), Spring, **FEW | {"rounds": 2}).accepted
+    assert len(guessed) > 1 and not guessed[0] and all(guessed[1:])
 
 
 def test_too_little_a_gain_is_confirmed_once(monkeypatch) -> None:
