@@ -206,10 +206,10 @@ def missing_observer(model: LinearSystem) -> str:
     which = [model.disturbance_labels[i] for i in model.estimated]
     observer = "DisturbanceObserver" if which else "StateEstimator"
     if not np.array_equal(model.shown, np.eye(model.n_states)):
-        which.insert(0, "the states")
+        which.insert(0, "The states")
     if not which:
         return ""
-    verb = "are" if which[1:] or which[0] == "the states" else "is"
+    verb = "are" if which[1:] or which[0] == "The states" else "is"
     return (
         f"{', '.join(which)} {verb} estimated: the {observer} is no part of the law or the policy. "
         "Whoever calls it runs the observer, and passes its estimates."

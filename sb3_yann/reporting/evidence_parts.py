@@ -239,7 +239,8 @@ def _beyond(subject: Subject) -> Finding:
     begins = np.array([each[0] for each in subject.shown_loops[OF_MPC].observations])[:, part]
     low = begins.min(axis=0)
     high = begins.max(axis=0)
-    box = ", ".join(map("{} {:.4g} to {:.4g}".format, with_units(problem.model)[0], low, high))
+    ends = zip(with_units(problem.model)[0], map(number, low), map(number, high), strict=True)
+    box = ", ".join(f"{name} {a}" + f" to {b}" * (a != b) for name, a, b in ends)
     states = problem.units.to_plant(subject.samples)[:, part]
     loops = subject.loops_from(states[((states < low) | (states > high)).any(axis=1)])
     mpc, policy = (Scores(loops[who].costs, loops[who].unsafe()) for who in (OF_MPC, OF_POLICY))

@@ -327,7 +327,7 @@ def test_what_estimates_is_refused_where_it_does_not_fit(tmp_path) -> None:
         (mpc, {"estimator": "me"}, "must be a StateEstimator"),
         (mpc.explicit(), {"estimator": observer}, "do not say where"),
         (mpc, {}, "estimator=observer"),
-        (plain, {}, "the states are estimated.* estimator=observer"),
+        (plain, {}, "The states are estimated.* estimator=observer"),
         (mpc, {"estimator": observer, "format": "onnx"}, "no memory"),
         (mpc, {"estimator": observer, "checks": Checks(missing=[1, 2])}, "one number, or 5"),
     ):
