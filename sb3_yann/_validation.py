@@ -114,9 +114,9 @@ def check_bounds(
 
 
 def sides_of(name: str) -> tuple[str, str]:
-    """Return what two bounds are called: x_min and x_max, or those of a group by its name."""
-    if name == "MixedBounds":
-        return "MixedBounds.low", "MixedBounds.high"
+    """Return what two bounds are called: x_min and x_max, or low and high after a name's mark."""
+    if name.endswith((".", "_")):
+        return f"{name}low", f"{name}high"
     return f"{name}_min", f"{name}_max"
 
 

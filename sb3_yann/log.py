@@ -127,6 +127,12 @@ class Log:
         first = self.episodes[0]
         return first.states.shape[1], first.inputs.shape[1], first.disturbances.shape[1]
 
+    @property
+    def named_units(self) -> dict[str, str]:
+        """The unit of each named state, input and disturbance; empty where no header has one."""
+        names = (*self.state_names, *self.input_names, *self.disturbance_names)
+        return dict(zip(names, self.units, strict=False))
+
     def in_names(self, text: str) -> str:
         """Return a text with the log's names in place of ``x[0]``, ``y[0]``, ``u[0]``, ``d[0]``."""
         of = {"u": self.input_names, "d": self.disturbance_names}
@@ -348,9 +354,9 @@ class Log:
         if time is not None:
             unit = time_unit or _name_and_unit(columns[time])[1]
             pairs = [_time(path, k, row, columns[time], unit) for k, row in enumerate(content)]
-            if any(stamped for _, stamped in pairs):
+            instants, stamped = np.array(pairs).T
+            if np.any(stamped):
                 time_unit = unit or "s"
-            instants = np.array([each for each, _ in pairs])
             times = [instants[part] for part in parts]
         names, units = zip(*map(_name_and_unit, wanted[: n + m + d]), strict=True)
         return cls._of(
@@ -437,7 +443,9 @@ def _column(path: object, name: str, header: Sequence[str]) -> str:
     """Return the column of this name, with or without its unit."""
     found = [each for each in header if name in (each, _name_and_unit(each)[0])]
     if not found:
-        hint = " Its delimiter seems to be another: pass delimiter=';'." * (";" in "".join(header))
+        marks = ";,\t" if len(header) == 1 else ";"
+        other = next((each for each in marks if each in "".join(header)), "")
+        hint = f" Its delimiter seems to be another: pass delimiter={other!r}." * bool(other)
         hint += " It is empty." * (not header)
         raise ValueError(f"{path} has no column {name!r}; it has {list(header)}.{hint}")
     if len(found) > 1:

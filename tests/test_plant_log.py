@@ -226,7 +226,9 @@ TWO = "level,valve\n"
 @pytest.mark.parametrize(
     ("text", "states", "said"),
     [
-        (CSV, ["h"], "no column 'h'; it has"),
+        (CSV, ["h"], r"no column 'h'; it has \[[^\]]*\].$"),
+        ("h [cm];valve\n1;2\n", ["h"], "pass delimiter=';'.$"),
+        ("h [cm]\tvalve\n1\t2\n", ["h"], r"pass delimiter='\\t'.$"),
         ("", ["h"], r"it has \[\]. It is empty."),
         (CSV, "level", "list of column names"),
         (CSV.replace("1.1", "high"), ["level"], "row 3: level is 'high', expected a number"),
@@ -241,6 +243,8 @@ TWO = "level,valve\n"
 def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> None:
     with pytest.raises(ValueError, match=said):
         Log.from_csv(write(text), states=states, inputs=["valve"], dt=10)
+    with pytest.raises(ValueError, match=r"no column 'level'; .* pass delimiter=','.$"):
+        Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, delimiter=";")
 
 
 def test_identify_takes_a_log_with_its_names(write) -> None:
@@ -262,8 +266,9 @@ def test_identify_takes_a_log_with_its_names(write) -> None:
 def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(write) -> None:
     u = np.random.default_rng(0).normal(size=60)
     x = played(lambda x, u: 0.8 * x + 0.5 * u, u, 0.0)
-    rows = zip(10 * np.arange(60), x, u, strict=False)
-    path = write("time [s],T [K],valve", *(f"{t},{a:.6f},{b:.6f}" for t, a, b in rows))
+    rows = zip(10 * np.arange(60), x, u, np.sin(u**2), strict=False)
+    lines = (f"{t},{a:.6f},{b:.6f},{c:.6f}" for t, a, b, c in rows)
+    path = write("time [s],T [K],valve,F1 [kg]", *lines)
     log = Log.from_csv(path, ["T"], ["valve"], dt=10, time="time")
     assert Log.from_csv(path, ["T [K]"], ["valve"], dt=10, time="time").state_names == ("T",)
     assert repr(log) == "Log(1 episode, 59 steps of dt = 10 s; 1 state (T), 1 input (valve))"
@@ -272,6 +277,12 @@ def test_headers_with_units_and_the_unit_of_time_reach_model_report_and_plots(wr
     assert identify_outputs(log, order=1, delay=0).model.units == ("K", "")
     assert "sampled every 10 s" in model.report() and "time constant 44.81 s" in model.report()
     assert replace(model, dt=5).time_unit == "s"
+    loaded = Log.from_csv(path, ["T"], ["valve"], dt=10, time="time", disturbances=["F1"])
+    for late in (identify(loaded, delay=1).model, identify_outputs(loaded, delay=1).model):
+        assert "Disturbances: F1 (kg).\n" in late.report() and "T (K), " in late.report()
+    mpc = LinearMPC(late, Q=late.C.T @ late.C, R=[[1]], horizon=2, u_min=-4, u_max=4,
+                    disturbances=DisturbanceBounds(-1, 1))  # fmt: skip
+    assert {"F1 (kg)"} == {*mpc.labels(units=True)} - {*mpc.labels()} - {"T (K)"}
     limits = {"x_min": -9, "x_max": 9, "u_min": -4, "u_max": 4}
     mpc = LinearMPC(replace(model, units=("C", "")), Q=[[1]], R=[[1]], horizon=2, **limits)
     with pytest.raises(ValueError, match="T is in K in the log, and in C in the model of the MPC"):

@@ -20,6 +20,7 @@ normal (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74), nor are gains of a pole 
 FOLLOWS = 3.0  # standard errors from which a state is said to go on and on
 LONG = 100  # samples in which the motion of one must grow by as much as it is, else it is a rate
 ROUNDING = 1e-7  # of a slope, relative to its parts
+CURVED = "Curvature: "  # begins notes on it
 UNTOLD = "Standard errors and intervals do not tell that."  # ends notes on what they leave out
 
 
@@ -49,8 +50,9 @@ class Gains(ReadOnlyArrays):
     beside_errors: Array
 
     @classmethod
-    def of(cls, A: Array, B: Array, integrators: int, errors: Iterable[Array] = ()) -> Gains:
-        """Return the gains of a model of so many integrators; ``errors`` are of `responses`."""
+    def of(cls, A: Array, B: Array, integrators: int = -1, errors: Iterable[Array] = ()) -> Gains:
+        """Return the gains beside so many integrators, -1: counted; errors are of `responses`."""
+        integrators = count_integrators(A) if integrators < 0 else integrators
         found = responses(A, B, integrators)
         found[2] *= integrators > 1
         widths = np.array([*errors] or np.zeros(found.shape))

@@ -22,6 +22,7 @@ from sb3_yann._validation import (
     half_widths,
     to_float,
 )
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.polyhedra import largest_ball
 from sb3_yann.units import Units
@@ -107,12 +108,20 @@ class PlantLaw(ReadOnlyArrays):
             theta = np.minimum(np.maximum(theta, self.clamped[0]), self.clamped[1])
         return theta
 
+    def _numbers(self, theta: ArrayLike) -> Array:
+        """Return theta (n_theta,) or (batch, n_theta) as numbers."""
+        given = to_float("theta", theta)
+        n = self.n_theta
+        if given.ndim not in (1, 2) or given.shape[-1] != n:
+            states = [] if self.model is None else labels_of(self.model)[0]
+            states += [f"then mpc.layout.names[{len(states)}:]"] * (0 < len(states) < n)
+            of = f": {', '.join(states)}" if states else ""
+            raise ValueError(f"theta has shape {given.shape}, expected ({n},) or (batch, {n}){of}.")
+        return given
+
     def _points(self, theta: ArrayLike) -> tuple[Array, Array]:
         """Return theta as checked numbers, and as contiguous rows within what may be asked."""
-        points = to_float("theta", theta)
-        n = self.n_theta
-        if points.ndim not in (1, 2) or points.shape[-1] != n:
-            raise ValueError(f"theta has shape {points.shape}, expected ({n},) or (batch, {n}).")
+        points = self._numbers(theta)
         rows = np.ascontiguousarray(np.atleast_2d(points))
         if not np.all(np.isfinite(rows)):
             bad = self.units.to_plant(rows[~np.all(np.isfinite(rows), axis=1)][0])
@@ -165,14 +174,8 @@ class PlantLaw(ReadOnlyArrays):
                 "The law knows no operating point: it was built by hand. Take it from "
                 "LinearMPC.explicit() or online(), or use u_ss + law(shown - theta_ss)."
             )
-        values = to_float("shown", shown)
-        if values.shape[-1:] != self.theta_ss.shape:
-            size = len(self.theta_ss)
-            raise ValueError(
-                f"shown has shape {values.shape}, expected ({size},) or (batch, {size})."
-            )
         units = self.units
-        return units.input_to_plant(self(units.to_deviations(values)))
+        return units.input_to_plant(self(units.to_deviations(self._numbers(shown))))
 
     @property
     def units(self) -> Units:
@@ -237,10 +240,8 @@ class PlantLaw(ReadOnlyArrays):
             check_array(name, data[name], (2, law.n_inputs)) if name in data else None
             for name in ("rate", "moving")
         )
-        clamped = None
-        if "clamped" in data:
-            low, high = data["clamped"]
-            clamped = check_bounds("clamped", low, high, law.n_theta)
+        ends = data.get("clamped")
+        clamped = None if ends is None else check_bounds("clamped", ends[0], ends[1], law.n_theta)
         return law.on_plant(model, theta_ss, rate, moving, clamped)
 
     def __deepcopy__(self, memo: object = None) -> Self:

@@ -198,22 +198,18 @@ def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axe
             "The law's box is not bounded: there is no frame to draw. Solve the problem for a "
             "bounded theta_min and theta_max."
         )
-    m = law.n_inputs
     zero = law.units.theta_ss[0]
-    rest = law.units.u_ss
-    inputs = [f"u[{k}]" for k in range(m)]
-    if law.model is not None:
-        inputs = with_units(law.model)[1]
+    inputs = with_units(law.model)[1] if law.model else [f"u[{k}]" for k in range(law.n_inputs)]
     ends = np.unique(np.clip(law.b / law.A[:, 0], low, high)[law.A[:, 0] != 0])
     theta = np.unique(np.concatenate([np.linspace(low, high, 401), ends]))
     axes = axes_or_new(axes, 7.4, 4.4)
-    for k, line in enumerate(np.asarray(law(theta[:, None]) + rest).T):
+    for k, line in enumerate(np.asarray(law(theta[:, None]) + law.units.u_ss).T):
         axes.plot(theta + zero, line, color=COLORS[k % len(COLORS)], label=inputs[k])
     for end in ends[(ends > low) & (ends < high)]:
         axes.axvline(end + zero, color=REST, linewidth=0.5)
     called = [*labels] if labels else _labels(law)
     axes.set(xlim=(low + zero, high + zero), xlabel=called[0])
-    if m == 1:
+    if law.n_inputs == 1:
         axes.set(ylabel=inputs[0])
     else:
         legend_beside(axes)
@@ -241,12 +237,9 @@ def _labels(law: Any) -> list[str]:
 def _constant_inputs(law: Any) -> Name:
     """Return what names a region by the inputs that do not move in it."""
     m = law.n_inputs
-    names = [f"u[{k}]" for k in range(m)]
-    units = [""] * m
     rest = law.units.u_ss
-    if law.model is not None:
-        names = labels_of(law.model)[1]
-        units = law.model.units[law.model.n_states :] or units
+    names = labels_of(law.model)[1] if law.model else [f"u[{k}]" for k in range(m)]
+    units = (law.model and law.model.units[law.model.n_states :]) or [""] * m
     size = np.abs(law.gains).max(axis=(0, 2)) + 1e-300
     digits = 12 - np.ceil(np.log10(half_widths(law.u_min, law.u_max) + np.abs(rest))).astype(int)
 

@@ -149,10 +149,10 @@ def _require_text(what: str, given: Sequence[str]) -> None:
             )
 
 
-def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
-    """Return the unit of each state and input, "" where there is none.
+def as_units(given: Units, labels: Sequence[str], least: int) -> tuple[str, ...]:
+    """Return the unit of each label, "" where there is none.
 
-    Labels are the names of both, ``x[0]`` where there are no others.
+    Labels are states, inputs and named disturbances, which come after the ``least`` that need one.
     """
     if isinstance(given, Mapping):
         if unknown := [each for each in given if each not in labels]:
@@ -161,10 +161,10 @@ def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
     if isinstance(given, str) or not all(isinstance(each, str) for each in given):
         raise TypeError(f"units = {given!r} must map names to str, or list one for each.")
     found = tuple(given)
-    if found and len(found) != len(labels):
+    if found and len(found) not in (least, len(labels)):
         raise ValueError(f"units = {list(found)} must have one entry for each of {list(labels)}.")
     _require_text("units", found)
-    return found if any(found) else ()
+    return found[: None if any(found[least:]) else least] if any(found) else ()
 
 
 def as_unit(what: str, given: str) -> str:
@@ -180,15 +180,14 @@ def labels_of(model: LinearSystem) -> tuple[list[str], list[str]]:
     return list(model.state_names) or plain[:n], list(model.input_names) or plain[n:]
 
 
-def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
-    """Return the names of states and inputs, each with its unit in parentheses where it has one."""
+def with_units(model: LinearSystem, units: bool = True) -> tuple[list[str], ...]:
+    """Return the names of states, inputs and disturbances, with units in parentheses if any."""
     states, inputs = labels_of(model)
-    units = model.units or ("",) * (len(states) + len(inputs))
-    whole = [
-        f"{name} ({unit})" if unit else name
-        for name, unit in zip([*states, *inputs], units, strict=True)
-    ]
-    return whole[: len(states)], whole[len(states) :]
+    found = [*states, *inputs, *model.disturbance_labels]
+    for i, unit in enumerate(model.units if units else ()):
+        found[i] += f" ({unit})" if unit else ""
+    n, m = model.B.shape
+    return found[:n], found[n : n + m], found[n + m :]
 
 
 def labels_of_outputs(C: Array, states: Sequence[str]) -> list[str]:
@@ -235,6 +234,8 @@ def completed(
     if past and not isinstance(state_names, str) and len(state_names) == own and own:
         called = list(input_names) if len(input_names) == m else inputs
         state_names = [*state_names, *(called[j] + lag for j, lag in past)]
+        if isinstance(units, Mapping):
+            units = {called[j] + lag: units.get(called[j], "") for j, lag in past} | {**units}
     if past and not isinstance(units, str | Mapping) and len(units) == own + m:
         of_inputs = list(units[own:])
         units = [*units[:own], *(of_inputs[j] for j, _ in past), *of_inputs]

@@ -46,13 +46,14 @@ def plant_part(subject: Subject) -> Part:
     """Return the plant and the problem, in plant units."""
     problem = subject.problem
     model = subject.problem.model
-    states, inputs = with_units(model)
+    states, inputs, loads = with_units(model)
     point = [[name, "state", number(x)] for name, x in zip(states, model.x_ss, strict=True)]
     point += [[name, "input", number(u)] for name, u in zip(inputs, model.u_ss, strict=True)]
-    for i, load in enumerate(model.disturbance_labels):
+    for i, load in enumerate(loads):
         kind = "estimated disturbance" if i in model.estimated else "disturbance"
         point.append([load, kind, number(model.d_ss[i])])
     ends = zip(problem.labels(units=True), problem.theta_min, problem.theta_max, strict=True)
+    box = [[name, number(low), number(high)] for name, low, high in ends]
     soft = problem.soft.penalty
     facts = [
         ["horizon", f"{problem.horizon} steps of {model.step_length}"],
@@ -75,10 +76,7 @@ def plant_part(subject: Subject) -> Part:
             tag("h3", "The control problem"),
             table(["setting", "value"], facts),
             tag("h3", "Parameters of the law, and the box for which it is solved"),
-            table(
-                ["parameter", "lower", "upper"],
-                [[name, number(a), number(b)] for name, a, b in ends],
-            ),
+            table(["parameter", "lower", "upper"], box),
             tag("h3", "The linear model"),
             lines(model.report()),
         ]

@@ -374,8 +374,9 @@ def _require_same_sampling(log: Log, problem: LinearMPC) -> None:
 def _require_same_units(log: Log, problem: LinearMPC) -> None:
     """Raise where a header declares another unit than the model does."""
     model = problem.model
-    units = dict(zip((*model.state_names, *model.input_names), model.units, strict=False))
-    for name, its in zip((*log.state_names, *log.input_names), log.units, strict=False):
+    states, inputs = labels_of(model)
+    units = dict(zip([*states, *inputs, *model.disturbance_labels], model.units, strict=False))
+    for name, its in log.named_units.items():
         own = units.get(name)
         if its and own and its != own:
             raise ValueError(

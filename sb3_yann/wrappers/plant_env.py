@@ -118,8 +118,11 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Step; the reward is the one of this wrapper."""
-        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
-        u = self.units.input(u)
+        u = np.atleast_1d(np.asarray(action, np.float64))
+        if u.shape != self.inputs.shape:
+            of = ", ".join(with_units(self.problem.model)[1])
+            raise ValueError(f"action has shape {u.shape}, expected {self.inputs.shape}: {of}.")
+        u = self.units.input(np.clip(u, self.inputs.low, self.inputs.high))
         cost = float(self.problem.deviations.stage_cost(self.theta, u))
         observation, _, terminated, truncated, info = self.env.step(action)
         after = self.problem.units.to_deviations(self.seen(observation))
@@ -209,7 +212,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         high = np.minimum(x_ss + half, mpc.theta_max[layout.state])
         lowest = low if start_low is None else start_low
         highest = high if start_high is None else start_high
-        start = check_bounds("start", lowest, highest, n)
+        start = check_bounds("start_", lowest, highest, n)
         if not np.all(np.isfinite(start)):
             raise ValueError(
                 "The MPC's box of states is not bounded, so it is not known where episodes begin: "
@@ -357,7 +360,7 @@ class Equations(gym.Env[Array, Array]):
             raise ValueError(f"f returned the shape {slope.shape}. {called_as(x, u)} x is {of_x}.")
         wrong = np.flatnonzero(~np.isfinite(slope))
         if wrong.size and not self.fault and np.all(np.isfinite(x)):
-            states, inputs = with_units(self.model)
+            states, inputs, _ = with_units(self.model)
             values = zip((*states, *inputs), (*x, *u), strict=True)
             at = ", ".join(f"{name} = {value:.6g}" for name, value in values)
             self.fault = f"f(x, u) is {slope[wrong[0]]} for the slope of {states[wrong[0]]} at {at}"

@@ -173,6 +173,10 @@ def test_what_is_of_no_use_is_named() -> None:
         PlantEnv(slope, LinearMPC(TANK, **WEIGHTS, u_min=0, u_max=5))
     with pytest.raises(ValueError, match=r"options\['state'\] = \[1, 2\] must be 1 finite"):
         PlantEnv(slope, plain).reset(options={"state": [1, 2]})
+    with pytest.raises(ValueError, match=r"action has shape \(2,\), expected \(1,\): flow"):
+        PlantEnv(slope, plain).step(np.array([2.0, 2.0]))
+    with pytest.raises(ValueError, match="start_low must lie below start_high, but entry 0 has"):
+        PlantEnv(slope, plain, start_low=[360], start_high=[350])
 
 
 def test_an_mpc_from_it_has_the_bounds_of_its_own() -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
-from sb3_yann.control.gains import UNTOLD
+from sb3_yann.control.gains import CURVED, UNTOLD
 from sb3_yann.control.identification.least_squares import (
     WEAK,
     Regression,
@@ -161,14 +161,13 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     width = episodes[0].regressors.shape[1]
     if steps <= 4 * (2 * width + sum(delays) + 1):
         return Leftover(none, none, none, none, none)
-    now = np.concatenate([each.regressors[lags:] for each in longer])[:SEARCHED]
     target = np.concatenate([each.states[lags + 1 :] for each in longer])[:SEARCHED]
-    past = [
-        np.concatenate([each.regressors[lags - lag : len(each) - lag] for each in longer])[
-            :SEARCHED
-        ]
-        for lag in range(1, lags + 1)
-    ]
+
+    def before(lag: int) -> Array:
+        rows = [each.regressors[lags - lag : len(each) - lag] for each in longer]
+        return np.concatenate(rows)[:SEARCHED]
+
+    now, *past = map(before, range(lags + 1))
     steps = len(now)
     center = now.mean(axis=0)
     plain = np.column_stack([np.ones(steps), now - center])
@@ -260,7 +259,7 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
     explained = np.maximum(explained, 0.0)  # what errs more on rows held out explains nothing
     if np.any(share > 0):
         curved = (
-            f"Curvature: squares and products of states and inputs explain {listed(100 * share)} % "
+            f"{CURVED}squares and products of states and inputs explain {listed(100 * share)} % "
             "of the residuals' variance. "
         )
         sure = not known or bool(np.any(left.bends[:n] & (share > 0)))

@@ -160,20 +160,14 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
         log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
     try:
         found = fit_log(
-            log,
-            x_ss=x_ss,
-            u_ss=u_ss,
-            d_ss=d_ss,
-            offset=offset,
-            ridge=ridge,
-            held_out=held_out,
-            delay=delay,
-        )
+            log, x_ss=x_ss, u_ss=u_ss, d_ss=d_ss,
+            offset=offset, ridge=ridge, held_out=held_out, delay=delay,
+        )  # fmt: skip
     except ValueError as error:
         raise ValueError(log.in_names(str(error))) from None
     model = LinearModel(**{**vars(found.system), "disturbance_names": log.disturbance_names})
     if log.state_names:
-        model = model.named(log.state_names, log.input_names, log.units[: sum(log.sizes[:2])])
+        model = model.named(log.state_names, log.input_names, log.named_units)
     step = found.regression
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 
 from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_range
-from sb3_yann.control.gains import Gains
+from sb3_yann.control.gains import CURVED, Gains
 from sb3_yann.control.identification.dead_time import as_delays, exact_memory, memory_labels
 from sb3_yann.control.identification.fit import require_moving, system_of
 from sb3_yann.control.identification.innovations import TINY_RIDGE, Innovations, filtered, shifted
@@ -252,7 +252,7 @@ def identify_outputs(
     if np.array_equal(model.C, np.eye(q, n)):  # the first states are the outputs
         errors[:, :q] = found.gain_errors[..., :m] * scale[:q, None] / scale[q : q + m]
     state_names = _state_names(log, model, found.delays)
-    units = zip([*log.state_names, *log.input_names], log.units, strict=False)
+    named = *state_names, *log.input_names, *log.disturbance_names
     whole = LinearModel(
         A,
         B,
@@ -266,7 +266,7 @@ def identify_outputs(
         state_names=state_names,
         input_names=log.input_names,
         disturbance_names=log.disturbance_names,
-        units={name: unit for name, unit in units if name in (*state_names, *log.input_names)},
+        units={name: unit for name, unit in log.named_units.items() if name in named},
         C=C,
         time_unit=log.time_unit,
     )
@@ -409,7 +409,7 @@ def _notes(
     ]
     if np.any(found.curvature > 0):
         notes.append(
-            f"Curvature: squares and products of outputs and inputs explain "
+            f"{CURVED}squares and products of outputs and inputs explain "
             f"{listed(100 * found.curvature)} % of the prediction errors' variance. The plant is "
             "not linear over this log: record closer to the operating point."
         )

@@ -65,7 +65,7 @@ class LinearModel(LinearSystem):
     state_names, input_names, disturbance_names : sequence of str, optional
         Names for reports, n, m and at most d of them. Equality ignores them.
     units : mapping from name to str, or sequence of n + m str, optional
-        Units of states and inputs, for reports.
+        Units of states and inputs, and after them of named disturbances, for reports.
     estimated : sequence of int, optional
         Disturbances, by their index, that no sensor measures: a :class:`DisturbanceObserver`
         estimates them. Equality ignores it, `dataclasses.replace` keeps it.
@@ -127,8 +127,7 @@ class LinearModel(LinearSystem):
         inputs = as_names("input_names", input_names, u.size)
         count = min(len(disturbance_names), d.size)  # those that offset_free adds come after them
         loads = as_names("disturbance_names", disturbance_names, count)
-        labels = [*(states or names((n,))), *(inputs or names((0, u.size)))]
-        known = [*labels, *loads]
+        known = [*(states or names((n,))), *(inputs or names((0, u.size))), *loads]
         if both := sorted({each for each in known if known.count(each) > 1}):
             raise ValueError(f"{both} name two signals: each needs a name of its own.")
         point = check_positive("dt", dt), x, u, E, d
@@ -142,7 +141,7 @@ class LinearModel(LinearSystem):
             state_names=states,
             input_names=inputs,
             disturbance_names=loads,
-            units=as_units(units, labels),
+            units=as_units(units, known, n + u.size),
             estimated=check_indices("estimated", estimated, E.shape[1]),
             C=None if C is None else check_array("C", C, ("q", n)),
             time_unit=as_unit("time_unit", time_unit),
@@ -327,7 +326,7 @@ class LinearModel(LinearSystem):
         state_names, input_names : sequence of str
             One for each, or none.
         units : mapping of name to unit, or sequence of str
-            Of states and inputs.
+            Of states and inputs, and of named disturbances.
         time_unit : str, optional
             Of ``dt``, where it has none yet: ValueError for another one.
         """
@@ -355,7 +354,7 @@ class LinearModel(LinearSystem):
         return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))
 
     def __repr__(self) -> str:
-        states, inputs = with_units(self)
+        states, inputs, _ = with_units(self)
         sizes = f"states={states}, inputs={inputs}, disturbances={self.n_disturbances}"
         if self.estimated:
             sizes += f", estimated={[*self.estimated]}"

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.gains import NORMAL, ON_CIRCLE, SURE_ERRORS, UNTOLD, Gains, count_integrators
+from sb3_yann.control.gains import CURVED, NORMAL, ON_CIRCLE, SURE_ERRORS, UNTOLD, Gains
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
 
 MAY_INTEGRATE = f"may integrate: it is 1 within {SURE_ERRORS:g} standard errors"
@@ -51,8 +51,9 @@ def _head(model: LinearSystem) -> list[str]:
         f"Operating point: {point}.",
     ]
     if model.state_names or model.input_names or model.units:
-        states, inputs = with_units(model)
-        named = {"States": states, "Inputs": inputs, "Disturbances": model.disturbance_names}
+        states, inputs, loads = with_units(model)
+        loads = loads[: len(model.disturbance_names)]
+        named = {"States": states, "Inputs": inputs, "Disturbances": loads}
         head.insert(1, " ".join(f"{what}: {', '.join(of)}." for what, of in named.items() if of))
     return head
 
@@ -163,9 +164,7 @@ def _scaling(model: LinearSystem) -> list[str]:
 
 def _gains(model: LinearSystem) -> list[str]:
     """Return the lines on what held inputs do in the end."""
-    gains = model.gains
-    if gains is None:
-        gains = Gains.of(model.A, model.B, count_integrators(model.A))
+    gains = model.gains or Gains.of(model.A, model.B)
     known = np.any(gains.errors, axis=1)
     rows = np.flatnonzero(known if np.any(known) else np.ones_like(known))
     rounding = 1e-9 * np.max(np.abs(gains.values))
@@ -220,6 +219,8 @@ def _gains(model: LinearSystem) -> list[str]:
         text = f" Not distinguishable from zero: {none}." if none else ""
         if any(each.endswith(UNTOLD) for each in model.notes):
             noise += " alone: the notes say what there is besides, by which gains err more"
+        if any(each.startswith(CURVED) for each in model.notes):
+            text = f" It is of a linear fit, and does not cover the curvature.{text}"
         lines.append(f"  ± is a 95 % interval, under {noise}.{text}")
     return lines
 

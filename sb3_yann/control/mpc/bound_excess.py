@@ -118,7 +118,7 @@ class BoundNames(NamedTuple):
         states, inputs = labels_of(model)
         units = [*(model.units or [""] * (len(states) + len(inputs)))]
         of_states = [*zip(states, units, strict=False)]
-        of_inputs = [*zip(inputs, units[len(states) :], strict=True)]
+        of_inputs = [*zip(inputs, units[len(states) :], strict=False)]
         outputs = labels_of_outputs(problem.outputs.C, model.state_names)
         every = [*of_states, *((name, dict(of_states).get(name, "")) for name in outputs)]
         found = [each for each, used in zip(every, bounds.used, strict=True) if used]

@@ -79,7 +79,8 @@ def _rows(name: str, C: Array, n_states: int, names: Sequence[str]) -> Array:
     """Return outputs as a matrix (q, n): they may be names of states, or indices."""
     if C.dtype.kind == "U":
         if missing := [each for each in C.tolist() if each not in names]:
-            raise ValueError(f"{name} has {missing}, but the model's states are {[*names]}.")
+            known = f"are {[*names]}" if names else "have no names: model.named([...]) gives some"
+            raise ValueError(f"{name} has {missing}, but the model's states {known}.")
         C = np.array([names.index(each) for each in C.tolist()])
     return check.check_outputs(name, C, n_states)
 
@@ -323,7 +324,7 @@ class MixedBounds(ReadOnlyArrays):
         for name, given in (("F", F), ("G", G)):
             value = to_float(f"MixedBounds.{name}", np.zeros((0, 0)) if given is None else given)
             parts[name] = check_array(f"MixedBounds.{name}", np.atleast_2d(value), ("k", "columns"))
-        lower, upper = _loose("MixedBounds", low, high)
+        lower, upper = _loose("MixedBounds.", low, high)
         units = to_float("MixedBounds.soft", soft)
         if np.any(units < 0):
             raise ValueError(f"MixedBounds.soft = {units.tolist()}: no entry may be negative.")
@@ -337,7 +338,7 @@ class MixedBounds(ReadOnlyArrays):
             check_array(f"MixedBounds.{name}", M, (count, size)) if len(M) else
             np.zeros((count, size)) for name, M, size in sides
         )  # fmt: skip
-        low, high = _bounds("MixedBounds", self.low, self.high, count, "row in F or G")
+        low, high = _bounds("MixedBounds.", self.low, self.high, count, "row in F or G")
         for k in np.flatnonzero(~np.any(np.hstack([F, G]), axis=1)):
             raise ValueError(f"Row {k} of MixedBounds is zero in F and G: it bounds nothing.")
         for k in np.flatnonzero(np.isinf(low) & np.isinf(high)):
@@ -443,7 +444,7 @@ def parametric_box(names: Sequence[str], limits: Mapping[str, Bounds]) -> Bounds
         kind, i, upper = bound_entry(name)
         other = 0.0 if kind == "du" else float(limits[kind][not upper][i])
         if not np.isfinite(other):
-            wanted = check.sides_of("MixedBounds" if kind == "mixed" else kind)[not upper]
+            wanted = check.sides_of("MixedBounds." if kind == "mixed" else kind)[not upper]
             raise ValueError(
                 f"parametric_bounds has {name!r}, but nothing says how far it moves in: give "
                 f"{wanted} a finite entry {i}."

@@ -25,9 +25,12 @@ def completed(problem: MPCProblem) -> Terminal:
 
     The set is in the units of the problem.
     """
-    errors = problem.settled.error_system
+    size = problem.n_theta
     cost: Any = problem.terminal.cost
     half_spaces: Any = problem.terminal.set
+    if isinstance(half_spaces, tuple) and half_spaces[0].shape[1] != size:
+        check_array("Terminal.set F", half_spaces[0], ("rows", problem.model.n_states))
+    errors = problem.settled.error_system
     if cost is None:
         try:
             cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
@@ -42,12 +45,8 @@ def completed(problem: MPCProblem) -> Terminal:
         F, g = invariant_set(problem.deviations.settled, cost)
         F = F @ np.eye(problem.n_theta)[problem.layout.settles]
         half_spaces = F, g + F @ problem.theta_ss
-    n = problem.model.n_states
-    size = problem.n_theta
     F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
-    if F.shape[1] != size:
-        F = np.pad(check_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))
-    return Terminal(cost, (F, g))
+    return Terminal(cost, (np.pad(F, ((0, 0), (0, size - F.shape[1]))), g))
 
 
 def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:

@@ -12,7 +12,7 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, Given, ReadOnlyArrays, check_array, half_widths, to_float
 from sb3_yann.control import lqr
-from sb3_yann.control.linear_system import labels_of, with_units
+from sb3_yann.control.linear_system import with_units
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.coordinates import (
     ErrorSystem,
@@ -254,14 +254,14 @@ class MPCProblem(ReadOnlyArrays):
         model = self.model
         found = list(self.layout.names)
         later = ["", *(f", {k} sample{'s' * (k > 1)} ahead" for k in range(1, self.horizon + 1))]
-        states, inputs = with_units(model) if units else labels_of(model)
+        states, inputs, loads = with_units(model, units)
         if model.state_names or (units and model.units):
             found[self.layout.state] = states
             p = self.layout.n_references
             for state, at in self.set_points.items():
                 for k in range(self.layout.previews[0] + 1):
                     found[at + k * p] = f"set-point of {states[state]}{later[k]}"
-        for i, name in enumerate(model.disturbance_names):
+        for i, name in enumerate(loads[: len(model.disturbance_names)]):
             own = {f"d_{k}[{i}]" if k else f"d[{i}]": name + each for k, each in enumerate(later)}
             found = [own.get(each, each) for each in found]
         if model.input_names or (units and model.units):

@@ -76,6 +76,7 @@ def test_names_of_the_inputs_on_their_way_follow_from_those_of_the_inputs() -> N
     assert named.state_names == ("T", "h", "w(k-1)", "w(k-2)")
     assert named.units == ("K", "m", "kg/s", "kg/s", "kg/s", "V")
     assert named.named(["a", "b"], ["c", "d"]).state_names == ("a", "b", "c(k-1)", "c(k-2)")
+    assert model.named(["T", "h"], ["w", "v"], {"T": "K", "w": "kg"}).units[2:4] == ("kg", "kg")
     whole = named.named(["a", "b", "c", "d"], ["e", "f"], {"a": "K"})
     assert whole.state_names == ("a", "b", "c", "d") and whole.units[0] == "K"
     assert model.named(["T", "h"]).state_names == ("T", "h", "u[0](k-1)", "u[0](k-2)")

@@ -196,12 +196,19 @@ def test_deviations_are_told_with_what_to_pass() -> None:
     LinearMPC(plant, **given, tracking=Tracking([0], 1600, 2400))  # beside it, as may be
 
 
-def test_a_column_is_not_taken_for_a_batch() -> None:
+def test_what_does_not_fit_theta_or_the_states_is_named() -> None:
     tanks = LinearModel(np.eye(2) / 2, [[1], [1]], 1, x_ss=[12, 1], u_ss=[3])
     given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9}
     law = LinearMPC(tanks, x_min=[0, 0], x_max=[20, 3], **given).online()
-    with pytest.raises(ValueError, match=r"shown has shape \(2, 1\), expected \(2,\) or"):
+    with pytest.raises(ValueError, match=r"theta has shape \(2, 1\), expected \(2,\) or .*: x"):
         law.plant_input([[12.0], [1.0]])
+    law = LinearMPC(tanks, **given, rate=RateLimits(-1, 1)).online()
+    with pytest.raises(ValueError, match=r"x\[0\], x\[1\], then mpc.layout.names\[2:\]."):
+        law.plant_input([12.0, 1.0])
+    with pytest.raises(ValueError, match=r"Terminal.set F has shape \(1, 4\), .* \(rows, 2\)"):
+        LinearMPC(tanks, **given, terminal=Terminal(set=([[1, 0, 0, 0]], [2])))
+    with pytest.raises(ValueError, match=r"\['h'\], but the model's states have no names: model.n"):
+        LinearMPC(tanks, **given, tracking=Tracking(["h"], 0, 9))
 
 
 # ---- By how much episodes exceed the bounds of their problem, and what its soft bounds cost ----
