@@ -160,9 +160,15 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
         log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
     try:
         found = fit_log(
-            log, x_ss=x_ss, u_ss=u_ss, d_ss=d_ss,
-            offset=offset, ridge=ridge, held_out=held_out, delay=delay,
-        )  # fmt: skip
+            log,
+            x_ss=x_ss,
+            u_ss=u_ss,
+            d_ss=d_ss,
+            offset=offset,
+            ridge=ridge,
+            held_out=held_out,
+            delay=delay,
+        )
     except ValueError as error:
         raise ValueError(log.in_names(str(error))) from None
     model = LinearModel(**{**vars(found.system), "disturbance_names": log.disturbance_names})
