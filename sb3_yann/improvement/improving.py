@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from sb3_yann._progress import Progress, shown
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.compare import RULE, TOO_LITTLE
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.linear_system import missing_observer
 from sb3_yann.deployment.exporting import Exported, export
 from sb3_yann.env_pool import Source, maker
@@ -105,6 +105,8 @@ class Improvement:
         Fingerprint of the policy's weights when it ended.
     model : BaseAlgorithm, optional
         With the policy; not in the model's zip.
+    estimator : StateEstimator, optional
+        What the policy's estimates came from; nor is it in that zip.
     note : str
         What ended the search before a final check; empty where nothing did.
     rests_aside : bool
@@ -127,6 +129,7 @@ class Improvement:
     settings: dict[str, float] = field(default_factory=dict)
     policy: str = ""
     model: Any = field(default=None, repr=False, compare=False)
+    estimator: StateEstimator | None = field(default=None, repr=False, compare=False)
     note: str = ""
     rests_aside: bool = False
 
@@ -141,8 +144,8 @@ class Improvement:
         return known[-1] if known else (-np.inf, np.inf)
 
     def export(self, path: str | PathLike[str], **options: Any) -> Exported:
-        """Write the policy as a file or as code: :func:`sb3_yann.export` of the model."""
-        return export(self.model, path, **options)
+        """Write policy and estimator as a file or as code: :func:`sb3_yann.export` of the model."""
+        return export(self.model, path, **{"estimator": self.estimator} | options)
 
     @property
     def reason(self) -> str:
@@ -370,7 +373,7 @@ def improve(
     found = replace(found, settings=settings, policy=prints)
     record: Any = model
     record.improvements = (*getattr(model, "improvements", ()), found)
-    return replace(found, model=model)
+    return replace(found, model=model, estimator=work.estimator)
 
 
 def fingerprint(state: dict[str, th.Tensor]) -> str:
@@ -441,6 +444,7 @@ class _Work:
         self.rng = np.random.default_rng([seed, 1])
         self.checks: list[Check] = []
         self.hard: Scenarios | None = None  # what the last check in a twin has lost
+        self.estimator: StateEstimator | None = None  # what the policy's estimates come from
         self.has_learnt = not self.layer.network.is_zero()
 
     def interrupted(self) -> Improvement:
@@ -487,6 +491,7 @@ class _Work:
 
     def in_twin(self, twin: PlantTwin) -> Improvement:
         """Plan in the members of a twin, imitate, and check on every member."""
+        self.estimator = twin.dynamics.row.estimator
         self.keep_margin(twin.dynamics.row, twin.episodes)
         trial = Trial.draw(twin, self.n_starts, self.rng)
         before = self._check_in(trial) if self.has_learnt else None
@@ -606,6 +611,7 @@ class _Work:
         try:
             value_at_end(self.problem)  # raises where the law cannot rest: no plan could be made
             simulator.begin(least)
+            self.estimator = simulator.row.estimator
             self.keep_margin(simulator.row, simulator.episodes)
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
             trial = SimulatorTrial(simulator)

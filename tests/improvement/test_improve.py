@@ -307,7 +307,7 @@ def test_set_points_are_followed_for_less_whatever_plans_gain(monkeypatch) -> No
 
 
 @pytest.mark.filterwarnings("ignore::sb3_yann.CostMismatchWarning")
-def test_an_observer_is_a_part_of_the_model(monkeypatch) -> None:
+def test_an_observer_is_a_part_of_the_model_and_of_its_export(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(module, "TRIES", 1)
     mpc = offset_free_problem()[0]
 
@@ -319,6 +319,7 @@ def test_an_observer_is_a_part_of_the_model(monkeypatch) -> None:
     found = improve(model, make, n_starts=4, rounds=1, updates=100)
     assert found.steps > 0 and found.checks
     assert found.accepted != (bits(model) == before)
+    assert not found.export(tmp_path / "controller.npz").note  # it lacks nothing
 
 
 class Short(Spring):
