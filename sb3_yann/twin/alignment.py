@@ -99,12 +99,16 @@ class Logged:
     def excitation(self) -> Array:
         """How much of each input's variance (m,) neither the MPC nor a line in theta explains.
 
-        Set-points and bounds that change count as held: what they move is excitation.
+        Set-points and bounds that change count as held: what they move is excitation. Previous
+        inputs move no state beside those of now, and a test that is held follows them: the line
+        has none of them.
         """
         theta = self.row.shown(self.rows).copy()
-        asked = np.r_[self.problem.layout.reference, self.problem.layout.limits]
+        layout = self.problem.layout
+        asked = np.r_[layout.reference, layout.limits]
         theta[:, asked] = theta[:, asked].mean(axis=0)
-        columns = np.column_stack([np.ones(len(theta)), theta, law_of(self.problem)(theta)])
+        known = np.delete(theta, layout.previous, axis=1)
+        columns = np.column_stack([np.ones(len(theta)), known, law_of(self.problem)(theta)])
         left = self.inputs - columns @ np.linalg.lstsq(columns, self.inputs, rcond=None)[0]
         variance = np.var(self.inputs, axis=0)
         return np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)

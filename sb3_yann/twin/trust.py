@@ -48,7 +48,8 @@ class Trust:
     predicted, actual : ndarray, shape (episodes,)
         Costs of held-out episodes, of two to four their pieces, in closed loop.
     excitation : ndarray, shape (m,)
-        Share of each input's variance that theta, its set-points held, does not explain.
+        Share of each input's variance that the MPC, its set-points held, and theta, but for
+        previous inputs, do not explain.
     moves : ndarray, shape (m,)
         Standard deviations of the inputs, in half-widths.
     problems, advice : tuple of str
@@ -256,7 +257,7 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
         if (more := len(trust.actual) - 10) > 0:
             said.append(f"  ... and {more} more")
         said.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
-    said.append("Inputs: how much they move, and what share of variance is new each sample:")
+    said.append("Inputs: how much they move, and what share of it neither states nor MPC tell:")
     inputs = labels_of(problem.model)[1]
     for name, own, moves in zip(inputs, trust.excitation, trust.moves, strict=True):
         rests = "rests on the given B" if own < ALONE else "is known from the log"

@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from sb3_yann import LinearModel, LinearMPC, PlantEnv, PlantTwin, Tracking, identify
+from sb3_yann import LinearModel, LinearMPC, PlantEnv, PlantTwin, RateLimits, Tracking, identify
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.alignment import Logged
 from sb3_yann_envs import cstr, problems
@@ -318,6 +318,22 @@ def test_the_input_of_an_mpc_in_a_closed_loop_is_not_its_own() -> None:
     assert PlantTwin.fit(problems.cstr(), dithered).trust.excitation > 0.02
 
 
+def test_an_input_that_is_held_excites_though_the_one_before_tells_it() -> None:
+    plant = LinearModel([[0.9]], [[0.1]], 1.0)
+    box = {"u_min": -1, "u_max": 1, "theta_min": -2, "theta_max": 2}
+    mpc = LinearMPC(plant, Q=[[1]], R=[[1]], horizon=3, rate=RateLimits(-0.5, 0.5), **box)
+    rng = np.random.default_rng(0)
+    log = []
+    for _ in range(3):
+        test = np.repeat(rng.uniform(-0.3, 0.3, 10), 20)
+        theta = [np.zeros(2)]
+        for moved in test:
+            u = -0.3 * theta[-1][0] + moved
+            theta.append(np.array([0.9 * theta[-1][0] + 0.1 * u + rng.normal(0, 0.1), u]))
+        log.append((np.array(theta), np.array(theta)[1:, 1:]))
+    assert PlantTwin.fit(mpc, log, residuals=["none"]).trust.excitation > 0.5
+
+
 def test_set_points_excite_a_closed_loop() -> None:
     mpc = LinearMPC(
         LinearModel([[0.9]], [[0.1]], 1.0), Q=[[1]], R=[[1]], horizon=3, u_min=-1, u_max=1,
@@ -327,7 +343,7 @@ def test_set_points_excite_a_closed_loop() -> None:
     log = evaluate(mpc.explicit(), worn, seeds=range(5))
     twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], residuals=SELECT)
     assert "its gain is known from the log" in twin.report() and not twin.trust.advice
-    assert "and what share of variance is new each sample:\n" in twin.report()
+    assert "and what share of it neither states nor MPC tell:\n" in twin.report()
     assert twin.reidentified().model.B == pytest.approx(0.8 * mpc.model.B, rel=0.01)
 
 
