@@ -15,7 +15,6 @@ from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback, Mask
@@ -32,6 +31,7 @@ SETTLED = 1e-5  # A start is done when a correction saves less than this part of
 # corrections at most; after how many the best of several guesses goes on
 SWEEPS = 40
 RACE = 4
+BATCH = 100_000  # steps of trajectories at once: more take memory, fewer the interpreter's time
 TIE = 0.1  # by which part of its cost a guess of the caller's may cost more than the best
 SOFT = 1e-2  # bounds count so much less at first: stiff ones would end a search where it meets them
 DAMPED = 10.0
@@ -80,9 +80,7 @@ class TwinPlant:
         acting = self._acting(rows)
         if self.members is not None:
             return np.asarray(acting.step(theta[:, None], u[:, None])[:, 0])
-        every = (len(acting.members), 1, 1)
-        after = acting.step(np.tile(theta, every), np.tile(u, every))
-        return np.asarray(after.mean(axis=0))
+        return np.asarray(acting.step(theta[None], u[None]).mean(axis=0))
 
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
         """Return the next theta (k, n_theta), of the starts ``rows``; an estimated d stays."""
@@ -226,13 +224,19 @@ def roll_out(
 
     It begins at ``starts`` (k, n_theta); ``rows`` (k,) are their numbers, as the plant knows them.
     """
-    m = task.problem.model.n_inputs
+    problem = task.problem
 
     def act(t: int, theta: Array) -> Array:
         u = policy(t, theta)
-        return np.clip(np.where(np.isnan(u), 0.0, u), *task.limits(theta))
+        return np.clip(np.where(np.isnan(u), 0.0, u), *problem.deviations.input_range(theta))
 
-    return play(act, lambda t, theta, u: plant.step(theta[t], u[t], rows), starts, steps, m)
+    return play(
+        act,
+        lambda t, theta, u: plant.step(theta[t], u[t], rows),
+        starts,
+        steps,
+        problem.model.n_inputs,
+    )
 
 
 @dataclass(frozen=True)
@@ -277,28 +281,43 @@ def planned(
 
     ``starts`` (k, n_theta), whose numbers are ``rows`` (k,), as the plant knows them.
     """
-    found = []
-    every = np.arange(len(starts))
+    k = len(starts)
     turn = plant.turn
     soft = dataclasses.replace(task, weight=SOFT * task.weight)
-    for policy in policies:
-        thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
+    found = []
+    for thetas, inputs, every in _played(plant, task, policies, starts, steps, rows):
         gains = np.zeros((*inputs.shape, starts.shape[1]))
         first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs), turn)
-        found.append(improved(plant, soft, first, rows, RACE if len(policies) > 1 else SWEEPS))
-    ranked = np.array([each.costs for each in found])
+        found.append(improved(plant, soft, first, every, RACE if len(policies) > 1 else SWEEPS))
+    ranked = np.concatenate([each.costs for each in found]).reshape(-1, k)
+    parts = zip(*((each.thetas, each.inputs, each.gains) for each in found), strict=True)
+    thetas, inputs, gains = (np.concatenate(each, axis=1) for each in parts)
+    raced = Plans(thetas, inputs, gains, ranked.ravel().copy(), turn)
     if preferred:
         ranked[-1] -= TIE * np.abs(ranked[-1])
-    best = np.argmin(ranked, axis=0)
-    parts = zip(*((each.thetas, each.inputs, each.gains) for each in found), strict=True)
-    thetas, inputs, gains = (np.stack(each, axis=1)[:, best, every] for each in parts)
-    costs = np.array([each.costs for each in found])[best, every]
-    plans = improved(plant, soft, Plans(thetas, inputs, gains, costs, turn), rows, SWEEPS)
+    best = raced.of(np.argmin(ranked, axis=0) * k + np.arange(k))
+    plans = improved(plant, soft, best, rows, SWEEPS)
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
     plans = improved(plant, task, hard, rows, SWEEPS)
     # The last search may have been damped, and its feedback with it.
     _, gains, _ = _backward(plant, task, plans, rows, np.zeros(len(rows)))
     return dataclasses.replace(plans, gains=gains)
+
+
+def _played(
+    plant: TwinPlant, task: Task, policies: list[Policy], starts: Array, steps: int, rows: Rows
+) -> Iterator[tuple[Array, Array, Rows]]:
+    """Yield thetas, inputs and row numbers of the policies' trajectories, of several at once."""
+    some = max(1, BATCH // (steps * len(starts)))
+    for first in range(0, len(policies), some):
+        group = policies[first : first + some]
+
+        def act(t: int, theta: Array, group: list[Policy] = group) -> Array:
+            parts = zip(group, np.split(theta, len(group)), strict=True)
+            return np.concatenate([policy(t, part) for policy, part in parts])
+
+        every = np.tile(rows, len(group))
+        yield *roll_out(plant, task, act, np.tile(starts, (len(group), 1)), steps, every), every
 
 
 def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
@@ -438,20 +457,13 @@ def initial_guesses(
     ]
     first = [push(law_of(problem)) for push in pushes]
 
-    def played(policy: Policy) -> tuple[Array, Array]:
-        thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
-        return task.costs(thetas, inputs), inputs
-
-    least, best = played(first[0])
-    cheaper: NDArray[np.bool_] = np.zeros(len(starts), dtype=bool)
     others = [push(lambda theta, K=K: theta @ K.T) for K in _gains(problem) for push in pushes]
-    for policy in (*first[1:], *others):
-        costs, inputs = played(policy)
-        won = costs < least
-        best[:, won] = inputs[:, won]
-        least = np.minimum(costs, least)
-        cheaper = cheaper | won
-    return [*first, lambda t, theta: best[t]] if cheaper.any() else first
+    played = [*_played(plant, task, [*first, *others], starts, steps, rows)]
+    costs = np.concatenate([task.costs(*pair) for *pair, _ in played]).reshape(-1, len(starts))
+    cheapest = np.argmin(costs, axis=0)
+    inputs = np.concatenate([each for _, each, _ in played], axis=1)
+    best = inputs[:, cheapest * len(starts) + np.arange(len(starts))]
+    return [*first, lambda t, _: best[t]] if cheapest.any() else first
 
 
 def _pushed(u: Array, until: int, law: Feedback) -> Policy:

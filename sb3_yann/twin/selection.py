@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from threading import Event
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ import torch as th
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import linalg, optimize
+from threadpoolctl import threadpool_limits
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from sb3_yann._progress import bar
@@ -126,12 +129,29 @@ class _Networks:
         return _network(self.weights, (z - self.center) / self.width) * self.unit
 
     def fit_steps(self, pairs: list[list[Array]], iterations: int) -> None:
-        """Fit them to single steps: each by itself, and on all rows, by L-BFGS."""
-        with bar("networks of a model", total=len(pairs) * iterations, timed=True) as doing:
-            for i, (z, y) in enumerate(pairs):
-                self._fit_steps(i, z, y, iterations, doing)
+        """Fit them to single steps: each by itself, side by side, on all rows, by L-BFGS."""
+        stopped = Event()
+        with (
+            bar("networks of a model", total=len(pairs) * iterations, timed=True) as doing,
+            ThreadPoolExecutor() as pool,
+        ):
 
-    def _fit_steps(self, i: int, z: Array, y: Array, iterations: int, doing: Any) -> None:
+            def done(_: Array) -> None:
+                doing.update()
+                if stopped.is_set():
+                    raise StopIteration
+
+            fits = [
+                pool.submit(self._fit_steps, i, z, y, iterations, done)
+                for i, (z, y) in enumerate(pairs)
+            ]
+            try:
+                for each in fits:
+                    each.result()
+            finally:
+                stopped.set()  # an interrupt does not wait for fits
+
+    def _fit_steps(self, i: int, z: Array, y: Array, iterations: int, done: Any) -> None:
         """Fit network i to pairs z (rows, k), y (rows, n)."""
         weights = [each.detach()[i].requires_grad_() for each in self.weights]
         rows = (self.tensor(z) - self.center[i]) / self.width[i]
@@ -146,14 +166,15 @@ class _Networks:
             slopes = th.autograd.grad(value, weights)
             return value.item(), parameters_to_vector(slopes).double().numpy()
 
-        found = optimize.minimize(
-            loss,
-            parameters_to_vector(weights).detach().double().numpy(),
-            jac=True,
-            method="L-BFGS-B",
-            options={"maxiter": iterations, "maxcor": CURVATURES, "ftol": 0.0},
-            callback=lambda _: doing.update(),
-        )
+        with threadpool_limits(1):  # of this thread
+            found = optimize.minimize(
+                loss,
+                parameters_to_vector(weights).detach().double().numpy(),
+                jac=True,
+                method="L-BFGS-B",
+                options={"maxiter": iterations, "maxcor": CURVATURES, "ftol": 0.0},
+                callback=done,
+            )
         vector_to_parameters(self.tensor(found.x), weights)
         for each, fitted in zip(self.weights, weights, strict=True):
             each.data[i] = fitted
