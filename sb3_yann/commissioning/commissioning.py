@@ -226,18 +226,20 @@ class Commissioning:
         violations = sum(each.violations for each in journal.episodes)
         of_policies = sum(each.violations for each in ours)
         more = self._size_of_batch()
+        moved = sum(each.excited for each in journal.episodes)
+        aside = f"; {moved} moved at random do not count in costs" if moved else ""
         return summary_lines(
             f"{journal.report()}\n{verdict}",
             **rows,
             violations=f"{of_policies} steps of policies, {violations - of_policies} of the MPC",
             steps=f"{every:,} of the plant in {len(journal.episodes)} episodes, {len(ours)} begun "
-            "by policies",
+            f"by policies{aside}",
             next=f"run(batches={len(self.batches) + 1}) plays {more} episodes more",
         )
 
     def _play(self, plant: Plant) -> None:
         journal = self.journal
-        unsafe = any(each.violations for each, by_policy in journal.batch if by_policy)
+        unsafe = any(each.unsafe for each, by_policy in journal.batch if by_policy)
         doubted = unsafe or journal.doubted or journal.cut_off >= 2
         trial = journal.accepted and not self.shadow
         number = len(journal.batch)
@@ -380,7 +382,13 @@ class Commissioning:
         log = [
             (units.to_plant(each.thetas), units.input_to_plant(each.actions)) for each in episodes
         ]
-        return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
+        return PlantTwin.fit(
+            self.policy.problem,
+            log,
+            observer=self.observer,
+            seed=seed,
+            progress_bar=self.progress_bar,
+        )
 
     @property
     def _first_bound(self) -> float:
@@ -500,7 +508,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
         return f"{journal.cut_off} episodes that it began never ended"
     if not played:
         return ""
-    if unsafe := sum(each.violations for each in played):
+    if unsafe := sum(each.unsafe for each in played):
         return f"it violated a limit in {unsafe} steps"
     if costs.longer:
         return costs.longer

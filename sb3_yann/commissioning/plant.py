@@ -34,11 +34,11 @@ class PlantEpisode:
 
     ``thetas`` (T + 1, n_theta) were measured, or estimated where that was not finite; ``actions``
     are (T, m), ``reward`` the plant's own, summed. ``violations`` counts steps with
-    ``info["violation"]`` or too large an excess over a hard bound, and an end that is no time
-    limit. After ``step`` the MPC took over because of ``alarm``, -1 where it did not. ``apart`` is
-    the largest distance of the policy's inputs from the MPC's, in input ranges, whichever of them
-    acted. Where it was ``excited`` random steps were added to the MPC's inputs: its cost is not the
-    MPC's.
+    ``info["violation"]`` or beyond a hard bound, and an end that is no time limit; ``unsafe``
+    those of them that were not allowed, see :meth:`Plant.play`. After ``step`` the MPC took over
+    because of ``alarm``, -1 where it did not. ``apart`` is the largest distance of the policy's
+    inputs from the MPC's, in input ranges, whichever of them acted. Where it was ``excited`` random
+    steps were added to the MPC's inputs: its cost is not the MPC's.
     """
 
     thetas: Array
@@ -49,6 +49,7 @@ class PlantEpisode:
     step: int
     apart: float
     excited: bool = False
+    unsafe: int = 0
 
     @property
     def usable_for_fitting(self) -> bool:
@@ -110,8 +111,8 @@ class Plant:
 
         Until then it is ``act``: :meth:`policy`, :meth:`mpc` or :meth:`excited_mpc`. Without a
         watchdog only violations and readings that are not finite are seen. The policy may exceed a
-        hard bound by the ``allowed`` half-widths: a violation that the plant reports is none where
-        its size is known, and allowed.
+        hard bound by the ``allowed`` half-widths, the MPC by any: what the plant reports alarms
+        nobody where its size is known, and allowed.
         """
         if watchdog is not None:
             watchdog.start(known)
@@ -119,6 +120,7 @@ class Plant:
         actions = list[Array]()
         reward = 0.0
         violations = 0
+        unsafe = 0
         apart = 0.0
         excited = act not in (self.policy, self.mpc)
         alarm = None
@@ -141,12 +143,13 @@ class Plant:
             excess = beyond.largest
             limit = allowed if act == self.policy else np.inf
             sized = EXCESS_ROOM < excess <= limit
-            reported = bool(info.get("violation", False)) and not sized
-            unsafe = reported or terminated or bool(excess > limit)
+            violated = bool(info.get("violation", False)) or terminated
+            forbidden = terminated or bool(excess > limit) or (violated and not sized)
             reward = reward + float(gained)
-            violations = violations + unsafe
+            violations = violations + (violated or bool(excess > EXCESS_ROOM))
+            unsafe = unsafe + forbidden
             if alarm is None:
-                why = "The plant reports a violation, or ends the episode." if unsafe else ""
+                why = "The plant reports a violation, or ends the episode." if forbidden else ""
                 if excess > limit:
                     names = BoundNames.of(self.problem)
                     why = f"On the plant {names.in_words(float(beyond.worst), float(excess))}."
@@ -163,7 +166,7 @@ class Plant:
                 raise RuntimeError(f"An episode of the plant did not end in {ENDLESS} steps.")
         passed.close()
         played = np.array(thetas), np.array(actions)
-        return PlantEpisode(*played, reward, violations, alarm, step, apart, excited)
+        return PlantEpisode(*played, reward, violations, alarm, step, apart, excited, unsafe)
 
     def _theta(self, observation: Any) -> Array:
         seen = normalized(self.model, observation)

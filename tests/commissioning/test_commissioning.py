@@ -216,7 +216,19 @@ def test_a_violation_takes_the_policy_back(begun) -> None:
     run.run(2)
     assert [k for k, each in enumerate(run.journal.by_policy) if each] == [turn]
     assert "taken back" in run.batches[1].reason
-    assert run.episodes[turn].violations == 1
+    assert run.episodes[turn].violations == run.episodes[turn].unsafe == 1
+
+
+def test_steps_of_the_mpc_beyond_a_bound_are_counted_and_alarm_nobody() -> None:
+    mpc = replace(problem(), x_max=[1.0, 3.0])
+    model = DDPG(YannPolicy, Cart(), policy_kwargs={"problem": mpc}, seed=0, device="cpu")
+    plant = Plant(Cart(), model)
+    seed = next(seed for seed in range(50) if plant.begin(seed)[0] > 1.3)
+    played = plant.play(plant.begin(seed), plant.mpc, None)
+    assert played.violations == np.sum(played.thetas[1:, 0] > 1.0)
+    assert played.violations > 0 == played.unsafe and played.alarm is None
+    ours = plant.play(plant.begin(seed), plant.policy, None, allowed=0.0)
+    assert ours.unsafe > 0 and ours.alarm.kind == "violation"
 
 
 def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:
@@ -298,7 +310,7 @@ def costs(more: float, error: float, pairs: int, look: int = 1) -> Costs:
 
 
 def test_a_policy_is_taken_back_where_it_surely_costs_more_or_shows_no_gain() -> None:
-    played = SimpleNamespace(violations=0, alarm=None)
+    played = SimpleNamespace(unsafe=0, alarm=None)
     journal = SimpleNamespace(batch=[(played, True)], cut_off=0)
     said = "it cost 10.3, the MPC in turns with it 10"
     assert said in why_taken_back(journal, costs(0.3, 0.15, 8))  # Student's t: 1.895
