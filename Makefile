@@ -8,7 +8,6 @@ STAMP := $(VENV)/.installed
 PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
 	$(PY) -m pytest -n logical --maxprocesses 4 --dist loadfile
 # python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
-# --no-compile halves the installation: of torch's files few are ever imported.
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
 CODE := sb3_yann envs benchmarks experiments examples tests noxfile.py docs/conf.py docs/pictures.py
@@ -77,7 +76,7 @@ $(STAMP): pyproject.toml constraints.txt
 		$(PYTHON) -m venv --clear $(VENV); }
 	@echo "installing into $(VENV), a few minutes the first time (torch is large) ..."
 	@$(PIP) install -c constraints.txt hatchling
-	@$(PIP) install -c constraints.txt --no-compile --no-build-isolation -e '.[dev]'
+	@$(PIP) install -c constraints.txt --no-build-isolation -e '.[dev]'
 	@echo "compiling the inner loops, half a minute ..."
 	@$(PY) -c 'from sb3_yann.networks._kernels import afterstate_value, yann_layer' & \
 		$(PY) -c 'from sb3_yann.control._kernels import online, polyhedra, sweep' & wait

@@ -263,7 +263,10 @@ def improve(
     Where the actor keeps the problem's bounds, and no ``bounds_margin`` was given, it keeps as far
     from them as the MPC's model errs in 95 % of the steps. The model ends with the policy that was
     accepted and a critic that is refitted to it, else as it was. It saves and goes on learning as
-    any other. Ctrl-C prints what was found so far, and leaves the model as it was.
+    any other. One that a twin taught has the twin's spaces: its file is loaded for another env by
+    ``DDPG.load(path, env=env, custom_objects={"observation_space": env.observation_space,
+    "action_space": env.action_space})``. Ctrl-C prints what was found so far, and leaves the model
+    as it was.
 
     Parameters
     ----------
@@ -610,8 +613,8 @@ class _Work:
         least = 2 * (FIRST_LOOK + ENOUGH)  # episodes beside the first: a round, and the pairs
         try:
             value_at_end(self.problem)  # raises where the law cannot rest: no plan could be made
-            simulator.begin(least)
             self.estimator = simulator.row.estimator
+            simulator.begin(least)
             self.keep_margin(simulator.row, simulator.episodes)
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
             trial = SimulatorTrial(simulator)

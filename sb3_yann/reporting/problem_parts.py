@@ -122,7 +122,7 @@ def constraints_part(subject: Subject) -> Part:
                 lower, upper = problem.limits_at(of, x[: len(values)])  # at run time
                 parts.append(values)
                 out = (values < lower[..., k] - room) | (values > upper[..., k] + room)
-                beyond += int(out.sum())
+                beyond += int(out[len(out) - len(u) :].sum())  # where it begins is no step
             values = np.concatenate(parts)
             row += [f"{number(np.nanmin(values))} to {number(np.nanmax(values))}", str(beyond)]
         rows.append(row)

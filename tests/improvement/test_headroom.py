@@ -412,10 +412,9 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
 @pytest.mark.nightly
 def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
     mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=Terminal())
-    two_rounds = {"n_starts": 2, "max_steps": 5700}
-    found = headroom(mpc, "ClippedPendulum-v0", seed=2021, **two_rounds)
-    assert found.mpc_costs[0] > 2000  # it hangs
-    assert found.best_costs[0] < 0.3 * found.mpc_costs[0]
+    found = headroom(mpc, "ClippedPendulum-v0", n_starts=12)
+    hangs = found.mpc_costs > 2000
+    assert np.any(found.best_costs[hangs] < 0.3 * found.mpc_costs[hangs])
     assert found.verdict == "learn"  # no linear model says so, and an observer does not help
     assert found.nonlinearity == pytest.approx(found.total)
     assert "improve(mpc, make, max_steps=60_000)" in found.report()

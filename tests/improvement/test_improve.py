@@ -320,6 +320,7 @@ def test_an_observer_is_a_part_of_the_model_and_of_its_export(monkeypatch, tmp_p
     assert found.steps > 0 and found.checks
     assert found.accepted != (bits(model) == before)
     assert not found.export(tmp_path / "controller.npz").note  # it lacks nothing
+    assert improve(model, make, max_steps=30).estimator is not None  # nor where nothing is learnt
 
 
 class Short(Spring):

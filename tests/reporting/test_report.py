@@ -256,7 +256,8 @@ def test_inputs_beyond_a_bound_at_run_time_fail(monkeypatch) -> None:
         tank, Q=[[1]], R=[[1]], horizon=3, x_min=0, x_max=20, u_min=0, u_max=10,
         parametric_bounds=["u_max"],
     )  # fmt: skip
-    env = PlantEnv(lambda x, u: 0.1 * (15 - x) + 0.5 * (u - 3) - 0.3, mpc, max_episode_steps=20)
+    outside = {"start_low": 20.3, "start_high": 20.4, "max_episode_steps": 20}  # no step is
+    env = PlantEnv(lambda x, u: 0.1 * (15 - x) + 0.5 * (u - 3) - 0.3, mpc, **outside)
     model = DDPG("YannPolicy", env, policy_kwargs={"problem": mpc, "keep_bounds": False})
     layer = model.actor.mu
     text = "Inputs leave their bounds at random points of the box of parameters."
@@ -266,9 +267,11 @@ def test_inputs_beyond_a_bound_at_run_time_fail(monkeypatch) -> None:
         assert (text in [each.text for each in part.findings]) is not keeps
         for room in (2.0, 1e-3):  # half-widths that do not count
             monkeypatch.setattr(problem_parts, "EXCESS_ROOM", room)
-            register = str(problem_parts.constraints_part(subject).content).split("</tr>")[1]
-            beyond = re.findall(r"<td[^>]*>(\d+)</td>", register)
-            assert (beyond[-1] == "0") is (keeps or room > 1)  # of the input, in closed loops
+            rows = str(problem_parts.constraints_part(subject).content).split("</tr>")[1:]
+            of_u, of_x = (re.findall(r"<td[^>]*>(\d+)</td>", row)[-2:] for row in rows[:2])
+            assert of_x == ["0", "0"] and (of_u[-1] == "0") is (
+                keeps or room > 1
+            )  # of the input, in closed loops
         # a layer without them, and with another law
         layer.moving = None
         layer.rated = False
