@@ -416,7 +416,7 @@ def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
     hangs = found.mpc_costs > 2000
     assert np.any(found.best_costs[hangs] < 0.3 * found.mpc_costs[hangs])
     assert found.verdict == "learn"  # no linear model says so, and an observer does not help
-    assert found.nonlinearity == pytest.approx(found.total)
+    assert found.nonlinearity > 0.95 * found.total
     assert "improve(mpc, make, max_steps=60_000)" in found.report()
 
 
