@@ -224,19 +224,14 @@ def roll_out(
 
     It begins at ``starts`` (k, n_theta); ``rows`` (k,) are their numbers, as the plant knows them.
     """
-    problem = task.problem
+    m = task.problem.model.n_inputs
+    limits = task.problem.deviations.input_range
 
     def act(t: int, theta: Array) -> Array:
         u = policy(t, theta)
-        return np.clip(np.where(np.isnan(u), 0.0, u), *problem.deviations.input_range(theta))
+        return np.clip(np.where(np.isnan(u), 0.0, u), *limits(theta))
 
-    return play(
-        act,
-        lambda t, theta, u: plant.step(theta[t], u[t], rows),
-        starts,
-        steps,
-        problem.model.n_inputs,
-    )
+    return play(act, lambda t, theta, u: plant.step(theta[t], u[t], rows), starts, steps, m)
 
 
 @dataclass(frozen=True)

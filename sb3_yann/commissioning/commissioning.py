@@ -162,7 +162,8 @@ class Commissioning:
         self.largest: float = record.events[0].get("largest", bound) if record.events else bound
         begin = {**self._settings, "largest": self.largest}
         self.journal = Journal(record, begin, CommissioningState(self._first_bound))
-        self._restore(self.journal.state)
+        with shown(self.progress_bar):
+            self._restore(self.journal.state)
 
     @property
     def batches(self) -> list[Batch]:
@@ -382,13 +383,7 @@ class Commissioning:
         log = [
             (units.to_plant(each.thetas), units.input_to_plant(each.actions)) for each in episodes
         ]
-        return PlantTwin.fit(
-            self.policy.problem,
-            log,
-            observer=self.observer,
-            seed=seed,
-            progress_bar=self.progress_bar,
-        )
+        return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
 
     @property
     def _first_bound(self) -> float:

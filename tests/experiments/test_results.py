@@ -123,10 +123,8 @@ def catalog(monkeypatch, tmp_path):
 def test_the_command_writes_its_report(catalog, tmp_path, capsys) -> None:
     assert main(["--jobs", "1", "--results", "here.sqlite"]) == 0
     assert "docs/results.md" in capsys.readouterr().out
-    assert (
-        '`make paper ARGS="--jobs 1 --results here.sqlite"`'
-        in (tmp_path / "docs/results.md").read_text()
-    )
+    page = (tmp_path / "docs/results.md").read_text()
+    assert '`make paper ARGS="--jobs 1 --results here.sqlite"`' in page
     assert main(["--quick", "--jobs", "1", "--only", "cstr / (MPC|optimum)"]) == 0
     assert (tmp_path / "out/paper-quick/results.md").exists()
     assert "2 of 3 runs" in capsys.readouterr().out

@@ -412,11 +412,11 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
 @pytest.mark.nightly
 def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
     mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=Terminal())
-    found = headroom(mpc, "ClippedPendulum-v0", n_starts=12)
+    found = headroom(mpc, "ClippedPendulum-v0")  # with few starts roundings decide
     hangs = found.mpc_costs > 2000
-    assert np.any(found.best_costs[hangs] < 0.3 * found.mpc_costs[hangs])
-    assert found.verdict == "learn"  # no linear model says so, and an observer does not help
-    assert found.nonlinearity > 0.95 * found.total
+    much = 0.3 * found.mpc_costs[hangs]
+    assert np.any(found.best_costs[hangs] < much) and found.verdict == "learn"
+    assert np.all(np.minimum(found.observer_costs, found.reidentified_costs)[hangs] > much)
     assert "improve(mpc, make, max_steps=60_000)" in found.report()
 
 

@@ -68,9 +68,8 @@ def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str, gamma: 
     slope = -2 * z @ solved(name).state_action_terms(gamma).P
     scale = np.concatenate([np.ones(law.n_theta), (law.u_max - law.u_min) / 2])
     expected = (slope * scale)[:, law.n_theta :]
-    np.testing.assert_allclose(
-        rows.grad.numpy()[:, law.n_theta :], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max()
-    )
+    slopes = rows.grad.numpy()[:, law.n_theta :]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
 @EVERY_PROBLEM

@@ -256,7 +256,7 @@ def test_inputs_beyond_a_bound_at_run_time_fail(monkeypatch) -> None:
         tank, Q=[[1]], R=[[1]], horizon=3, x_min=0, x_max=20, u_min=0, u_max=10,
         parametric_bounds=["u_max"],
     )  # fmt: skip
-    outside = {"start_low": 20.3, "start_high": 20.4, "max_episode_steps": 20}  # no step is
+    outside = {"start_low": 20.3, "start_high": 20.4, "max_episode_steps": 20}
     env = PlantEnv(lambda x, u: 0.1 * (15 - x) + 0.5 * (u - 3) - 0.3, mpc, **outside)
     model = DDPG("YannPolicy", env, policy_kwargs={"problem": mpc, "keep_bounds": False})
     layer = model.actor.mu
@@ -269,9 +269,8 @@ def test_inputs_beyond_a_bound_at_run_time_fail(monkeypatch) -> None:
             monkeypatch.setattr(problem_parts, "EXCESS_ROOM", room)
             rows = str(problem_parts.constraints_part(subject).content).split("</tr>")[1:]
             of_u, of_x = (re.findall(r"<td[^>]*>(\d+)</td>", row)[-2:] for row in rows[:2])
-            assert of_x == ["0", "0"] and (of_u[-1] == "0") is (
-                keeps or room > 1
-            )  # of the input, in closed loops
+            assert of_x == ["0", "0"]  # it begins beyond, and is within after a step
+            assert (of_u[-1] == "0") is (keeps or room > 1)  # in closed loops
         # a layer without them, and with another law
         layer.moving = None
         layer.rated = False
@@ -422,9 +421,8 @@ def test_a_policy_that_was_changed_after_improve_fails(improved) -> None:
             each.add_(0.01)
     (finding,) = evidence_parts.improve_part(subject_of(changed)).findings
     assert finding.verdict == "failed" and "changed since" in finding.text
-    assert (
-        "nothing has confirmed" in evidence_parts.guard_part(subject_of(changed)).findings[0].text
-    )
+    found = evidence_parts.guard_part(subject_of(changed)).findings
+    assert "nothing has confirmed" in found[0].text
     back = copy.deepcopy(improved[0])
     with th.no_grad():
         for each in back.policy.actor.mu.network.parameters():
@@ -542,10 +540,8 @@ def test_starts_that_the_guard_knows_are_named() -> None:
     known = subject_of(model, guard=guard, seeds=range(999_995, 1_000_003))
     text = evidence_parts.loops_part(known).content
     assert "3 of these starts are known to the guard" in text
-    assert (
-        "known to the guard"
-        not in evidence_parts.loops_part(subject_of(model, guard=guard)).content
-    )
+    loops = evidence_parts.loops_part(subject_of(model, guard=guard))
+    assert "known to the guard" not in loops.content
 
 
 def test_starts_of_the_mpc_itself_need_no_rows_and_those_of_a_policy_are_counted() -> None:

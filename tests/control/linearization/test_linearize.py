@@ -327,9 +327,8 @@ def test_an_episode_that_is_over_is_begun_anew_before_its_state_is_set(ends: boo
 def test_the_notes_tell_what_was_solved_for_and_what_is_observed() -> None:
     model = LinearModel.from_env(settling(), x_ss=[np.nan], u_ss=[0.4])
     assert model.x_ss == pytest.approx([0.2])
-    assert any(
-        "Of the 2 entries of the operating point, 1 were solved for" in n for n in model.notes
-    )
+    said = "Of the 2 entries of the operating point, 1 were solved for"
+    assert any(said in n for n in model.notes)
     assert not any("observation is not this state" in n or "terminates" in n for n in model.notes)
     assert model.dt == 0.1 and model.n_disturbances == 0
 

@@ -263,9 +263,8 @@ def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
     M = mpc.state_action_terms(0.9).P
     following = mpc.predict(theta, u)
     value = np.einsum("bi,ij,bj->b", following, mpc.value_matrix(0.9), following)
-    np.testing.assert_allclose(
-        np.einsum("bi,ij,bj->b", z, M, z), form + 0.9 * value, rtol=1e-9, atol=1e-9
-    )
+    found = np.einsum("bi,ij,bj->b", z, M, z)
+    np.testing.assert_allclose(found, form + 0.9 * value, rtol=1e-9, atol=1e-9)
 
 
 def test_stage_cost_is_the_formula() -> None:
