@@ -75,8 +75,8 @@ $(STAMP): pyproject.toml constraints.txt
 		echo "creating $(VENV) with $$($(PYTHON) --version) ..."; \
 		$(PYTHON) -m venv --clear $(VENV); }
 	@echo "installing into $(VENV), a few minutes the first time (torch is large) ..."
-	@$(PIP) install -c constraints.txt hatchling
-	@$(PIP) install -c constraints.txt --no-build-isolation -e '.[dev]'
+	@$(PIP) install --no-compile -c constraints.txt hatchling
+	@$(PIP) install --no-compile -c constraints.txt --no-build-isolation -e '.[dev]'
 	@echo "compiling the inner loops, half a minute ..."
 	@$(PY) -c 'from sb3_yann.networks._kernels import afterstate_value, yann_layer' & \
 		$(PY) -c 'from sb3_yann.control._kernels import online, polyhedra, sweep' & wait
