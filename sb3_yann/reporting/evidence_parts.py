@@ -79,10 +79,9 @@ def loops_part(subject: Subject) -> Part:
     ):
         rows.append([name, str(before), str(after), f"{after - before:+d}"])
     first = subject.seeds[0]
-    last = subject.seeds[-1]
     count = len(subject.seeds)
     is_range = count > 2 and subject.seeds == (*range(first, first + count),)
-    seeds = f"{first} to {last}" if is_range else ", ".join(map(str, subject.seeds))
+    seeds = f"{first} to {subject.seeds[-1]}" if is_range else ", ".join(map(str, subject.seeds))
     cost = "the sum of the MPC's stage cost: the env gives no reward."
     if is_rewarded(loops):
         cost = "minus the sum of the rewards."
@@ -93,6 +92,7 @@ def loops_part(subject: Subject) -> Part:
     )
     if _in_twin(subject):
         how += " The env is a twin, fitted to the plant's log: the plant has played none of them."
+        how += " To leave what the log shows is a violation there."
     state = subject.state
     known = set() if state is None else {*state.evidence.starts.seeds} & {*subject.seeds}
     warning = (

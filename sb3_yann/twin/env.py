@@ -197,10 +197,11 @@ class Limits:
         limited = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max))
         return cls(coordinates.row, bounded - room, limited + room)
 
-    def violated(self, thetas: Array) -> NDArray[np.bool_]:
-        """Return whether states lie beyond, for rows (..., size); NaN does."""
+    def violated(self, thetas: Array, room: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether states lie beyond by some half-widths, for rows (..., size); NaN does."""
         x = thetas[..., self.row.state]
-        return np.asarray(~((x >= self.low) & (x <= self.high)).all(axis=-1))
+        more = room * self.row.problem.theta_half[: len(self.low)]
+        return np.asarray(~((x >= self.low - more) & (x <= self.high + more)).all(axis=-1))
 
 
 def _planned(coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
@@ -322,15 +323,14 @@ class TwinEnv(gym.Env[Single, Single]):
             after[row.given] = self._episode.thetas[self._steps, row.given]
         self._theta = after
         beyond = bound_excess(problem, row.shown(np.array([before, after])), u[None])
-        excess = float(beyond.largest)
+        left = bool(self.model.limits.violated(after, EXCESS_ROOM))
         theta = units.to_plant(row.shown(after))
         cost = float(problem.stage_cost(row.shown(before), u))
         info = {
             "cost": cost,
-            "violation": bool(self.model.limits.violated(after)) or excess > EXCESS_ROOM,
-            "excess": excess,
+            "violation": left or bool(beyond.largest > EXCESS_ROOM),
+            "excess": float(beyond.largest),
             "penalty": float(beyond.penalty),
             "state": theta,
         }
-        over = self._steps >= len(self._episode)
-        return theta.astype(np.float32), -cost, False, over, info
+        return theta.astype(np.float32), -cost, False, self._steps >= len(self._episode), info

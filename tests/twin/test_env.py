@@ -6,10 +6,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG
 
-from general_problems import servo, solved
+from general_problems import level, servo, solved
+from sample_plants import LinearPlant
 from sb3_yann import ImprovementGuard, LinearMPC, NoActionNoise, PlantTwin, SoftBounds, YannPolicy
+from sb3_yann.compare import EXCESS_ROOM
+from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.env import Limits, Starts
 from sb3_yann.twin.log import Episode
@@ -25,13 +29,14 @@ def test_it_is_an_env_with_the_plant_s_spaces() -> None:
     assert env.observation_space.problem == problem()
 
 
-def test_an_episode_is_that_of_a_member_costs_the_stage_cost_and_is_as_long_as_the_log_s() -> None:
+def test_an_episode_is_its_seed_s_member_s_costs_the_stage_cost_and_is_as_long_as_logged() -> None:
     found = twin()
     env = found.env()
     steps = 0
     over = False
+    np.testing.assert_array_equal(env.reset(seed=5)[0], env.reset(seed=5)[0])
+    assert [env.reset(seed=k)[1]["member"] for k in range(7)] == [0, 1, 2, 3, 4, 0, 1]
     _, info = env.reset(seed=8)
-    assert info["member"] == 3
     while not over:
         before = info["state"]
         u = np.float32([np.sin(steps)])
@@ -41,22 +46,6 @@ def test_an_episode_is_that_of_a_member_costs_the_stage_cost_and_is_as_long_as_t
         np.testing.assert_allclose(info["state"], expected, rtol=1e-12, atol=1e-12)
         steps += 1
     assert steps == 60 and not terminated
-
-
-def test_seeds_name_the_members_and_repeat_an_episode() -> None:
-    env = twin().env()
-    assert [env.reset(seed=k)[1]["member"] for k in range(7)] == [0, 1, 2, 3, 4, 0, 1]
-    np.testing.assert_array_equal(env.reset(seed=5)[0], env.reset(seed=5)[0])
-    given = env.reset(options={"state": [0.3, -0.2]})[0]
-    np.testing.assert_allclose(given, [0.3, -0.2], rtol=1e-6)
-
-
-@pytest.mark.parametrize("action", [[np.nan], [0.0, 0.0]])
-def test_an_action_that_is_none_is_refused(action) -> None:
-    env = twin().env()
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="finite numbers"):
-        env.step(np.array(action))
 
 
 def test_a_model_trains_in_it_under_a_guard_that_plays_every_member() -> None:
@@ -120,6 +109,9 @@ def test_an_episode_may_begin_where_it_is_asked_to() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(options={"state": given})
+    for action in ([np.nan], [0.0, 0.0]):
+        with pytest.raises(ValueError, match="finite numbers"):
+            env.step(np.array(action))
     with pytest.raises(gym.error.ResetNeeded):
         found.env().step(np.zeros(1))
 
@@ -163,3 +155,11 @@ def test_hard_bounds_cut_the_limits_and_soft_ones_do_not() -> None:
     found = limits_of(soft)
     np.testing.assert_allclose(found.low, [-0.4, -0.5], atol=1e-7)
     np.testing.assert_allclose(found.high, [0.3, 1.9], atol=1e-7)
+    tank = level()
+    law = tank.explicit()
+    plant = TimeLimit(LinearPlant(tank, np.array([1.0, 1.8])), 20)  # to the bound, and beyond it
+    env = PlantTwin.fit(tank, evaluate(law, plant, range(6)).pairs, residuals=["none"]).env()
+    for push, half_widths in ((3e-4, 5e-4), (3e-3, 5e-3)):  # of which 1e-3 are no violation
+        played = evaluate(lambda theta, push=push: law(theta) + push, env, range(6))
+        assert max(each[:, 0].max() for each in played.observations) > 1 + 0.9 * half_widths
+        assert played.violations.any() == (half_widths > EXCESS_ROOM)
