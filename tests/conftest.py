@@ -35,6 +35,14 @@ def same_initial_weights() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let fits of models and policies be short."""
+    from improvement_samples import quick
+
+    quick(monkeypatch)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     config.option.loadscopereorder = False  # pytest-xdist would begin with files of many tests
 

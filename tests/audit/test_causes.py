@@ -34,6 +34,7 @@ from sb3_yann.improvement.simulator import of_law
 from sb3_yann.rollout import rollout
 from sb3_yann.wrappers.theta import SetPoint, below
 
+pytestmark = pytest.mark.usefixtures("brisk")
 MPC = two_input_mpc()
 
 

@@ -27,6 +27,7 @@ from sb3_yann.rollout import rollout
 from sb3_yann.wrappers import EstimateState, StageCost
 from sb3_yann_envs import problems
 
+pytestmark = pytest.mark.usefixtures("brisk")
 A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.2], [0.1, 0.0, 0.5]])
 BOX = {"theta_min": -9, "theta_max": 9}
 MODEL = LinearModel(A, [[0], [0], [1]], dt=1.0, state_names=["a", "b", "c"])

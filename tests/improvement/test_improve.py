@@ -40,12 +40,8 @@ from weights import is_mpc
 UNSEEN = range(900, 930)
 SIMULATED = {kind: {"simulator": True} for kind in (SAC, TQC, PPO)}
 NIGHTLY = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("brisk")
 module = importlib.import_module("sb3_yann.improvement.improving")
-
-
-@pytest.fixture(autouse=True)
-def brisk(monkeypatch) -> None:
-    quick(monkeypatch)
 
 
 @cache

@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from improvement_samples import FEW, Spring, bits, model_of, quick
+from improvement_samples import FEW, Spring, bits, model_of
 from sb3_yann import improve
 from sb3_yann.improvement.simulator import Excited, OutOfStepsError, Simulator, of_law
 
 SEEDS = range(5)
-
-
-@pytest.fixture(autouse=True)
-def brisk(monkeypatch) -> None:
-    quick(monkeypatch)
+pytestmark = pytest.mark.usefixtures("brisk")
 
 
 def same(ours, theirs) -> bool:

@@ -13,7 +13,7 @@ from sb3_yann import LinearModel, LinearMPC, PlantTwin, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import plant_twin
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.forecast import REMEMBERED, Forecast, _cure, _Replays
+from sb3_yann.twin.forecast import REMEMBERED, Forecast, _changed, _cure, _Replays
 from sb3_yann.twin.trust import costs_of
 from sb3_yann_envs import ProblemBox
 from twin_samples import POLYNOMIALS, problem
@@ -85,6 +85,12 @@ def test_the_truth_lies_within_the_interval() -> None:
         after = evaluate(lambda x, act=act: act(x[None])[0], lambda: copy.copy(plant), seeds).costs
         _, low, high, _ = found.forecast(act)
         assert low <= after.sum() / before.sum() - 1 <= high and high - low < 0.2
+
+
+def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> None:
+    for more, sure in (([-0.3, -0.03, 0, 0, 1e-3], True), ([-0.3, 0.03, 0.1, 0.1, 1e-3], False)):
+        mean, low, high = _changed(np.ones((5, 5)), 1 + np.array([more] * 5), 5)
+        assert (high < 0) == sure and min(more) < low < mean < high < max(more)
 
 
 def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
