@@ -235,7 +235,8 @@ def execute(seed: int, how: str) -> Row:
         found = improve(mpc, twin, rounds=1, n_starts=20, updates=400)
     spent = time.perf_counter() - began
     true = true_change(found.model, mpc, make) if found.accepted else 0.0
-    low, high = found.interval
+    known = [each.interval for each in found.checks if each.interval is not None]
+    low, high = known[-1] if known else (-np.inf, np.inf)
     return Row(
         seed, how, hidden, len(log), True, found.accepted, found.change, low, high, true, spent,
         found.reason, *first

@@ -151,8 +151,7 @@ class Trial:
         for number, each in enumerate(episodes):
             rows = each.thetas[np.minimum(np.arange(self.steps), len(each)), part]
             self.given[:, self.follow == number] = rows[:, None]
-        self._law = law_of(self.twin.problem)
-        runs = self._run(self._law)
+        runs = self._run(law_of(self.twin.problem))
         self.rows = runs[0]
         self.far = np.nan_to_num(self._beyond(self.rows), nan=np.inf)
         self.mpc = self._outcome(*runs)
@@ -197,23 +196,31 @@ class Trial:
         known = self.known
         mean = self.mean
         excess = costs - self.mpc[0]
-        safe = not np.any(less_safe(unsafe, self.mpc[1]))
+        less = less_safe(unsafe, self.mpc[1]).any(axis=1)
         policy, mpc = (Scores(c[known], u[known]) for c, u in (played, self.mpc))
         allowed_more = RULE.tolerance(self.mpc[0][known], BoundNames.of(self.twin.problem))
         reason = no_worse(policy, mpc, mpc, allowed_more).reason
         logged, error = self._as_logged(excess)
         if not reason and not logged <= 0:
             reason = f"episodes like the log's cost {100 * logged / mean:.2g} % more"
-        if not reason and not safe:
-            reason = "a start outside the log breaks a bound of the problem"
+        if not reason and less.any():
+            worst = int(np.argmax(np.where(less, unsafe[:, LARGEST_EXCESS], -1)))
+            broken = allowed_more.exceeded(Scores(*played), worst) or "the cost is not finite"
+            reason = f"outside the log, from {self._in_words(worst)}, {broken}"
         beyond = (excess - self.room())[~known]
         if not reason and not np.all(beyond <= 0):
             more = 100 * excess[~known][np.argmax(beyond)] / mean
             reason = f"a start outside the log costs {more:.3g} % of the mean cost more"
-        change = float(excess[known].mean())
-        worst = float(excess[known].max())
-        shown = change / mean, worst / mean, safe, logged / mean, error / mean
-        return Check(iteration, not reason, reason, *shown)
+        shown = float(excess[known].mean()) / mean, float(excess[known].max()) / mean
+        of_log = logged / mean, error / mean
+        return Check(iteration, not reason, reason, *shown, not less.any(), *of_log)
+
+    def _in_words(self, start: int) -> str:
+        """Return theta of one of all starts, in plant units."""
+        problem = self.twin.problem
+        theta = self.twin.dynamics.row.shown(self.starts.reshape(-1, self.starts.shape[-1])[start])
+        values = zip(problem.labels(units=True), problem.units.to_plant(theta), strict=True)
+        return ", ".join(f"{name} = {value:.3g}" for name, value in values)
 
     def _as_logged(self, excess: Array) -> tuple[float, float]:
         """Return the mean of the starts that go on as the log does, and its standard error.
@@ -278,6 +285,12 @@ class Trial:
 FIRST_LOOK = 10  # pairs of a trial between rounds
 LOOKS = looks(FIRST_LOOK, 80)  # pairs after which it is decided, or more are played
 ENOUGH = 40  # pairs that an acceptance takes: the worst 5 % of the starts are two of them
+TRIES = 3  # confirmations of a policy that is taught what it has lost
+
+
+def most_episodes(rounds: int = 4) -> int:
+    """Return how many episodes `improve` may play beside its first: of all rounds and tries."""
+    return FIRST_LOOK * (rounds + 1) + 2 * LOOKS[-1] * (TRIES + 1)
 
 
 class SimulatorTrial(PairedTrial):

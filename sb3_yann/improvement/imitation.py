@@ -367,13 +367,11 @@ def fit_layer(
     Rows that are not finite are left out. The networks go on from where they are.
     """
     low = problem.deviations.u_min
-    half = problem.u_half
-    wanted = np.clip((inputs - low) / half - 1, -1, 1)
+    wanted = np.clip((inputs - low) / problem.u_half - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
     wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
-    to = th.as_tensor(wanted[finite], dtype=th.float32)
-    _fit(layer, at, to, HUBER, rng, updates)
+    _fit(layer, at, th.as_tensor(wanted[finite], dtype=th.float32), HUBER, rng, updates)
 
 
 def _fit(

@@ -31,10 +31,12 @@ from sb3_yann.improvement.confirmation import (
     ENOUGH,
     FIRST_LOOK,
     LOOKS,
+    TRIES,
     Check,
     SimulatorTrial,
     Trial,
     confirm,
+    most_episodes,
 )
 from sb3_yann.improvement.imitation import Teacher, controller_of, imitate, policy_of, refit_critic
 from sb3_yann.improvement.simulator import (
@@ -67,7 +69,6 @@ RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it 
 PROMISED = 0.95  # share of a gain in the model that the simulator must show from the same starts
 LITTLE_MORE = 0.02  # share of a gain by which another round must raise it
 OTHERS = 9  # scenarios beside each that is planned, in which a policy shows what it has not learnt
-TRIES = 3  # confirmations of a policy that is taught what it has lost
 
 Weights = dict[str, th.Tensor]
 
@@ -87,7 +88,7 @@ class Improvement:
     checks : tuple of Check
         The comparisons of candidates with the MPC, in the twin or in the simulator.
     change : float
-        The accepted policy's mean cost there against the MPC's: -0.02 is 2 % less.
+        The accepted policy's mean cost there against the MPC's: -0.02 is 2 % less, 0 without one.
     accepted : bool
         Whether a policy passed. If none did, the model is as it was.
     before : Check, optional
@@ -135,12 +136,14 @@ class Improvement:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Where the last policy's change lies with 90 %: in the simulator, or on a twin's plant.
+        """Where ``change`` lies with 90 %: in the simulator, or on a twin's plant.
 
-        Ends are fractions of the MPC's mean cost: -0.02 is 2 % less. They are infinite where no
-        policy came so far that its change was estimated.
+        Ends are fractions of the MPC's mean cost: -0.02 is 2 % less. Both are 0 where nothing was
+        accepted; what was refused has its own in ``checks``.
         """
-        known = [each.interval for each in self.checks if each.interval is not None]
+        if not self.accepted:
+            return 0.0, 0.0
+        known = [each.interval for each in self.checks if each.accepted and each.interval]
         return known[-1] if known else (-np.inf, np.inf)
 
     def export(self, path: str | PathLike[str], **options: Any) -> Exported:
@@ -173,8 +176,8 @@ class Improvement:
         if not self.accepted:
             said = f"{self.reason} The model is as it was."
             last = self._last
-            change = f"{self._change(last.change, last)}: not accepted" if last else ""
-            return summary_lines(said, change=change, steps=steps, next=self._next())
+            refused = f"a candidate, {self._change(last.change, last)}" if last else ""
+            return summary_lines(said, refused=refused, steps=steps, next=self._next())
         last = self._accepted
         rows = {"change": self.change_in_words}
         if last is not None:
@@ -183,8 +186,7 @@ class Improvement:
             rows["violations"] = "no more than the MPC's" if last.safe else "more than the MPC's"
             if last.mpc_exceeds:
                 rows["violations"] += f"; that exceeds a hard bound from {last.mpc_exceeds} starts"
-        which = "twin=twin" if source == "twin" else "env=env"
-        more = f'report(result.model, "report.html", {which}), then '
+        more = f'report(result.model, "report.html", {source}={source}), then '
         more += "Commissioning(result.model, plant, shadow=True)"
         said = "Accepted: a better policy."
         if self.model is not None:
@@ -216,8 +218,7 @@ class Improvement:
             low, high = (100 * each for each in interval)
             return f"{found}; on the plant {low:+.2f} to {high:+.2f} % (90 %)"
         found = f"{change_in_percent(change, interval)} {cost} in the simulator"
-        starts = check.starts_in_words if check else ""
-        return found + f", from {starts}" * bool(starts)
+        return found + (f", from {check.starts_in_words}" if check and check.starts else "")
 
     def _next(self) -> str:
         """Return what leads on after a refusal."""
@@ -372,8 +373,7 @@ def improve(
             raise
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}
-    prints = fingerprint(policy.actor.state_dict())
-    found = replace(found, settings=settings, policy=prints)
+    found = replace(found, settings=settings, policy=fingerprint(policy.actor.state_dict()))
     record: Any = model
     record.improvements = (*getattr(model, "improvements", ()), found)
     return replace(found, model=model, estimator=work.estimator)
@@ -632,8 +632,7 @@ class _Work:
                 accepted = self._confirm(simulator, model, best)
         except OutOfStepsError:
             note = f"max_steps = {max_steps:,} are too few to go on, {simulator.steps:,} are taken"
-            most = FIRST_LOOK * (self.rounds + 1) + 2 * LOOKS[-1] * (TRIES + 1)
-            needed = simulator.needed(most)
+            needed = simulator.needed(most_episodes(self.rounds))
             counts = f"; at best {simulator.needed(least):,}, for all rounds and tries {needed:,}"
             endless = ": an episode takes more, or has no end: wrap the env in a TimeLimit"
             note += f"{counts} are needed" if needed else endless
@@ -662,8 +661,7 @@ class _Work:
         others = [simulator.episodes[i] for i in drawn]
         midway = len(others) // 2
         scenarios = Scenarios.like(model, chosen + others, self.rng, midway)
-        usual = len(scenarios) - midway
-        teacher = Teacher(scenarios, self.seed + number, len(chosen), usual)
+        teacher = Teacher(scenarios, self.seed + number, len(chosen), len(scenarios) - midway)
         teacher.show(self.act() if number else None)
         return model, teacher
 

@@ -21,6 +21,7 @@ from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, o
 from sb3_yann.control.mpc.augmented import SHARE
 from sb3_yann.env_pool import Source, maker
 from sb3_yann.evaluation import change_in_percent, paired_rows, summary_lines
+from sb3_yann.improvement.confirmation import most_episodes
 from sb3_yann.improvement.simulator import (
     OutOfStepsError,
     Simulator,
@@ -97,7 +98,7 @@ class Headroom:
     reidentified : LinearMPC, optional
         The same MPC with a model that these episodes, or a twin's log, tell.
     budget : int
-        Steps of the env that `improve` is likely not to exceed; 0 in a twin.
+        Steps of the env that suffice `improve` for all rounds and tries; 0 in a twin.
     unplanned : int
         Starts from which no plan was played: steps were too few, or Ctrl-C came.
     why : dict of str to str
@@ -250,9 +251,6 @@ ROUNDS = 4  # how often a model is fitted and planned in, at most
 LEFT = 0.05  # half-widths from its plan at which an MPC has a random plant again: see `Planning`
 KEPT = 1e-3
 """A plan is played anew where the plant broke its promise by so much of the MPC's mean cost."""
-
-EPISODES_OF_IMPROVE = 300
-"""Episodes that `improve` takes at most by default: 120 to 290 on the plants of the tables."""
 
 
 def headroom(
@@ -528,8 +526,7 @@ class _Search:
         whole = Headroom(base, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
         if verdict == [*ADVICE][1]:  # where it loses from some starts, others may bring less
-            by_observer = dataclasses.replace(whole, best_costs=observer)
-            if not offset > SURE * by_observer.standard_error:
+            if not offset > SURE * dataclasses.replace(whole, best_costs=observer).standard_error:
                 verdict = UNKNOWN
         lost = -gain(base, self.played.get("plan", base)) if self.poor else 0.0
         unplanned = int(np.count_nonzero(~self.planned))
@@ -544,7 +541,7 @@ class _Search:
             steps=self.simulator.steps,
             note=note,
             reidentified=self.reidentified,
-            budget=EPISODES_OF_IMPROVE * int(self.base.lengths.max()) if self.twin is None else 0,
+            budget=self.simulator.needed(most_episodes()) if self.twin is None else 0,
             unplanned=unplanned,
             why=self.why,
         )
@@ -586,8 +583,7 @@ class Observing:
             self.u = np.zeros((len(x), self.other.model.n_inputs))
             found = [each.reset(y) for each, y in zip(self.observers, x, strict=True)]
         else:
-            pairs = zip(rows, x, strict=True)
-            found = [self.observers[i].update(y, self.u[i]) for i, y in pairs]
+            found = [self.observers[i].update(y, self.u[i]) for i, y in zip(rows, x, strict=True)]
         x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
         d = np.clip(d_hat, bounds.d_min, bounds.d_max)
         rest = theta[:, layout.limits], theta[:, layout.previous]

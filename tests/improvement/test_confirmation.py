@@ -102,8 +102,7 @@ def test_what_is_not_sure_after_forty_is_asked_twice_as_many() -> None:
 
 
 def test_starts_that_the_mpc_cannot_finish_are_left_out_and_do_not_count() -> None:
-    simulator = Fake(gains(0.2, 0.001), lost=lambda seeds: seeds % 8 == 3)
-    found, pairs = looked(simulator)
+    found, pairs = looked(Fake(gains(0.2, 0.001), lost=lambda seeds: seeds % 8 == 3))
     assert found.accepted and len(pairs.starts.seeds) >= ENOUGH
     assert not any(seed % 8 == 3 for seed in pairs.starts.seeds)
     assert np.isfinite(pairs.starts.mpc.costs).all() and np.isfinite(pairs.scores.costs).all()

@@ -24,6 +24,7 @@ from sb3_yann import (
     Tracking,
     UntrustedTwinError,
     headroom,
+    improve,
     offset_free,
 )
 from sb3_yann.audit.meaning import in_deviations
@@ -110,6 +111,7 @@ def test_it_takes_no_step_more_than_it_may() -> None:
     Counted.steps_taken = 0
     found = headroom(heater(), Counted, n_starts=5, max_steps=700)
     assert found.steps == Counted.steps_taken <= 700
+    assert f"tries {found.budget:,} are needed" in improve(heater(), Counted, max_steps=700).reason
     assert found.observer_played is not None and "were too few to go on" in found.report()
     assert found.verdict == "not known" and "from 5 of 5 starts no plan" in found.report()
     with pytest.raises(ValueError, match="max_steps = 100 are too few for 5 episodes of the MPC"):
@@ -123,8 +125,7 @@ def test_ctrl_c_prints_what_has_been_played_so_far(capsys, monkeypatch) -> None:
     monkeypatch.setattr("sb3_yann.improvement.measuring._Search.plan", interrupted)
     with pytest.raises(KeyboardInterrupt):
         headroom(heater(), Heater, n_starts=3)
-    said = capsys.readouterr().err
-    assert "Interrupted; of what was played so far:\nVerdict:" in said
+    assert "Interrupted; of what was played so far:\nVerdict:" in capsys.readouterr().err
 
 
 class Ending(Heater):
@@ -359,8 +360,7 @@ def tracking() -> LinearMPC:
 def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
     make = in_deviations(lambda: units.plant("plant", "plant"), MPC)
     plain = headroom(MPC.deviations, make, n_starts=3)
-    shown = StageCost(units.plant("plant", "plant"), MPC)
-    found = headroom(MPC, shown, n_starts=3)
+    found = headroom(MPC, StageCost(units.plant("plant", "plant"), MPC), n_starts=3)
     np.testing.assert_allclose(found.mpc_costs, plain.mpc_costs, rtol=1e-9)
     np.testing.assert_allclose(found.best_costs, plain.best_costs, rtol=1e-6)
     assert found.mpc_costs.max() < 10 and found.verdict == "keep the MPC"
@@ -417,7 +417,7 @@ def test_a_swing_is_found_where_the_mpc_shows_none() -> None:
     much = 0.3 * found.mpc_costs[hangs]
     assert np.any(found.best_costs[hangs] < much) and found.verdict == "learn"
     assert np.all(np.minimum(found.observer_costs, found.reidentified_costs)[hangs] > much)
-    assert "improve(mpc, make, max_steps=60_000)" in found.report()
+    assert "improve(mpc, make, max_steps=142_200)" in found.report()
 
 
 def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:

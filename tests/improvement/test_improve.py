@@ -112,8 +112,7 @@ def test_beyond_what_its_episodes_show_the_mpc_acts_alone(confine) -> None:
 
 @pytest.mark.parametrize("share", [1.0, 0.999, 0.3, 0.004])
 def test_it_takes_no_step_more_than_it_may_and_closes_its_envs(share) -> None:
-    whole = pickle.loads(better())[1].steps
-    most = max(int(share * whole), 1)
+    most = max(int(share * pickle.loads(better())[1].steps), 1)
     Counted.forget()
     model = model_of(Counted)
     before = bits(model)
@@ -296,8 +295,7 @@ def followed() -> gym.Env:
 
 def test_set_points_are_followed_for_less_whatever_plans_gain(monkeypatch) -> None:
     monkeypatch.setattr(Teacher, "gain", 0.0)  # plans know no set-point before it comes
-    mpc = tracking()
-    model = DDPG(YannPolicy, followed(), device="cpu", policy_kwargs={"problem": mpc})
+    model = DDPG(YannPolicy, followed(), device="cpu", policy_kwargs={"problem": tracking()})
     found = improve(model, followed, **FEW)
     assert found.accepted and found.change < -0.02
 
@@ -474,8 +472,12 @@ def test_of_long_episodes_parts_are_planned_and_the_whole_is_checked(monkeypatch
     assert {len(each.given) for each in planned} == {9}
     trial = confirmation.Trial.draw(twin_of(), 10, np.random.default_rng(0))
     assert trial.steps == max(map(len, twin_of().episodes)) == 20
-    lost = trial.hard((trial.mpc[0] + 1e3, trial.mpc[1]))  # every start of every member
-    assert len(lost) == confirmation.HARDEST
+    assert len(trial.hard((trial.mpc[0] + 1e3, trial.mpc[1]))) == confirmation.HARDEST
+    costs, unsafe = (each.copy() for each in trial.mpc)
+    unsafe[12, [4, 5, 6, 8]] = 0.25, 0.25, 0.25, 0  # of the input, at one of the starts around
+    place, speed = trial.starts[0, 12]
+    where = f"outside the log, from x[0] = {place:.3g}, x[1] = {speed:.3g}, "
+    assert trial.check(1, (costs, unsafe)).reason == f"{where}u[0] exceeds its bound by 0.25"
 
 
 def test_a_fit_takes_the_way_of_most_plans_and_reaches_bounds() -> None:
@@ -540,7 +542,9 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
         "  steps        2 candidates tried",
     ]
     sure = replace(passed, interval=(-0.03, -0.002))
-    twin = Improvement((sure,), -0.021, True)
+    twin = Improvement((replace(refused, interval=(-0.04, 0.01)), sure), -0.021, True)
+    assert twin.interval == sure.interval
+    assert replace(twin, checks=twin.checks[:1], accepted=False, change=0.0).interval == (0, 0)
     assert "from starts like the log's; on the plant -3.00 to -0.20 % (90 %)" in str(twin)
     decided = replace(sure, starts=40, final=True)
     there = str(replace(twin, checks=(decided,), where="the simulator", steps=5000))
@@ -550,7 +554,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     where = "of the MPC's mean cost in the twin, from starts like the log's"
     assert Improvement((refused,), 0.0, accepted=False).report().splitlines()[:3] == [
         "Nothing better was found: 2 starts with violations. The model is as it was.",
-        f"  change       -3.00 % {where}: not accepted",
+        f"  refused      a candidate, -3.00 % {where}",
         "  steps        1 candidate tried",
     ]
     small = Check(1, True, "", -4e-4, 0.0, True)
@@ -563,11 +567,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
 @pytest.mark.parametrize(
     ("where", "note", "leads_on"),
     [
-        (
-            "the twin",
-            "it may lose: to settle it, log held steps of u",
-            "the MPC and log held steps",
-        ),
+        ("the twin", "it may lose: to settle it, log steps of u", "the MPC and log steps of u"),
         ("the twin", "plans +0.00 %, too little to teach", "keep the MPC: there is little to gain"),
         ("the twin", "2 starts with violations", "log more episodes, of other starts"),
         (
