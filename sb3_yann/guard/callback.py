@@ -240,11 +240,11 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
-        return summary_of(self.state, self.player.policy, self.steps, self.settings.eval_freq)
+        return summary_of(self.state, self.player.policy, self.settings.eval_freq)
 
     @property
     def steps(self) -> int:
-        """Steps of its simulator: all episodes, but not the five pushes of each input before."""
+        """Steps of its simulator in all runs, but those that check it, or whether a run goes on."""
         return self.player.steps
 
     def plot(self, axes: Axes | None = None) -> Axes:
@@ -261,11 +261,8 @@ class ImprovementGuard(BaseCallback):
             check_twin(policy, self.twin.problem)
         watch_buffer(self.model)
         known = getattr(self.model, "guard_state", None)
-        if known is not None:  # a run that goes on has the same weights
-            mpc = known.evidence.mpc
-        else:
-            with preserve_rng():  # building an actor draws weights
-                mpc = ActorCheckpoint.of_mpc(policy)
+        with preserve_rng():  # building an actor draws weights; a run that goes on has the same
+            mpc = known.evidence.mpc if known else ActorCheckpoint.of_mpc(policy)
         self.player = Player(self.model, policy, self.env, mpc)
         self._saved: ActorCheckpoint | None = None
         self._final: ActorCheckpoint | None = None
@@ -294,6 +291,7 @@ class ImprovementGuard(BaseCallback):
                     f"The guard's env {settings.env} does not play the episodes of before: it is "
                     "another simulator of that name. The policies are tried anew.",
                 )
+        player.steps = known.steps if known else 0  # as if it had never stopped
         if not goes_on:
             player.max_input_step = None
             evidence, leading, refusals = first_evidence(player, settings, known)
@@ -303,8 +301,7 @@ class ImprovementGuard(BaseCallback):
                 state.episodes = known.episodes
             self.model.guard_state = state  # type: ignore[attr-defined]
             leading.restore(player.policy)
-        restore = self._leave_accepted
-        self._handler = InterruptHandler.install(self.model, restore, sys._getframe())
+        self._handler = InterruptHandler.install(self.model, self._leave_accepted, sys._getframe())
         player.policy.actor_step = self.state.step
         player.policy.guarded = True
         self._has_begun = True
@@ -363,8 +360,7 @@ class ImprovementGuard(BaseCallback):
         policy = self.player.policy
         if state.accepted.is_actor_of(policy):
             return
-        candidate = ActorCheckpoint.of(policy)
-        decided = decide(state.evidence, candidate, self.player, self.settings)
+        decided = decide(state.evidence, ActorCheckpoint.of(policy), self.player, self.settings)
         if decided is None:
             return
         state.evidence, decision = decided
@@ -403,6 +399,7 @@ class ImprovementGuard(BaseCallback):
         """Restore the accepted policy where Ctrl-C is about to end `learn`, also in a trial."""
         self.player.interrupted = True
         self.player.policy.guarded = False
+        self.state.steps = self.player.steps
         restore_accepted(self.model)
 
     def _folder_of_accepted(self) -> Path | None:
@@ -420,6 +417,7 @@ class ImprovementGuard(BaseCallback):
 
     def _save_accepted(self) -> None:
         """Save the model with the accepted policy, if it is another one than was saved last."""
+        self.state.steps = self.player.steps
         accepted = self.state.accepted
         policy = self.player.policy
         if self._folder is None or accepted is self._saved:

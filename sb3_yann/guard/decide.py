@@ -509,8 +509,7 @@ class Player:
             require_state_shown(env, self.policy.observation_given)
 
     def _act(self, t: int, observations: NDArray[Any], rows: Rows) -> NDArray[Any]:
-        seen = normalized(self.model, observations)
-        actions, _ = self.policy.predict(seen, deterministic=True)
+        actions, _ = self.policy.predict(normalized(self.model, observations), deterministic=True)
         if not np.all(np.isfinite(actions)):  # of a subclass: the actor itself puts out no NaN
             raise Unplayable("an action of the actor is not a finite number")
         return np.asarray(actions)

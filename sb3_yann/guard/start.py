@@ -160,9 +160,8 @@ def still_holds(evidence: Evidence, player: Player) -> bool:
         again = player.scores(player.episodes(evidence.accepted, seeds))
     except Unplayable:
         return False
-    margin = starts.tolerance.margin
     return (
-        np.allclose(again.costs, expected.costs, rtol=1e-5, atol=1e-3 * margin)
+        np.allclose(again.costs, expected.costs, rtol=1e-5, atol=1e-3 * starts.tolerance.margin)
         and again.unsafe.shape == expected.unsafe.shape
         and np.allclose(again.unsafe, expected.unsafe, atol=EXCESS_ROOM)
     )

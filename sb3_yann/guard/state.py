@@ -205,7 +205,7 @@ class GuardState:
 
     ``settings`` are what the evidence depends on. Inputs may move by ``max_input_step`` (m,) from
     one sample to the next. ``step`` is the factor of the actor's learning rate; ``episodes`` of
-    training are over, and so many were when the last candidate was tried.
+    training are over, and so many were when the last candidate was tried. ``steps`` were simulated.
     """
 
     settings: dict[str, Any]
@@ -214,6 +214,7 @@ class GuardState:
     step: float = 1.0
     episodes: int = 0
     last_trial: int | None = None
+    steps: int = 0
     decisions: list[Decision] = field(default_factory=list)
 
     @property
@@ -305,7 +306,7 @@ REFUSAL_ADVICE = {
 """What helps against a reason for a refusal that holds such words: the first one that does."""
 
 
-def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0, eval_freq: int = 1) -> str:
+def summary_of(state: GuardState, policy: StartsAsMPC, eval_freq: int = 1) -> str:
     """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
     decisions = state.decisions
     evidence = state.evidence
@@ -356,7 +357,7 @@ def summary_of(state: GuardState, policy: StartsAsMPC, steps: int = 0, eval_freq
         verdict,
         **rows,
         violations=violations,
-        steps=f"{steps:,} of the guard's simulator" if steps else "",
+        steps=f"{state.steps:,} of the guard's simulator" if state.steps else "",
         candidates=candidates,
         refused=refusals,
         next=more,

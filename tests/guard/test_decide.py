@@ -131,8 +131,7 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()
     starts = guard.state.evidence.starts
     hard = starts.seeds[: starts.n_hard]
-    known = starts.seeds[starts.n_hard :]
-    assert sorted(known) == [*range(FIRST, FIRST + 10)]
+    assert sorted(starts.seeds[starts.n_hard :]) == [*range(FIRST, FIRST + 10)]
     assert hard and all(seed % 3 == 0 for seed in hard)
 
 
@@ -180,7 +179,7 @@ def push_left(policy) -> None:
     correct(policy, LEFT, -1.2)  # the best is -.5
 
 
-def test_the_guard_counts_the_steps_of_its_simulator() -> None:
+def test_the_guard_counts_the_steps_of_its_simulator_in_all_runs(tmp_path) -> None:
     class Counted(Slide):
         steps = 0
 
@@ -188,8 +187,16 @@ def test_the_guard_counts_the_steps_of_its_simulator() -> None:
             Counted.steps += 1
             return super().step(action)
 
-    _, guard = tried(spoil_left, spoil_left, env=Counted)
-    assert guard.steps == Counted.steps - 5  # a push of the input from five starts
+    model, guard = tried(spoil_left, spoil_left, env=Counted)
+    for runs in (1, 2):
+        checks = 5 + 5 * STEPS * (runs - 1)  # a push of the input from five starts, and episodes
+        assert guard.steps == Counted.steps - checks
+        for said in (f"{guard.steps} of the guard's simulator", f"in {1 + runs} episodes"):
+            assert said in guard.summary()
+        model.save(tmp_path / "model")
+        model = DDPG.load(tmp_path / "model", env=Slide(), device="cpu")
+        guard = make_guard(Counted)
+        train(model, STEPS, At([STEPS], spoil_left), guard)
 
 
 @pytest.mark.parametrize("rule", [{}, {"least_gain": 0.0}, {"cvar_alpha": 0}])
@@ -448,8 +455,7 @@ def test_beyond_the_bound_it_is_refused_with_the_reason() -> None:
     assert guard.decisions[0].verdict == "rejected"
     assert "an input that moves too far in one step" in guard.decisions[0].reason
     assert is_mpc(model)
-    mpc = guard.state.evidence.starts.mpc
-    assert not mpc.unsafe[:, 3].any()  # the MPC itself never counts
+    assert not guard.state.evidence.starts.mpc.unsafe[:, 3].any()  # the MPC itself never counts
 
 
 def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:

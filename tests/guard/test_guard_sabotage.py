@@ -111,8 +111,7 @@ def test_amid_learning_actor_target_and_moments_return_to_those_last_accepted(
         compared.append(actor_bits(policy) == kept[0] == accepted_bits(guard))
 
     sabotages = At([STEPS, 5 * STEPS], spoil)
-    steps = [STEPS, 5 * STEPS]
-    train(model, 6 * STEPS, At([1], better), sabotages, guard, At(steps, compare))
+    train(model, 6 * STEPS, At([1], better), sabotages, guard, At([STEPS, 5 * STEPS], compare))
     assert compared == [True, True]
 
 
@@ -331,5 +330,4 @@ def test_a_guard_s_env_that_pays_another_cost_than_training_is_reported(weight: 
     other = {"n_eval_episodes": 4, "n_final_starts": 2}
     guard = ImprovementGuard(lambda: TimeLimit(StageCost(Carriage(), paid), 12), **other)
     found = told(lambda: model.learn(120, callback=[NoActionNoise(), guard]))
-    named = ["pays something else" in each for each in found]
-    assert sum(named) == (weight != mpc.R[0, 0])
+    assert sum(["pays something else" in each for each in found]) == (weight != mpc.R[0, 0])

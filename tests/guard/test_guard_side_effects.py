@@ -159,8 +159,7 @@ def interrupted(model, steps: int, *callbacks: BaseCallback) -> None:
 
 def test_between_two_steps_the_candidate_gives_way_to_what_was_accepted() -> None:
     model = build(learning_rate=0.0)
-    guard = make_guard(eval_freq=100)
-    interrupted(model, 40, At([5], better), guard, At([17], ctrl_c))
+    interrupted(model, 40, At([5], better), make_guard(eval_freq=100), At([17], ctrl_c))
     assert is_mpc(model)  # no trial has been
 
 
@@ -193,8 +192,7 @@ def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_polic
 
     plays: list[int] = []
     model = build(gradient_steps=0)
-    guard = make_guard(partial(CutOff, FIRST, act))
-    interrupted(model, 4 * STEPS, At([1], better), guard)
+    interrupted(model, 4 * STEPS, At([1], better), make_guard(partial(CutOff, FIRST, act)))
 
 
 def test_a_simulator_that_swallows_it_ends_the_training_all_the_same() -> None:
@@ -206,8 +204,7 @@ def test_a_simulator_that_swallows_it_ends_the_training_all_the_same() -> None:
 
     plays: list[int] = []
     model = build(gradient_steps=0)
-    guard = make_guard(partial(CutOff, FIRST, act))
-    interrupted(model, 4 * STEPS, At([1], better), guard)
+    interrupted(model, 4 * STEPS, At([1], better), make_guard(partial(CutOff, FIRST, act)))
     assert is_mpc(model) and len(plays) == 4
 
 
