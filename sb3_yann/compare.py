@@ -201,8 +201,7 @@ class Tolerance:
         """
         row = policy.unsafe[episode]
         if mpc is not None:
-            allowed = allowed_excess(mpc.unsafe[episode, ANY_BOUND], self.excess_room)
-            if row[ANY_BOUND] <= allowed:
+            if row[ANY_BOUND] <= allowed_excess(mpc.unsafe[episode, ANY_BOUND], self.excess_room):
                 return ""
         return self.bounds.in_words(row[WORST], row[LARGEST_EXCESS] or row[ANY_BOUND])
 

@@ -213,8 +213,7 @@ class Log:
         ValueError
             For shapes that do not fit, or numbers that are not finite.
         """
-        given = {"states": states, "actions": inputs, "disturbances": disturbances}
-        records = _records(given)
+        records = _records({"states": states, "actions": inputs, "disturbances": disturbances})
         if sum(map(len, records)) < 2:
             first = records[0]
             raise ValueError(
@@ -583,9 +582,11 @@ def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np
     middle = float(np.nanmedian(whole))
     most = 2 * np.sum(uneven) > len(whole)
     if most and abs(middle - dt) > 0.1 * dt:
+        fits = [unit for unit, s in SECONDS.items() if abs(middle - dt * s) <= 0.1 * dt * s]
         raise ValueError(
             f"dt = {dt:g}, but a step of the log takes {middle:g} (the median). Give time and dt "
-            'in the same unit; of time stamps dt is in seconds, or in time_unit="h".'
+            "in the same unit; of time stamps dt is in seconds, or in "
+            f'time_unit="{[*fits, "min"][0]}".'
         )
     if most or np.sum(uneven & (np.abs(whole - dt) < 0.5 * dt)) > 5 + 0.02 * len(whole):
         words = (

@@ -498,8 +498,7 @@ def _require_same_inputs(policy: Any, space: Any) -> None:
     if not isinstance(space, gym.spaces.Box) or not np.any(model.u_ss):
         return
     own = (policy.u_min, policy.u_max)
-    half = half_widths(policy.u_min, policy.u_max)
-    if same_bounds((space.low, space.high), own, half):
+    if same_bounds((space.low, space.high), own, half_widths(*own)):
         raise ValueError(
             f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "
             f"the law is of a plant with u_ss = {model.u_ss.tolist()}. Leave x_ss and u_ss out of "

@@ -81,8 +81,9 @@ def test_where_more_than_half_of_the_steps_are_none_the_unit_is_another() -> Non
 
     parts, lost = without_gaps([numbered(8)], [times(4)], 1.0)
     assert lost == 4 and [len(each) for each in parts] == [4]
-    with pytest.raises(ValueError, match=r"dt = 1, but a step of the log takes 3 \(the median\)"):
-        without_gaps([numbered(8)], [times(5)], 1.0)
+    for time, said in ((times(5), r"3 \(the median\)"), (60 * times(0), 'time_unit="min"')):
+        with pytest.raises(ValueError, match=f"dt = 1, but a step of the log takes .*{said}"):
+            without_gaps([numbered(8)], [time], 1.0)
     with pytest.raises(ValueError, match="time has 2 episodes, states has 1"):
         without_gaps([numbered(8)], [times(0), times(0)], 1.0)
 

@@ -97,6 +97,7 @@ def with_two_outputs() -> ObserveDisturbance:
         (lambda: drawn({"a": 1}), TypeError(rf"runs\['a'\] = 1 {PLAYED}")),
         (lambda: played(-1), "seeds = -1 must be a whole number of at least 0"),
         (lambda: export(scalar_mpc(), "law.c", name=3), "name = 3 must be a word of letters"),
+        (lambda: export("c", scalar_mpc()), TypeError("path = LinearMPC.* must be the path of a")),
         (
             lambda: comparison_table("", played(), played()),
             "before has 0 episodes and after 0; .* one at least",

@@ -286,9 +286,8 @@ class Commissioning:
         twin = None
         if self._changed:
             costs = compare(journal, plant, self.twin, None)
-            first = len(journal.episodes)
             state = CommissioningState(
-                self._first_bound, first=first, anew=number, tried=before.tried
+                self._first_bound, first=len(journal.episodes), anew=number, tried=before.tried
             )
             verdict: Verdict = "begins anew"
             reason = "Two episodes in a row had an alarm."

@@ -97,7 +97,7 @@ class StateEstimator:
         cross = np.vstack([cross, np.zeros((d, q))])
         periods = [check_int("every", each) for each in np.ravel(every).tolist()]
         if len(periods) not in (1, q):
-            raise ValueError(f"every = {every} must be one number, or {q}.")
+            raise ValueError(f"every = {every} must be one number, or one for each of {q} outputs.")
         self.every = np.resize(periods, q)
         if gain is None:
             found = self._kalman_gain(linalg.block_diag(W, D), V, cross)
@@ -294,8 +294,7 @@ def _require_observable(model: LinearModel, E: Array, C: Array) -> None:
     d = E.shape[1]
     q = len(C)
     for pole in np.linalg.eigvals(model.A):
-        hautus = np.vstack([pole * np.eye(n) - model.A, C])
-        if abs(pole) > 1 - 1e-9 and _rank(hautus) < n:
+        if abs(pole) > 1 - 1e-9 and _rank(np.vstack([pole * np.eye(n) - model.A, C])) < n:
             raise ValueError(
                 f"The measurements do not see an unstable mode: eigenvalue {pole:.6g} of A is not "
                 "observable through C. Measure another output."

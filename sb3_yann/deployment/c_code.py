@@ -389,8 +389,7 @@ def _description(data: ControllerArrays, about: str, identity: str, units: list[
         ET.SubElement(listed, "File", name=unit)
     ET.SubElement(ET.SubElement(root, "LogCategories"), "Category", name="logStatusError")
     if data["dt"]:
-        step = repr(float(data["dt"]))
-        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=step)
+        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(float(data["dt"])))
     variables = ET.SubElement(root, "ModelVariables")
     _add_variables(variables, data)
     structure = ET.SubElement(root, "ModelStructure")

@@ -84,7 +84,8 @@ class Checks:
             late = check_positive("late_after", self.late_after, "None checks nothing.")
         given = np.ravel(self.missing).tolist()
         if len(given) not in (1, size):
-            raise ValueError(f"missing = {self.missing} must be one number, or {size}.")
+            wanted = f"one number, or one for each of the {size} readings"
+            raise ValueError(f"missing = {self.missing} must be {wanted}.")
         missing = [check_int("missing", each, 0) for each in given]
         counts["missing"] = np.resize(np.array(missing, np.int64), size)
         return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}
@@ -122,8 +123,7 @@ def estimator_arrays(
 
     entries = np.arange(len(seen))
     in_d = np.arange(layout.disturbance.start, layout.disturbance.stop)
-    first = in_d[len(in_d) - len(estimated) :]
-    from_filter = np.concatenate([entries[layout.state], first])
+    from_filter = np.concatenate([entries[layout.state], in_d[len(in_d) - len(estimated) :]])
     previous = entries[layout.previous]
     read = np.delete(entries, np.concatenate([from_filter, previous]))
     n_read = q + len(read)

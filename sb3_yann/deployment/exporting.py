@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_yann._archive import atomic_write, digest_of, write_arrays
-from sb3_yann._validation import check_choice, check_options
+from sb3_yann._validation import check_choice, check_options, check_type
 from sb3_yann.deployment.c_code import c_files, fmu_file
 from sb3_yann.deployment.code import Cost
 from sb3_yann.deployment.describe import Checks, Estimator, Exportable, describe
@@ -115,7 +115,8 @@ def export(
     >>> [path.name for path in written.paths]
     ['reactor.c', 'reactor.h', 'reactor_selftest.c']
     """
-    target = Path(path)
+    wanted = 'the path of a file, after what goes into it: export(model, "controller.c")'
+    target = Path(check_type("path", path, str | PathLike, wanted))
     kind = format or target.suffix.lstrip(".")
     check_choice("format", kind, ("npz", "c", "onnx", "st", "xml", "fmu"))
     check_choice("precision", precision, ("double", "float"))

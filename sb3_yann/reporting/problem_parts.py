@@ -231,8 +231,7 @@ def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, str, int, str, Any]]
     )  # fmt: skip
     for called, keys, of_limits, is_soft, values in groups:
         for k in np.flatnonzero(np.isfinite(problem.limits[of_limits]).any(axis=0)):
-            kind = "soft" if is_soft[k] else "hard"
-            yield called[k], keys[k], of_limits, int(k), kind, values
+            yield called[k], keys[k], of_limits, int(k), "soft" if is_soft[k] else "hard", values
 
 
 # ---- The law ----

@@ -157,8 +157,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Html:
         tag("tr", *(tag(name, each, **kind) for each, kind in zip(row, kinds, strict=True)))
         for name, row in [("th", head), *(("td", row) for row in body)]
     ]
-    whole = tag("table", tag("thead", lines[0]), tag("tbody", *lines[1:]))
-    return tag("div", whole, class_="wide")
+    return tag("div", tag("table", tag("thead", lines[0]), tag("tbody", *lines[1:])), class_="wide")
 
 
 def picture(draw: Callable[[], Axes | Figure], caption: str) -> Html:
@@ -323,8 +322,7 @@ class Subject:
                 observations=tuple(map(self._theta, played.observations)),
                 actions=tuple(map(self.policy.inputs, played.actions)),
             )
-            excess = excess_of_episodes(self.problem, played.pairs)
-            found[name] = replace(played, excess=excess)
+            found[name] = replace(played, excess=excess_of_episodes(self.problem, played.pairs))
         if not is_rewarded(found):
             for name, played in found.items():
                 costs = [costs_of(self.problem, *pair)[0] for pair in played.pairs]

@@ -96,8 +96,7 @@ class Starts:
         passes at the few of the log may fail between them.
         """
         drawn = self.draw(count, rng)
-        layout = self.problem.layout
-        if not layout.has_constants:
+        if not self.problem.layout.has_constants:
             return drawn
         held = self.row.given
         some = drawn[::2].copy()

@@ -132,8 +132,7 @@ def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
     found = []
     for episode in episodes:
         count = min(-(-least // len(episodes)), max(1, len(episode) // (4 * SHORTEST)))
-        edges = np.linspace(0, len(episode), count + 1).astype(int)
-        for first, last in pairwise(edges):
+        for first, last in pairwise(np.linspace(0, len(episode), count + 1).astype(int)):
             rows = episode.thetas[first : last + 1], episode.actions[first:last]
             found.append(Episode(*rows))
     return tuple(found)

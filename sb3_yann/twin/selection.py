@@ -105,8 +105,7 @@ class _Networks:
         self.unit = self.tensor(np.maximum(units, least))
 
         def drawn(rows: int, columns: int) -> th.Tensor:
-            shape = (count, rows, columns)
-            found: th.Tensor = th.randn(shape, generator=generator, dtype=dtype)
+            found = th.randn((count, rows, columns), generator=generator, dtype=dtype)
             return found.div(rows**0.5)
 
         def zeros(rows: int, columns: int) -> th.Tensor:

@@ -207,9 +207,10 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
                 "observer. Else write an env that shows them, and wrap it in MeasuredDisturbance "
                 "and StageCost."
             )
-        half = (mpc.theta_max - mpc.theta_min)[layout.state] / 4
-        low = np.maximum(x_ss - half, mpc.theta_min[layout.state])
-        high = np.minimum(x_ss + half, mpc.theta_max[layout.state])
+        box = mpc.theta_min[layout.state], mpc.theta_max[layout.state]
+        half = (box[1] - box[0]) / 4
+        low = np.maximum(x_ss - half, box[0])
+        high = np.minimum(x_ss + half, box[1])
         lowest = low if start_low is None else start_low
         highest = high if start_high is None else start_high
         start = check_bounds("start_", lowest, highest, n)
@@ -217,6 +218,13 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
             raise ValueError(
                 "The MPC's box of states is not bounded, so it is not known where episodes begin: "
                 "pass start_low and start_high."
+            )
+        off = np.abs(np.clip(start, *box) - start) > EXCESS_ROOM * mpc.theta_half[layout.state]
+        for i in np.flatnonzero(off.any(axis=0)):
+            warn(
+                f"{with_units(mpc.model)[0][i]} may begin at {start[0][i]:g} to {start[1][i]:g}, "
+                f"beyond theta's box, for which the MPC is made: {box[0][i]:g} to {box[1][i]:g}. "
+                "Change start_low and start_high, or widen theta_min and theta_max."
             )
         check_int("substeps", substeps)
         plant = Equations(f, mpc, start, substeps)
@@ -279,8 +287,7 @@ def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) 
             found = np.linalg.norm(held - effects) / np.linalg.norm(effects)
         return float(np.nan_to_num(found, nan=np.inf))
 
-    ratios = [*UNITS_OF_TIME, *(1 / each for each in UNITS_OF_TIME)]
-    best = min(ratios, key=error)
+    best = min([*UNITS_OF_TIME, *(1 / each for each in UNITS_OF_TIME)], key=error)
     return best if error(1.0) > 0.8 and error(best) < 0.2 else None
 
 

@@ -208,5 +208,5 @@ def test_a_filter_of_two_rates_uses_the_rare_readings_fully() -> None:
         x = model.step(x, [0.0]) + 0.1 * rng.normal(size=3)
     plain, rated = (float(np.mean(np.square(own[200:]))) for own in errors)
     assert rated < 0.85 * plain
-    with pytest.raises(ValueError, match="every = "):
+    with pytest.raises(ValueError, match="one number, or one for each of 2 outputs"):
         StateEstimator(model, every=[1, 2, 3])

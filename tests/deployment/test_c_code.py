@@ -41,8 +41,7 @@ def test_double_is_the_controller(name, compiler, tmp_path):
     assert error(actions, controller.evaluate(kept), controller) < 1e-12
     by_law, _ = compiled.at(kept, law=True)
     assert error(by_law, controller.evaluate(kept, networks=False), controller) < 1e-12
-    outside = (found & int(Status.OUTSIDE)) > 0
-    assert np.array_equal(outside, ~controller.in_domain(kept))
+    assert np.array_equal((found & int(Status.OUTSIDE)) > 0, ~controller.in_domain(kept))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -98,8 +98,7 @@ def test_a_problem_is_its_law_within_its_rates(tmp_path):
     previous = theta[:, -problem.model.n_inputs :]
     assert np.allclose(u, problem.explicit()(theta), atol=1e-9)
     du_min = problem.rate.du_min
-    du_max = problem.rate.du_max
-    assert np.all(u <= np.maximum(previous + du_max, problem.u_min) + 1e-9)
+    assert np.all(u <= np.maximum(previous + problem.rate.du_max, problem.u_min) + 1e-9)
     assert np.all(u >= np.minimum(previous + du_min, problem.u_max) - 1e-9)
     regulator = solved("reactor")
     alone = controller_of(regulator.explicit(), tmp_path)
@@ -108,8 +107,7 @@ def test_a_problem_is_its_law_within_its_rates(tmp_path):
 
 
 def test_it_needs_numpy_alone(tmp_path):
-    policy = policy_of("reactor")
-    controller = controller_of(policy, tmp_path)
+    controller = controller_of(policy_of("reactor"), tmp_path)
     source = Path(sb3_yann.deployment.controller.__file__)
     for each in (source, Path(sb3_yann._archive.__file__)):
         (tmp_path / each.name).write_bytes(each.read_bytes())
@@ -228,8 +226,7 @@ def test_rates_hold_whatever_happens(tmp_path):
 
 
 def test_networks_that_overflow_leave_the_law(tmp_path):
-    policy = disturbed(solved("reactor"))
-    controller = controller_of(policy, tmp_path)
+    controller = controller_of(disturbed(solved("reactor")), tmp_path)
     last = f"layer{int(controller.data['n_layers']) - 1}"
     controller = Controller({**controller.data, last: np.full_like(controller.data[last], np.inf)})
     obs = readings(10)[1:]

@@ -53,8 +53,7 @@ def test_what_is_not_finite_counts_as_in_the_controller(name, tmp_path):
 
 def test_a_graph_names_what_it_takes(tmp_path):
     written = export(policy_of("reactor"), tmp_path / "plant.onnx")
-    model = onnx.load(tmp_path / "plant.onnx")
-    said = {each.key: each.value for each in model.metadata_props}
+    said = {each.key: each.value for each in onnx.load(tmp_path / "plant.onnx").metadata_props}
     assert said == {
         "digest": written.digest, "obs_names": "C_A, C_B, C_S, T", "action_names": "U"
     }  # fmt: skip

@@ -57,8 +57,7 @@ def test_a_controller_stays_in_the_action_space(bounds, tmp_path) -> None:
 @pytest.mark.parametrize("bounds", BOUNDS)
 def test_c_code_stays_in_the_action_space(bounds, precision, tmp_path) -> None:
     policy = policy_within(*bounds)
-    compiled = Compiled(policy, tmp_path, precision)
-    require_inside(compiled.at(observations())[0], policy.action_space)
+    require_inside(Compiled(policy, tmp_path, precision).at(observations())[0], policy.action_space)
 
 
 def test_a_law_stays_within_the_bounds_of_its_problem(tmp_path) -> None:

@@ -232,9 +232,8 @@ def test_a_closed_loop_is_that_of_python(form, kind, rates, extra, tmp_path) -> 
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_the_self_test_runs_a_closed_loop_and_can_fail(precision, tmp_path) -> None:
-    observer = problem()[1]
     # A name that begins like tables of the code.
-    export(policy(), tmp_path / "est.c", estimator=observer, precision=precision)
+    export(policy(), tmp_path / "est.c", estimator=problem()[1], precision=precision)
     code = tmp_path / "est.c"
     assert self_test(tmp_path, "est").returncode == 0
     text = code.read_text()
@@ -329,7 +328,7 @@ def test_what_estimates_is_refused_where_it_does_not_fit(tmp_path) -> None:
         (mpc, {}, "estimator=observer"),
         (plain, {}, "The states are estimated.* estimator=observer"),
         (mpc, {"estimator": observer, "format": "onnx"}, "no memory"),
-        (mpc, {"estimator": observer, "checks": Checks(missing=[1, 2])}, "one number, or 5"),
+        (mpc, {"estimator": observer, "checks": Checks(missing=[1, 2])}, "one for each of the 5"),
     ):
         with pytest.raises(ValueError, match=message):
             export(given, path, **options)

@@ -257,7 +257,8 @@ def test_inputs_beyond_a_bound_at_run_time_fail(monkeypatch) -> None:
         parametric_bounds=["u_max"],
     )  # fmt: skip
     outside = {"start_low": 20.3, "start_high": 20.4, "max_episode_steps": 20}
-    env = PlantEnv(lambda x, u: 0.1 * (15 - x) + 0.5 * (u - 3) - 0.3, mpc, **outside)
+    with pytest.warns(UserWarning, match=r"x\[0\] may begin at 20.3 to 20.4, .*: 0 to 20. Change"):
+        env = PlantEnv(lambda x, u: 0.1 * (15 - x) + 0.5 * (u - 3) - 0.3, mpc, **outside)
     model = DDPG("YannPolicy", env, policy_kwargs={"problem": mpc, "keep_bounds": False})
     layer = model.actor.mu
     text = "Inputs leave their bounds at random points of the box of parameters."

@@ -38,12 +38,6 @@ def solve_explicit(
     none. Its errors are those of :meth:`LinearMPC.explicit`.
     """
     check_choice("solver", solver, ("walk", "ppopt"))
-    if not np.all(np.isfinite([program.theta_min, program.theta_max])):
-        raise ValueError(
-            f"The law needs a bounded box of theta, not {program.theta_min.tolist()} to "
-            f"{program.theta_max.tolist()}. Pass finite theta_min and theta_max (or x_min and "
-            "x_max), and where theta holds them, r_min and r_max, d_min and d_max, u_min and u_max."
-        )
     require_sane_sizes(program, u_min, u_max)
     timer.tick()
     try:

@@ -388,10 +388,9 @@ class LinearCost(ReadOnlyArrays):
 
     def sized(self, n_states: int, n_inputs: int) -> LinearCost:
         """Return it with prices of shapes (n,) and (m,)."""
-        sizes = ("x", self.x, n_states), ("u", self.u, n_inputs)
         x, u = (
             check_array(f"LinearCost.{name}", np.full(size, p) if p.ndim == 0 else p, (size,))
-            for name, p, size in sizes
+            for name, p, size in (("x", self.x, n_states), ("u", self.u, n_inputs))
         )
         return LinearCost(x, u, self.constant)
 

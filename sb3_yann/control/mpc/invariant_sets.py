@@ -56,8 +56,7 @@ def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> 
         return  # where rounding hides it, the laws say so
     B = errors.model.B
     weight = errors.R if cost is None else errors.R + problem.gamma * B.T @ cost @ B
-    unit = np.outer(problem.u_half, problem.u_half)
-    sizes = np.linalg.eigvalsh(weight * unit)
+    sizes = np.linalg.eigvalsh(weight * np.outer(problem.u_half, problem.u_half))
     if sizes[0] > 1e-13 * max(sizes[-1], np.finfo(float).tiny):
         return
     raise ValueError(

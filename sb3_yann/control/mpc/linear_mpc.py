@@ -420,6 +420,15 @@ class LinearMPC(MPCProblem):
     ) -> PiecewiseAffine:
         """Return the explicit law, solved within a budget unless it is there."""
         if solver not in self._laws:
+            box = zip(self.labels(units=True), self.theta_min, self.theta_max, strict=True)
+            of_law = np.delete(np.array([*box], object), self.extra, axis=0)
+            if far := [each for each in of_law if not np.isfinite(each[2] - each[1])]:
+                ends = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in far)
+                raise ValueError(
+                    f"The law needs a bounded box of theta, not {ends}. Pass finite theta_min and "
+                    "theta_max (or x_min and x_max), and where theta holds them, r_min and r_max, "
+                    "d_min and d_max, u_min and u_max."
+                )
             load_kernels()
             limits = self.deviations.u_min, self.deviations.u_max
             with BudgetTimer(time_limit, region_limit, effort_limit) as timer:

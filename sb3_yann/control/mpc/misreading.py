@@ -62,8 +62,7 @@ def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:
     # All orders of a few states; of more, two are exchanged.
     orders = [[*each] for each in permutations(range(n))][1:] if n <= MOST_REORDERED else []
     if n > MOST_REORDERED:
-        pairs = combinations(range(n), 2)
-        orders = [[{i: j, j: i}.get(k, k) for k in range(n)] for i, j in pairs]
+        orders = [[{i: j, j: i}.get(k, k) for k in range(n)] for i, j in combinations(range(n), 2)]
     for order in orders:
         back = np.argsort(order).tolist()
         yield (

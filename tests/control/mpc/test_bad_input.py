@@ -171,12 +171,16 @@ def test_an_infeasible_problem_is_a_value_error(changes: dict[str, Any]) -> None
         small_mpc(**changes).explicit()
 
 
-@pytest.mark.parametrize(
-    "changes", [{"x_min": None, "x_max": None}, {"x_min": [-1, -INF]}, {"theta_max": INF}]
-)
-def test_an_unbounded_box_is_a_value_error(changes: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"bounded box .* Pass finite theta_min and theta_max"):
-        small_mpc(**changes).explicit()
+def test_an_unbounded_box_is_a_value_error() -> None:
+    names = {"state_names": ["place", "speed"], "input_names": ["force"], "x_ss": [12, 0]}
+    cart = LinearModel([[1, 1], [0, 1]], [[0], [1]], 1, **names)
+    for changes, ends in (
+        ({"x_min": None, "x_max": None}, "place from -inf to inf, speed from -inf to inf"),
+        ({"x_min": [-1, -INF]}, "speed from -inf to 20"),
+        ({"theta_max": INF}, "place from -5 to inf, speed from -5 to inf"),
+    ):
+        with pytest.raises(ValueError, match=f"bounded box of theta, not {ends}. Pass finite the"):
+            small_mpc(cart, **{"x_max": 20} | changes).explicit()
 
 
 def test_bad_discount_of_the_critic_is_named() -> None:
