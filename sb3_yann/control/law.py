@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from os import PathLike, fspath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,27 +64,26 @@ class PlantLaw(ReadOnlyArrays):
     rate: Array | None = None
     moving: NDArray[np.intp] | None = None
     clamped: Array | None = None
-    # What a file should hold, for a message.
-    _kind = "a law"
+    u_min: Array
+    u_max: Array
+    theta_min: Array
+    theta_max: Array
+    _kind: ClassVar[str]  # what a file should hold, for a message
+    _derived: ClassVar[tuple[str, ...]]  # what follows from the rest, or is remembered
 
-    if TYPE_CHECKING:
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters n."""
+        return len(self.theta_min)
 
-        @property
-        def n_theta(self) -> int:
-            """Number of parameters."""
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs m."""
+        return len(self.u_min)
 
-        @property
-        def n_inputs(self) -> int:
-            """Number of inputs."""
-
-        u_min: Array
-        u_max: Array
-
-        def __getstate__(self) -> dict[str, Any]:
-            """Return what a copy keeps."""
-
-        def __call__(self, theta: ArrayLike) -> Array:
-            """Return the input, both in deviations."""
+    def __call__(self, theta: ArrayLike) -> Array:
+        """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
+        raise NotImplementedError
 
     def on_plant(
         self,
@@ -239,6 +238,10 @@ class PlantLaw(ReadOnlyArrays):
         clamped = None if ends is None else check_bounds("clamped", ends[0], ends[1], law.n_theta)
         return law.on_plant(model, theta_ss, rate, moving, clamped)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy keeps."""
+        return {name: each for name, each in vars(self).items() if name not in self._derived}
+
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""
         return self
@@ -311,6 +314,7 @@ class PiecewiseAffine(PlantLaw):
     # areas violate two neighbors alike: rounding must not choose.
     tie_tolerance = 1e-12
     _kind = "a PiecewiseAffine"
+    _derived = ("packed", "_at")
 
     def __post_init__(self) -> None:
         """Check the arrays against each other and store them as read-only float64."""
@@ -346,16 +350,6 @@ class PiecewiseAffine(PlantLaw):
     def n_halfspaces(self) -> int:
         """Number of half-spaces q of all regions together."""
         return len(self.b)
-
-    @property
-    def n_theta(self) -> int:
-        """Number of parameters n."""
-        return int(self.gains.shape[2])
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs m."""
-        return int(self.gains.shape[1])
 
     def __call__(self, theta: ArrayLike) -> Array:
         """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
@@ -502,10 +496,6 @@ class PiecewiseAffine(PlantLaw):
     def __repr__(self) -> str:
         law = f"regions={self.n_regions}, halfspaces={self.n_halfspaces}, theta={self.n_theta}"
         return f"PiecewiseAffine({law}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was compiled for this process."""
-        return {name: each for name, each in vars(self).items() if name not in ("packed", "_at")}
 
 
 def read_law(kind: str, path: str | PathLike[str], build: Callable[[dict[str, Any]], T]) -> T:

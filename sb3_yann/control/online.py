@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,6 +85,7 @@ class OnlineLaw(PlantLaw):
     n_input_rows: int = 0
     feedback: Array | None = None
     _kind = "an OnlineLaw"
+    _derived = ("dual", "known", "program", "scaled", "half", "_first_rows", "_has_warned")
 
     def __post_init__(self) -> None:
         """Check the arrays against each other and store them as read-only float64."""
@@ -125,16 +126,6 @@ class OnlineLaw(PlantLaw):
         """
         parts = {each.name: getattr(program, each.name) for each in fields(program)}
         return cls(**parts, u_min=u_min, u_max=u_max, infeasible=infeasible)
-
-    @property
-    def n_theta(self) -> int:
-        """Number of parameters n."""
-        return int(self.F.shape[1])
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs m."""
-        return len(self.u_min)
 
     @property
     def n_constraints(self) -> int:
@@ -278,11 +269,6 @@ class OnlineLaw(PlantLaw):
         sizes = f"constraints={self.n_constraints}, variables={len(self.c)}, theta={self.n_theta}"
         return f"OnlineLaw({sizes}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what follows from the rest, and what is remembered."""
-        derived = ("dual", "known", "program", "scaled", "half", "_first_rows", "_has_warned")
-        return {name: each for name, each in vars(self).items() if name not in derived}
-
 
 Law = PiecewiseAffine | OnlineLaw
 LAWS = ("auto", "explicit", "online")
@@ -349,6 +335,10 @@ class DualProgram:
         # A violation costs 1e6 times its square, in units of the curvature of the cost. So much
         # at least is added to the unit diagonal that this can be solved to nine digits.
         softness = np.maximum(1 / (1e6 * own[:, 0] ** 2), 1e-8)
+        # Bounds of one input, and what has a slack already, never give way.
+        alone = (np.count_nonzero(program.G, axis=1) == 1) & ~np.any(program.S, axis=1)
+        alone[: program.n_input_rows] = True
+        alone |= np.any(program.G[:, len(program.c) - program.n_slacks :], axis=1)
         return cls(
             D=np.ascontiguousarray(((scaled.S + G @ by_theta)[moved] / own).T),
             d0=(scaled.w + (G @ by_one)[:, 0])[moved] / own[:, 0],
@@ -356,7 +346,7 @@ class DualProgram:
             E=np.ascontiguousarray((reach[:m, None] * by_row[:m, moved] / own[:, 0]).T),
             K=np.ascontiguousarray(K),
             k0=-reach[:m] * by_one[:m, 0],
-            softness=np.where(_never_softened(program)[moved], 0.0, softness),
+            softness=np.where(alone[moved], 0.0, softness),
             fixed=(scaled.S[~moved], scaled.w[~moved]),
             bounds=np.stack([u_min, u_max]),
             rows=np.flatnonzero(moved),
@@ -448,14 +438,6 @@ def steepness(program: ParametricQP, u_min: Array, u_max: Array) -> float:
     """Return how many times half of what a dual method takes the slacks of a program cost."""
     ratio, _ = slack_costs(_in_units(program, u_min, u_max)[0])
     return 2 * float(ratio.max()) / MILD
-
-
-def _never_softened(program: ParametricQP) -> NDArray[np.bool_]:
-    """Tell which rows never give way: bounds of one input, and what has a slack already."""
-    inputs = len(program.c) - program.n_slacks
-    alone = (np.count_nonzero(program.G, axis=1) == 1) & ~np.any(program.S, axis=1)
-    alone[: program.n_input_rows] = True
-    return np.asarray(alone | np.any(program.G[:, inputs:], axis=1))
 
 
 def _require_positive_definite(H: Array) -> None:
