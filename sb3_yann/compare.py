@@ -159,11 +159,6 @@ class Scores(NamedTuple):
     unsafe: Array
     visits: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
 
-    def breaks_more_than(self, other: Scores, room: float = EXCESS_ROOM) -> bool:
-        """Return whether it is less safe: a large step of an input wears, and breaks nothing."""
-        less = less_safe(self.unsafe, other.unsafe, room)
-        return bool(np.any(np.delete(less, INPUT_STEP, axis=1)))
-
     def at(self, index: Any) -> Scores:
         """Return some of the episodes."""
         return Scores._make(each[index] for each in self)
@@ -354,7 +349,8 @@ def no_worse(
     ``tail_errors``, standard errors of the worst starts' average, count as well.
     """
     names = range(len(mpc.costs)) if names is None else names
-    breaks = policy.breaks_more_than(accepted, tolerance.excess_room)
+    less = less_safe(policy.unsafe, accepted.unsafe, tolerance.excess_room)
+    breaks = bool(np.any(np.delete(less, INPUT_STEP, axis=1)))  # a large step breaks nothing
     # Neither is exceeded: a tolerance over the accepted policy alone would add up.
     allowed = np.minimum(accepted.unsafe, mpc.unsafe)
     less = less_safe(policy.unsafe, allowed, tolerance.excess_room)

@@ -92,17 +92,14 @@ def settled(A: Array, P: Array) -> Array:
     return np.asarray(np.linalg.solve(one - A + P, one - P))
 
 
-def _on_circle(A: Array) -> int:
-    return int(np.sum(np.abs(np.linalg.eigvals(A) - 1) < ON_CIRCLE))
-
-
 def responses(A: Array, B: Array, integrators: int) -> Array:
     """Return steady-state gains, slopes of integrators, their growth, and the gains without them.
 
     Shape (4, n, m). A pole that is 1 has no part in the first.
     """
     P = projector(A, integrators)
-    own = settled(A, projector(A, _on_circle(A)))
+    ones = int(np.sum(np.abs(np.linalg.eigvals(A) - 1) < ON_CIRCLE))
+    own = settled(A, projector(A, ones))
     return np.array([own @ B, P @ B, (A @ P - P) @ B, settled(A, P) @ B])
 
 

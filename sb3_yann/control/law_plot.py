@@ -51,12 +51,10 @@ def axes_or_new(axes: Axes | None, width: float = 6.4, height: float = 4.0) -> A
     return new_figure(width, height).subplots() if axes is None else axes
 
 
-def legend_beside(axes: Axes, title: str | None = None) -> None:
+def legend_beside(axes: Axes) -> None:
     """Put the legend to the right of the data; none where nothing has a label."""
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(
-            title=title, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0, frameon=False
-        )
+        axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0, frameon=False)
 
 
 def plot_law(

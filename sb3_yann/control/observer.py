@@ -172,7 +172,14 @@ class StateEstimator:
 
         Measured disturbances d are those that acted together with u.
         """
-        predicted = self._after(u, d)
+        if (d is None) != (self.n_known == 0):
+            raise ValueError(
+                f"d = {d!r}, but the observer takes {self.n_known} measured disturbances: those "
+                "of its model that are not `estimated`. Pass what acted together with u."
+            )
+        predicted = self.A @ self.estimate + self.B @ check_array("u", u, (self.model.n_inputs,))
+        if d is not None:
+            predicted = predicted + self.E @ check_array("d", d, (self.n_known,))
         now = np.array(y, np.float64)
         if now.shape == (self.n_measured,):
             now = np.where(np.isnan(now), self.C_aug @ predicted, now)
@@ -186,17 +193,6 @@ class StateEstimator:
         left = np.eye(len(self.A)) - self.gain @ self.C_aug
         driven = np.hstack([self.gain, left @ self.B, left @ self.E])
         return np.asarray(np.linalg.solve(np.eye(len(self.A)) - left @ self.A, driven))
-
-    def _after(self, u: ArrayLike, d: ArrayLike | None) -> Array:
-        if (d is None) != (self.n_known == 0):
-            raise ValueError(
-                f"d = {d!r}, but the observer takes {self.n_known} measured disturbances: those "
-                "of its model that are not `estimated`. Pass what acted together with u."
-            )
-        moved = self.A @ self.estimate + self.B @ check_array("u", u, (self.model.n_inputs,))
-        return np.asarray(
-            moved if d is None else moved + self.E @ check_array("d", d, (self.n_known,))
-        )
 
     def _kalman_gain(self, W: Array, V: Array, cross: Array) -> Array | None:
         """Return the steady-state gain of the filter, None where rounding hides it."""

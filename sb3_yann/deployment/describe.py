@@ -109,7 +109,14 @@ def estimator_arrays(
     """
     model = problem.model
     layout = problem.layout
-    _require_same(model, estimator)
+    own = estimator.model
+    pairs = [(getattr(own, key), getattr(model, key)) for key in ("A", "B", "E", "x_ss", "u_ss")]
+    same = all(a.shape == b.shape and np.allclose(a, b) for a, b in pairs)
+    if not same or estimator.n_estimated != len(model.estimated):
+        raise ValueError(
+            "The estimator is of another model than the problem: take found.estimator() of the "
+            "model that the MPC has, or the observer that offset_free(mpc) returned with it."
+        )
     q = estimator.n_measured
     size = len(estimator.A)
     n_known = estimator.n_known
@@ -154,18 +161,6 @@ def estimator_arrays(
 def _affine(matrix: Array, given_ss: Array, found_ss: Array) -> Array:
     """Return ``[matrix, c]``: a map of deviations, for what counts from these operating points."""
     return np.column_stack([matrix, found_ss - matrix @ given_ss])
-
-
-def _require_same(model: Any, estimator: StateEstimator) -> None:
-    """Raise unless an estimator's model is that of the problem."""
-    own = estimator.model
-    pairs = [(getattr(own, key), getattr(model, key)) for key in ("A", "B", "E", "x_ss", "u_ss")]
-    same = all(a.shape == b.shape and np.allclose(a, b) for a, b in pairs)
-    if not same or estimator.n_estimated != len(model.estimated):
-        raise ValueError(
-            "The estimator is of another model than the problem: take found.estimator() of the "
-            "model that the MPC has, or the observer that offset_free(mpc) returned with it."
-        )
 
 
 Exportable = BaseAlgorithm | StartsAsMPC | LinearMPC | PiecewiseAffine | OnlineLaw

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, check_array, check_choice, check_type
 from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.law_plot import (
     COLORS,
     LIMIT,
@@ -25,7 +24,7 @@ from sb3_yann.control.law_plot import (
     plot_law,
 )
 from sb3_yann.control.linear_system import labels_of, with_units
-from sb3_yann.control.mpc.condensing import condense
+from sb3_yann.control.mpc.report import ActiveConstraints
 from sb3_yann.rollout import Trajectories, as_played
 
 if TYPE_CHECKING:
@@ -77,27 +76,6 @@ def inputs_of(problem: LinearMPC, policy: Any, theta: Array) -> Array:
 
 
 # ---- Regions ----
-
-
-class ActiveConstraints:
-    """Names the constraints that are active in the optimal plan at a theta."""
-
-    def __init__(self, problem: LinearMPC) -> None:
-        program, self.names = condense(problem)
-        self.units = ProgramUnits(program, problem.deviations.u_min, problem.deviations.u_max)
-
-    def at(self, theta: Array) -> list[str] | None:
-        """Return the active constraints at theta (n_theta,), None where no plan is feasible."""
-        scaled = self.units.scaled
-        z = (theta - self.units.center) / self.units.half
-        U = scaled.solve(z)
-        if U is None:
-            return None
-        slack = scaled.w + scaled.S @ z - scaled.G @ U  # of unit rows, in half-widths
-        return [*dict.fromkeys(self.names[i] for i in np.flatnonzero(slack < 1e-7))]
-
-    def __call__(self, region: int, theta: Array) -> str:
-        return ", ".join(self.at(theta) or ()) or "no constraint acts"
 
 
 def plot_regions(
@@ -635,49 +613,40 @@ def plot_twin(trust: Any, axes: Sequence[Axes] | None = None) -> tuple[Axes, Axe
     ``trust`` is ``twin.trust``. A trusted twin's costs lie between the dashed lines, on root mean
     square.
     """
+    from matplotlib.ticker import LogLocator
+
     if axes is None:
         axes = new_figure(9.2, 3.8).subplots(1, 2)
     costs, runs = axes
-    _draw_costs(trust, costs)
-    _draw_free_runs(trust, runs)
-    for panel in (costs, runs):
-        panel.grid(alpha=0.3)
-        if panel.get_legend_handles_labels()[0]:
-            panel.legend(loc="lower left", bbox_to_anchor=(0, 1.01), frameon=False, ncols=3)
-    return costs, runs
-
-
-def _draw_costs(trust: Any, axes: Axes) -> None:
+    costs.set(xlabel="predicted cost", ylabel="actual cost")
+    runs.set(xlabel="steps ahead", ylabel="error (standard deviations of the states)")
     if len(trust.actual):
         both = np.concatenate([trust.predicted, trust.actual])
         both = both[np.abs(both) <= 3 * np.abs(trust.actual).max()]  # a run that diverged is not
         ends = np.array([both.min(), both.max()])
         ends = ends + 0.08 * np.array([-1, 1]) * max(float(np.ptp(ends)), 1e-9)
         error = 0.25 * np.abs(trust.actual).mean()
-        axes.plot(ends, ends, color="black", linewidth=1, label="as predicted")
+        costs.plot(ends, ends, color="black", linewidth=1, label="as predicted")
         for side, label in ((-1, "25 % of the mean off"), (1, "_nolegend_")):
-            axes.plot(ends, ends + side * error, "k--", linewidth=0.8, label=label)
+            costs.plot(ends, ends + side * error, "k--", linewidth=0.8, label=label)
         style: dict[str, Any] = {"color": COLORS[0], "alpha": 0.8, "label": "held-out episode"}
-        axes.plot(trust.predicted, trust.actual, "o", **style)
-        axes.set(xlim=ends, ylim=ends)
-    axes.set(xlabel="predicted cost", ylabel="actual cost")
-
-
-def _draw_free_runs(trust: Any, axes: Axes) -> None:
-    from matplotlib.ticker import LogLocator
-
-    runs = trust.runs
-    axes.set(xlabel="steps ahead", ylabel="error (standard deviations of the states)")
-    if len(trust.actual):
-        for name, errors, color, style in (
-            ("twin", runs.errors[trust.chosen], COLORS[0], "o-"),
-            ("linear model", runs.errors[0], COLORS[1], "s--"),
+        costs.plot(trust.predicted, trust.actual, "o", **style)
+        costs.set(xlim=ends, ylim=ends)
+        horizons = trust.runs.horizons
+        for name, errors, color, line in (
+            ("twin", trust.runs.errors[trust.chosen], COLORS[0], "o-"),
+            ("linear model", trust.runs.errors[0], COLORS[1], "s--"),
             ("nothing moves", trust.standing, COLORS[2], "^:"),
         ):
-            axes.plot(runs.horizons, errors, style, color=color, label=name)
-        axes.set(xscale="log", yscale="log")
-        axes.set_xticks(runs.horizons, [str(each) for each in runs.horizons], minor=False)
-        axes.set_xticks([], minor=True)
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter("{x:g}")  # no powers of ten
-        axes.yaxis.set_minor_formatter("")
+            runs.plot(horizons, errors, line, color=color, label=name)
+        runs.set(xscale="log", yscale="log")
+        runs.set_xticks(horizons, [str(each) for each in horizons], minor=False)
+        runs.set_xticks([], minor=True)
+        runs.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        runs.yaxis.set_major_formatter("{x:g}")  # no powers of ten
+        runs.yaxis.set_minor_formatter("")
+    for panel in (costs, runs):
+        panel.grid(alpha=0.3)
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(loc="lower left", bbox_to_anchor=(0, 1.01), frameon=False, ncols=3)
+    return costs, runs

@@ -250,7 +250,13 @@ def retarget(model: Model, mpc: LinearMPC, env: Any = None) -> Model:
     own["policy_kwargs"] = {**model.policy_kwargs, "problem": mpc}
     own["env"] = model.get_env() if env is None else env
     found = type(model)(**own)
-    lost = _lost(model, policy)
+    buffer: Any = getattr(model, "replay_buffer", None)
+    learnt = {
+        "the critic, which is of the old law and costs": int(policy.critic_updates) > 0,
+        "the replay buffer, whose rewards are of before": buffer is not None and buffer.size() > 0,
+        "the guard's accepted policies": getattr(model, "guard_state", None) is not None,
+    }
+    lost = [what for what, is_there in learnt.items() if is_there]
     actor: Any = found.policy.actor
     layer = policy.actor.mu
     kept = actor.mu
@@ -280,17 +286,6 @@ def _require_same_theta(old: LinearMPC, new: LinearMPC) -> None:
             f"The operating point of the MPC is {is_now.tolist()}, that of the model "
             f"{was.tolist()}: a correction counts from it. Keep x_ss and u_ss."
         )
-
-
-def _lost(model: BaseAlgorithm, policy: StartsAsMPC) -> list[str]:
-    """Return in words what a new model has not got, of what was learnt."""
-    buffer: Any = getattr(model, "replay_buffer", None)
-    learnt = {
-        "the critic, which is of the old law and costs": int(policy.critic_updates) > 0,
-        "the replay buffer, whose rewards are of before": buffer is not None and buffer.size() > 0,
-        "the guard's accepted policies": getattr(model, "guard_state", None) is not None,
-    }
-    return [what for what, is_there in learnt.items() if is_there]
 
 
 @th.no_grad()

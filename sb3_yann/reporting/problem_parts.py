@@ -20,8 +20,9 @@ from sb3_yann.control.linear_system import (
     with_units,
 )
 from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, costs_of
+from sb3_yann.control.mpc.report import ActiveConstraints
 from sb3_yann.env_pool import one_env
-from sb3_yann.evaluation.plots import ActiveConstraints, plot_regions
+from sb3_yann.evaluation.plots import plot_regions
 from sb3_yann.reporting.subject import (
     OF_MPC,
     OF_POLICY,

@@ -292,14 +292,6 @@ class LinearModel(LinearSystem):
             As of :meth:`sb3_yann.Log.from_arrays`.
         **options
             As of :func:`sb3_yann.identify`, which also returns standard errors.
-
-        Examples
-        --------
-        >>> x, u = np.zeros((101, 1)), np.random.default_rng(0).normal(size=(100, 1))
-        >>> for k in range(100):
-        ...     x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
-        >>> LinearModel.from_data(x, u, dt=1).B.round(6).tolist()
-        [[0.5]]
         """
         log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
         return cls(**vars(fit_log(log, **options).system))

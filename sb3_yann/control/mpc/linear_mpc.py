@@ -688,25 +688,14 @@ def _choose_penalty(problem: MPCProblem) -> None:
     slack would cost so much more than inputs that solvers lose digits, down to ten times the share
     of a unit in that cost, which multipliers are like.
     """
-    soft = problem.soft
-    cost, wide = _cost_of_coming_back(problem)
-    most = 100 * cost * max(1.0, wide)
-    soft._store(penalty=most)
-    with contextlib.suppress(ValueError):  # the laws say so
-        steep = steepness(condense(problem)[0], problem.u_min, problem.u_max)
-        soft._store(penalty=most if steep <= 1 else max(most / steep, 10 * cost * wide))
-
-
-def _cost_of_coming_back(problem: MPCProblem) -> tuple[float, float]:
-    """Return that cost, and the largest unit of violation in parts of its bound."""
     n = problem.model.n_states
     given = [problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]]
     sizes = np.abs([np.where(np.isfinite(each), each, 0.0) for each in given])
     x = np.where(np.any(sizes[:2] > 0, axis=0), sizes[:2].max(axis=0), sizes.max(axis=0))
     limits = np.abs([problem.u_min, problem.u_max])
     u = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
-    cost = problem.terminal.cost[:n, :n]
-    total = x @ (np.abs(problem.Q) + np.abs(cost)) @ x + u @ np.abs(problem.R) @ u
+    terminal = problem.terminal.cost[:n, :n]
+    total = x @ (np.abs(problem.Q) + np.abs(terminal)) @ x + u @ np.abs(problem.R) @ u
     total += problem.horizon * (np.abs(problem.price.x) @ x + np.abs(problem.price.u) @ u)
     sides = [np.abs(problem.limits[kind]) for kind in ("y", "mixed")]
     y, mixed = (np.where(np.isfinite(each), each, 0.0).max(axis=0) for each in sides)
@@ -719,4 +708,9 @@ def _cost_of_coming_back(problem: MPCProblem) -> tuple[float, float]:
             "neither states nor inputs have a bound that costs anything. Pass the cost of one unit "
             "of violation."
         )
-    return float(total), wide
+    cost = float(total)
+    most = 100 * cost * max(1.0, wide)
+    problem.soft._store(penalty=most)
+    with contextlib.suppress(ValueError):  # the laws say so
+        steep = steepness(condense(problem)[0], problem.u_min, problem.u_max)
+        problem.soft._store(penalty=most if steep <= 1 else max(most / steep, 10 * cost * wide))

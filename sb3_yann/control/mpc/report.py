@@ -136,18 +136,34 @@ def _stay_feasible(problem: MPCProblem, law: Law, theta: Array) -> Array:
     return kept
 
 
+class ActiveConstraints:
+    """Names the constraints that are active in the optimal plan at a theta."""
+
+    def __init__(self, problem: MPCProblem) -> None:
+        program, self.names = condense(problem)
+        self.units = ProgramUnits(program, problem.deviations.u_min, problem.deviations.u_max)
+
+    def at(self, theta: Array) -> list[str] | None:
+        """Return the active constraints at theta (n_theta,), None where no plan is feasible."""
+        scaled = self.units.scaled
+        z = (theta - self.units.center) / self.units.half
+        U = scaled.solve(z)
+        if U is None:
+            return None
+        slack = scaled.w + scaled.S @ z - scaled.G @ U  # of unit rows, in half-widths
+        return [*dict.fromkeys(self.names[i] for i in np.flatnonzero(slack < 1e-7))]
+
+    def __call__(self, region: int, theta: Array) -> str:
+        """Return what a picture calls a region that holds theta."""
+        return ", ".join(self.at(theta) or ()) or "no constraint acts"
+
+
 def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
     """Yield which constraints act in the optimal plan, anywhere in the horizon."""
-    program, names = condense(problem)
-    units = ProgramUnits(program, problem.u_min, problem.u_max)
-    scaled = units.scaled
-    counts = dict.fromkeys(names, 0)
-    for theta in bar("plans at random parameters", (feasible - units.center) / units.half):
-        U = scaled.solve(theta)
-        if U is None:  # on the border of the domain
-            continue
-        slack = scaled.w + scaled.S @ theta - scaled.G @ U
-        for name in {names[i] for i in np.flatnonzero(slack < 1e-7)}:
+    acting = ActiveConstraints(problem)
+    counts = dict.fromkeys(acting.names, 0)
+    for theta in bar("plans at random parameters", feasible):
+        for name in acting.at(theta) or ():  # none on the border of the domain
             counts[name] += 1
     yield "Constraints that act in the plan, as a share of the feasible parameters:"
     ranked = sorted(counts.items(), key=lambda item: -item[1])
