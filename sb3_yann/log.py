@@ -290,8 +290,6 @@ class Log:
         time_unit : str, optional
             Of ``dt``; by default that of the column of times.
         """
-        disturbances = disturbances or ()
-        references = references or ()
         for name, given in (("states", states), ("inputs", inputs)):
             if isinstance(given, str) or not given:
                 raise ValueError(f"{name} = {given!r} must be a list of column names.")

@@ -254,23 +254,16 @@ class _Step(NamedTuple):
     """Whether a violation may have changed the reward."""
 
 
+@dataclass
 class _Envs:
     """One env for each episode; those that are over wait for the others."""
 
+    envs: Sequence[gym.Env[Any, Any]]
+    resets: Sequence[tuple[int, dict[str, Any] | None]]
+    problem: LinearMPC | None
+    each: Callable[..., Iterable[Any]]
+    steps: int = 0  # of the episode, the one that is under way included
     steps_all = False
-
-    def __init__(
-        self,
-        envs: Sequence[gym.Env[Any, Any]],
-        resets: Sequence[tuple[int, dict[str, Any] | None]],
-        problem: LinearMPC | None,
-        each: Callable[..., Iterable[Any]] = map,
-    ) -> None:
-        self.envs = envs
-        self.resets = resets
-        self.problem = problem
-        self.each = each
-        self.steps = 0  # of the episode, the one that is under way included
 
     def reset(self) -> NDArray[Any]:
         """Return the first observations (k, n)."""

@@ -1,8 +1,4 @@
-"""The YANN layers: a law, exactly, plus trainable networks that are zero at first.
-
-They put out actions in [-1, 1], which stand for ``u_min`` and ``u_max`` of the law. `YannLayer` has
-a network for each region, as in the paper. `SharedYannLayer` has one network for any law.
-"""
+"""The YANN layers: a law, exactly, plus trainable networks that are zero at first."""
 
 from __future__ import annotations
 

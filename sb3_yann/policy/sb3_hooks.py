@@ -1,8 +1,4 @@
-"""What a policy does around Stable-Baselines3 and PyTorch.
-
-It asks for its algorithm, scales its learning rate, keeps its precision, and leaves out of replay
-buffers and gradients what is not finite.
-"""
+"""What a policy does around Stable-Baselines3 and PyTorch."""
 
 from __future__ import annotations
 

@@ -39,7 +39,6 @@ LEAST_GAIN = 0.6
 """A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
 MUCH_BETTER = 0.8  # share of the model's squared error that a unit's factor leaves at most
 ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
-MOVING = 1e-3  # of a standard deviation: a state that moves by more in a step moves
 PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
 LEAST_ROWS = 20  # rows of a regression on the law, at least
 LAW = 1e-3  # how far an input may be from the MPC's own, in half-widths

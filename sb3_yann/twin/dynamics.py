@@ -1,8 +1,4 @@
-"""The dynamics of a twin: the linear model, and what the plant does beyond it.
-
-A residual is a function of states, disturbances and inputs in scaled coordinates: see
-:class:`Coordinates`.
-"""
+"""The dynamics of a twin: the linear model, and what the plant does beyond it."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ from sb3_yann.twin.row_layout import RowLayout
 
 
 class Residual:
-    """``y = tanh(tanh(z W1 + b1) W2 + b2) W3 + b3 + z L + z' Q z``.
+    """``y = tanh(tanh(z W1 + b1) W2 + b2) W3 + b3 + z L + z' Q z`` of scaled :class:`Coordinates`.
 
     Without hidden units it is a polynomial, and without L, Q and b3 the linear model as it is.
     Weights are W1 (k, h), b1 (1, h), W2 (h, h), b2 (1, h), W3 (h, n), b3 (1, n), L (k, n) and Q (k,
@@ -294,7 +290,7 @@ class Dynamics:
 
         def inputs(t: int, rows: Array) -> Array:
             u = np.asarray(act(self.row.shown(rows.reshape(-1, rows.shape[-1]))), np.float64)
-            return u.reshape(*rows.shape[:2], self.m)
+            return u.reshape(*rows.shape[:2], self.problem.model.n_inputs)
 
         return self._play(inputs, starts, steps, given)
 
@@ -322,9 +318,5 @@ class Dynamics:
         self, act: Callable[[int, Array], Array], starts: Array, steps: int, given: Array | None
     ) -> tuple[Array, Array]:
         fixed = None if given is None else (self.row.given, given)
-        return play(act, lambda t, rows, u: self.step(rows[t], u[t]), starts, steps, self.m, fixed)
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return self.problem.model.n_inputs
+        m = self.problem.model.n_inputs
+        return play(act, lambda t, rows, u: self.step(rows[t], u[t]), starts, steps, m, fixed)

@@ -105,6 +105,9 @@ class PlantTwin(LearntModel):
     True
     >>> twin.env().reset(seed=0)[0].shape
     (4,)
+    >>> today = evaluate(twin.reidentified().explicit(), "CSTR-v0", seeds=range(5))
+    >>> bool(today.costs.mean() < log.costs.mean())
+    True
     """
 
     kind: str
@@ -244,16 +247,6 @@ class PlantTwin(LearntModel):
         With references or disturbances its operating point is where the plant rests today. Bounds
         and boxes are the same. The terminal cost is solved anew, and a terminal set is the new
         model's invariant one.
-
-        Examples
-        --------
-        >>> from sb3_yann.evaluation import evaluate
-        >>> from sb3_yann_envs import problems
-        >>> log = evaluate(problems.cstr().explicit(), "CSTR-v0", seeds=range(5))
-        >>> twin = PlantTwin.fit(problems.cstr(), [*zip(log.observations, log.actions)])
-        >>> today = evaluate(twin.reidentified().explicit(), "CSTR-v0", seeds=range(5))
-        >>> bool(today.costs.mean() < log.costs.mean())
-        True
         """
         self.require_trust()
         return reidentified(self.problem, self.dynamics.coordinates, self.episodes)

@@ -1,13 +1,9 @@
-"""Residuals fitted to a log, and which one counts: the one that free runs held out ask for.
-
-There are none, polynomials that are shrunk, and small networks, fitted in torch side by side. A
-linear one makes the re-identified MPC.
-"""
+"""Residuals fitted to a log, and which one counts: the one that free runs held out ask for."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -123,10 +119,6 @@ class _Networks:
         """Return arrays as one tensor."""
         return th.as_tensor(np.asarray(parts), dtype=self.dtype)
 
-    def __call__(self, z: th.Tensor) -> th.Tensor:
-        """Return what the networks make of z (members, batch, k)."""
-        return _network(self.weights, (z - self.center) / self.width) * self.unit
-
     def fit_steps(self, pairs: list[list[Array]], iterations: int) -> None:
         """Fit them to single steps: each by itself, side by side, on all rows, by L-BFGS."""
         stopped = Event()
@@ -192,7 +184,9 @@ class _Networks:
             windows.append(
                 np.concatenate([sliding_window_view(p, ahead + 1, axis=0) for p in parts])
             )
-        data = self.tensor(_same_length(windows))  # (members, windows, k, ahead + 1)
+        longest = max(map(len, windows))  # short ones are repeated
+        whole_windows = [each[np.arange(longest) % len(each)] for each in windows]
+        data = self.tensor(whole_windows)  # (members, windows, k, ahead + 1)
         linear = self.tensor(row.linear[row.state][:, row.inputs].T)
         low, high, scale, units = (
             self.tensor(each)
@@ -200,26 +194,22 @@ class _Networks:
         )
         turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
         per_turn = th.where(turn > 0, 1 / turn, 0.0)
-        for _ in self._steps(FIT_RATE, updates):
+        adam = th.optim.Adam(self.weights, lr=FIT_RATE)
+        schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
+        for _ in bar("networks of a model: steps of Adam", range(updates), timed=True):
             chosen = th.randint(data.shape[1], (WINDOWS,), generator=self.generator)
             window = data[:, chosen]
             x = window[..., :n, 0]
             loss = th.zeros((), dtype=self.dtype)
             for t in range(ahead):
                 features = th.cat([x, window[..., n:, t]], dim=-1)
-                x = features @ linear + self(features.clamp(low, high) / scale)
+                z = (features.clamp(low, high) / scale - self.center) / self.width
+                x = features @ linear + _network(self.weights, z) * self.unit
                 after = window[..., :n, t + 1]
                 x = x - turn * ((x - after) * per_turn).detach().round()  # an angle may have jumped
                 loss = loss + (((x - after) / units) ** 2).mean()
-            loss.backward()  # type: ignore[no-untyped-call]
-
-    def _steps(self, rate: float, updates: int) -> Iterator[None]:
-        """Yield before each gradient; then step."""
-        adam = th.optim.Adam(self.weights, lr=rate)
-        schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
-        for _ in bar("networks of a model: steps of Adam", range(updates), timed=True):
             adam.zero_grad()
-            yield
+            loss.backward()  # type: ignore[no-untyped-call]
             th.nn.utils.clip_grad_norm_(self.weights, 10.0)
             adam.step()
             schedule.step()
@@ -264,12 +254,6 @@ def _of_one_seed(log: Sequence[Episode]) -> NDArray[np.intp] | None:
         if e.seed == f.seed is not None
     ]
     return np.concatenate(found, axis=1).T if found else None
-
-
-def _same_length(parts: list[Array]) -> Array:
-    """Return arrays (rows, ...) as one (members, rows, ...): short ones are repeated."""
-    longest = max(map(len, parts))
-    return np.array([each[np.arange(longest) % len(each)] for each in parts])
 
 
 DEGREES = {"linear": 1, "quadratic": 2}
@@ -524,7 +508,12 @@ def reidentified(
     x: Array = np.zeros(n)
     u: Array = np.zeros(m)
     if problem.layout.has_constants:  # else the operating point is where it is to be held
-        x, u = _rest(problem, A, B, residual.predict(middle)[0])
+        # What drifts acts as a constant disturbance does: at rest ``C x = 0`` despite it.
+        drifting = LinearModel(A, B, model.dt, E=residual.predict(middle)[0][:, None])
+        weights = problem.Q, problem.R, problem.theta_half[problem.layout.state], problem.u_half
+        rest = steady_states(drifting, problem.tracking.C, *weights)
+        x = rest.x[:, -1]
+        u = rest.u[:, -1]
     note = f"Re-identified from {len(log)} episodes: {choice.name}."
     own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
     own |= {"notes": [note], "drift": None, "gains": None}  # what was said of the given one
@@ -533,14 +522,3 @@ def reidentified(
     with warnings.catch_warnings():  # what it is told of boxes that are not its own
         warnings.simplefilter("ignore")
         return replace(problem, model=found, terminal=terminal)
-
-
-def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
-    """Return the state (n,) and the input (m,) that rest despite the drift (n,), with ``C x = 0``.
-
-    The drift acts as a constant disturbance does.
-    """
-    drifting = LinearModel(A, B, problem.model.dt, E=drift[:, None])
-    weights = problem.Q, problem.R, problem.theta_half[problem.layout.state], problem.u_half
-    found = steady_states(drifting, problem.tracking.C, *weights)
-    return found.x[:, -1], found.u[:, -1]
