@@ -200,6 +200,11 @@ class SimulatedEpisodes(BaseCallback):
     seed : int, default 2_000_000
         Of the first episode in the simulator, from which the others count on, and of what is drawn.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If the model has no YannPolicy, or the simulator is the training env or shaped otherwise.
+
     Examples
     --------
     >>> from stable_baselines3 import DDPG

@@ -207,6 +207,11 @@ class Log:
             10 % are left out, and the episode is cut there; 30 % where stamps jitter about a grid.
         time_unit : str, optional
             Of ``dt`` and ``time``, for reports and plots.
+
+        Raises
+        ------
+        ValueError
+            For shapes that do not fit, or numbers that are not finite.
         """
         records = _records({"states": states, "actions": inputs, "disturbances": disturbances})
         if sum(map(len, records)) < 2:
@@ -265,10 +270,9 @@ class Log:
 
         A row holds the state at a sample and the inputs that act from there on. An episode ends
         before the row in which ``episode`` changes, or where ``time`` jumps or a reading is
-        missing; it needs no mark in the file. States that are read now and then, as a laboratory's,
-        are NaN in between. The last row of an episode is the state that the last inputs led to: the
-        inputs of that row do not count. Without ``episode`` and ``time`` all rows are one episode,
-        and a warning names the columns that may tell.
+        missing; it needs no mark in the file. Its last row is the state that the last inputs led
+        to: the inputs of that row do not count. Without ``episode`` and ``time`` all rows are one
+        episode, and a warning names the columns that may tell.
 
         Parameters
         ----------
@@ -289,6 +293,13 @@ class Log:
             Between two columns.
         time_unit : str, optional
             Of ``dt``; by default that of the column of times.
+
+        Raises
+        ------
+        ValueError
+            For a column that is not there or there twice, a row that holds no number where it
+            should, or one that is longer than the header. An episode ends where a reading is
+            missing, but for states that are read now and then, as a laboratory's: these stay NaN.
         """
         for name, given in (("states", states), ("inputs", inputs)):
             if isinstance(given, str) or not given:

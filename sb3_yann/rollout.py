@@ -148,6 +148,11 @@ def evaluate(
     starts : sequence of array_like, optional
         The state of each start, ``env.reset(options={"state": ...})``, for envs that have one.
 
+    Raises
+    ------
+    RuntimeError
+        If an episode does not end.
+
     Examples
     --------
     >>> import gymnasium

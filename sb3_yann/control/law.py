@@ -153,6 +153,11 @@ class PlantLaw(ReadOnlyArrays):
         shown : array_like, shape (n_theta,) or (batch, n_theta)
             References, disturbances and the previous input count from the plant's zero too.
 
+        Raises
+        ------
+        ValueError
+            If the law knows no plant.
+
         Examples
         --------
         >>> from sb3_yann.control import LinearMPC

@@ -91,6 +91,12 @@ def plot_law(
     Axes
         Each region is a polygon whose ``get_gid()`` is its number, but for a single parameter.
 
+    Raises
+    ------
+    ValueError
+        If ``entries`` are not two different ones of theta, the box is not bounded there, or the
+        law is solved online.
+
     Examples
     --------
     >>> from sb3_yann_envs import problems

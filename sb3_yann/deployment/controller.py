@@ -215,6 +215,11 @@ class Controller:
             The operator's output where he asks for it; otherwise it is held while manual. At the
             first step it is the plant's present input, whoever acts: the output goes on from it,
             and the estimator starts at rest there. Without it, it starts at the operating point.
+
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, or ``request`` is none of the three.
         """
         rows, single = self._rows(obs, len(self._good))
         if not single or self.request not in MODES:

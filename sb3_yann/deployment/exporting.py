@@ -69,8 +69,7 @@ def export(
     """Write a controller that runs without this package, as a file or as code.
 
     It is what `model.predict` is, law, networks, bounds and all, in the precision asked for; and a
-    step that checks the readings and falls back, see :class:`Controller`. After an error nothing is
-    written.
+    step that checks the readings and falls back, see :class:`Controller`.
 
     Parameters
     ----------
@@ -103,6 +102,11 @@ def export(
     -------
     Exported
         What was written, and what a step costs; print it.
+
+    Raises
+    ------
+    ImportError, OSError, TypeError, ValueError
+        If there is no such export; nothing is written then.
 
     Examples
     --------

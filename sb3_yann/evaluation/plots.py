@@ -342,6 +342,11 @@ def loops_figure(
         Entries of ``[theta, u]``: indices, or names as in ``problem.labels()``, or an input's; all
         states and inputs by default.
 
+    Raises
+    ------
+    ValueError
+        If there are no episodes, or these are not of the problem's theta and inputs.
+
     Examples
     --------
     >>> from sb3_yann.evaluation import evaluate

@@ -362,6 +362,11 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         ----------
         low, high : array_like, shape (n_theta,)
             Edges of the box, or None for both.
+
+        Raises
+        ------
+        ValueError
+            If an edge has another shape or is not finite, or ``low`` is above ``high``.
         """
         box = checks.as_box(low, high, self.problem.n_theta)
         for actor in (self.actor, self.actor_target):
@@ -489,6 +494,11 @@ class YannPolicy(StartsAsMPC, TD3Policy):
         ``n_critics``, ``optimizer_class`` and ``optimizer_kwargs``, as in SB3's `TD3Policy`. For
         Adam, the actor of more than 32 regions has :class:`RowAdam`. Arguments for features must
         keep their defaults: theta must reach the law as it is.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no problem, spaces or algorithm do not fit it, or a keyword is not known.
 
     Examples
     --------

@@ -139,7 +139,7 @@ class PlantTwin(LearntModel):
         units_confirmed: bool = False,
         progress_bar: bool = True,
     ) -> PlantTwin:
-        """Return the twin of a plant that was logged, not trusted where the log says little.
+        """Return the twin of a plant that was logged.
 
         Parameters
         ----------
@@ -172,6 +172,11 @@ class PlantTwin(LearntModel):
             saying.
         progress_bar : bool, default True
             Whether to show what takes more than three seconds.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For a log that cannot be read; one that says little makes a twin that is not trusted.
         """
         if not isinstance(problem, LinearMPC):
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
@@ -239,7 +244,7 @@ class PlantTwin(LearntModel):
         return plots.plot_twin(self.trust, axes)
 
     def reidentified(self) -> LinearMPC:
-        """Return the MPC of the same costs, bounds and horizon with a model of a trusted log.
+        """Return the MPC of the same costs, bounds and horizon with a model of the log.
 
         Its A, B and E are fitted to the log, and shrunk towards the given ones as far as held-out
         free runs ask for it. It is :attr:`problem` itself where no linear model predicts better.
@@ -247,6 +252,13 @@ class PlantTwin(LearntModel):
         With references or disturbances its operating point is where the plant rests today. Bounds
         and boxes are the same. The terminal cost is solved anew, and a terminal set is the new
         model's invariant one.
+
+        Raises
+        ------
+        UntrustedTwinError
+            If the twin is not to be trusted.
+        ValueError
+            Where the new model has no steady state or no Riccati solution.
         """
         self.require_trust()
         return reidentified(self.problem, self.dynamics.coordinates, self.episodes)
@@ -268,7 +280,15 @@ class PlantTwin(LearntModel):
         return found
 
     def env(self) -> TwinEnv:
-        """Return a :class:`TwinEnv` of a trusted twin, with the plant's spaces."""
+        """Return a Gymnasium env with the twin's dynamics and the plant's spaces.
+
+        The seed of an episode decides which member acts: seed modulo members.
+
+        Raises
+        ------
+        UntrustedTwinError
+            If the twin is not to be trusted.
+        """
         self.require_trust()
         return TwinEnv(self)
 

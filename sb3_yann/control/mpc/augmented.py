@@ -63,6 +63,12 @@ def offset_free(
         Such as ``found.estimator()`` of `identify_outputs`. Its noise, and its ``every``, are the
         observer's, and a disturbance drifts slowly beside it: smoother where outputs are noisy.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If the MPC has estimated disturbances already, tracks what is not measured, or the
+        measurements do not tell the disturbances.
+
     Examples
     --------
     >>> import gymnasium as gym
@@ -143,6 +149,11 @@ def with_extra(mpc: LinearMPC, low: ArrayLike, high: ArrayLike) -> LinearMPC:
         Without a preview of disturbances.
     low, high : array_like, shape (k,), or float
         Where the signals lie: networks take them in half-widths of it.
+
+    Raises
+    ------
+    ValueError
+        If a bound is not finite, ``low`` is not below ``high``, or disturbances have a preview.
 
     Examples
     --------

@@ -141,6 +141,12 @@ class LinearMPC(MPCProblem):
         The number of samples in which the inputs move, before they stay; or for how many samples
         each move is held, which sum up to the horizon. The default is each sample.
 
+    Raises
+    ------
+    TypeError, ValueError
+        For a wrong type, shape, sign or order, where no Riccati solution exists, and where a
+        reference or a disturbance has no steady state.
+
     Examples
     --------
     >>> cart = LinearModel([[1, 1], [0, 1]], [[0], [1]], dt=1.0)
