@@ -47,6 +47,10 @@ class TruncatedNormal:
         self.below = th.special.ndtr(self.low)
         self.mass = th.special.ndtr(self.high) - self.below
 
+    def mode(self) -> th.Tensor:
+        """Return the center, (batch, m)."""
+        return self.center
+
     def sample(self) -> th.Tensor:
         """Return actions (batch, m), with a gradient by center and spread."""
         quantile = self.below + th.rand_like(self.m) * self.mass
@@ -358,7 +362,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         if not deterministic:
             self.says_that_it_explores()
         distribution = self.get_distribution(obs)
-        actions = distribution.center if deterministic else distribution.sample()
+        actions = distribution.mode() if deterministic else distribution.sample()
         return actions, self.predict_values(obs), distribution.log_prob(actions)
 
     def evaluate_actions(
@@ -377,7 +381,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         distribution = self.get_distribution(observation)
-        return distribution.center if deterministic else distribution.sample()
+        return distribution.mode() if deterministic else distribution.sample()
 
 
 PPO.policy_aliases["YannPolicy"] = YannPPOPolicy
