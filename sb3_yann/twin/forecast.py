@@ -81,12 +81,17 @@ class _Replays:
         last = [np.minimum(k[:-1], len(e) - 1) for e, k in zip(episodes, at, strict=True)]
         self.inputs = np.stack([e.actions[k] for e, k in zip(episodes, last, strict=True)], axis=1)
         self.alive = np.arange(steps)[:, None] < [len(each) for each in episodes]
-        predicted = np.stack([self._step(r, u) for r, u in self._logged()])
+        rows, inputs = (
+            np.repeat(each[:, None], self.members, axis=1) for each in (self.rows[:-1], self.inputs)
+        )
+        predicted = np.stack([self._step(r, u) for r, u in zip(rows, inputs, strict=True)])
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(self.alive[:, None, :, None], errors, 0.0)  # (T, members, N, n)
         self.weights = None
         if remembers:
-            basis = self._basis()
+            basis = np.stack(
+                [self._regressors(t, r, inputs, self.errors) for t, r in enumerate(rows)]
+            )
             self.weights = self._memory(basis)
         if self.weights is not None:
             remembered = np.einsum("tmnk,mkj->tmnj", basis, self.weights)
@@ -95,12 +100,6 @@ class _Replays:
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
         sizes = np.log(np.sum(unseen**2, axis=-1) + TINY_SQUARE)
         self.left = np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0)
-
-    def _logged(self) -> list[tuple[Array, Array]]:
-        return [
-            (np.repeat(r[None], self.members, axis=0), np.repeat(u[None], self.members, axis=0))
-            for r, u in zip(self.rows[:-1], self.inputs, strict=True)
-        ]
 
     def _step(self, rows: Array, u: Array) -> Array:
         with np.errstate(all="ignore"):
@@ -146,13 +145,6 @@ class _Replays:
         one = np.ones((*rows.shape[:-1], 1))
         x = rows[..., self.dynamics.row.state]
         return np.concatenate([one, x, inputs[t], *past, *before], axis=-1)
-
-    def _basis(self) -> Array:
-        """Return the regressors (T, members, N, k) of the log."""
-        inputs = np.stack([u for _, u in self._logged()])
-        return np.stack(
-            [self._regressors(t, r, inputs, self.errors) for t, (r, _) in enumerate(self._logged())]
-        )
 
     def _memory(self, basis: Array) -> Array | None:
         """Return weights (members, k, n) of a memory; None where there are few rows.
