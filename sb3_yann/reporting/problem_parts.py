@@ -100,7 +100,7 @@ def constraints_part(subject: Subject) -> Part:
     """Return the register of all constraints: bounds, where they act, and what the loops show."""
     problem = subject.problem
     loops = subject.loops or {}
-    plans = [ActiveConstraints(problem).at(theta) for theta in subject.samples]
+    plans = [*map(ActiveConstraints(problem).at, subject.samples)]
     solvable = [plan for plan in plans if plan is not None]
     acting = Counter(
         key for plan in solvable for key in {each.partition(" at its ")[0] for each in plan}
