@@ -130,17 +130,19 @@ class IdentifiedOutputs(ReadOnlyArrays):
 
     def estimator(self) -> StateEstimator:
         """Return the Kalman filter of this model, in deviations, for `wrappers.EstimateState`."""
+        spread = self.gain @ self.noise
+        gain = None
         if any(each > 1 for each in self.every):
             own = len(self.model.A) - sum(self.delays)  # the rest are inputs on their way
             gain = np.zeros_like(self.gain)
             gain[:own] = np.linalg.lstsq(self.model.A[:own, :own], self.gain[:own], rcond=None)[0]
-            return StateEstimator(self.model, every=self.every, gain=gain)
-        spread = self.gain @ self.noise
         return StateEstimator(
             self.model,
             state_noise=spread @ self.gain.T,
             measurement_noise=self.noise,
             cross_noise=spread,
+            every=self.every or 1,
+            gain=gain,
         )
 
     @property

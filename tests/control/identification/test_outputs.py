@@ -248,7 +248,9 @@ def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
     late = slice(60, None)
     for i in range(2):  # of a filter that reads each sample
         assert rms((guess - z[20:])[late, i]) < 1.2 * rms((best - z[20:])[late, i])
-    assert found.estimator().every.tolist() == [1, 10]
+    estimator = found.estimator()
+    assert estimator.every.tolist() == [1, 10]
+    np.testing.assert_allclose(estimator.noise["measurement_noise"], found.noise)  # offset_free
 
 
 @pytest.mark.nightly
