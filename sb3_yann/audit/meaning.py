@@ -74,11 +74,11 @@ def warn_of_signs(
     *,
     theta: Callable[[Array], Array] = np.asarray,
     inputs: Callable[[Array], Array] = np.asarray,
-) -> None:
+) -> int:
     """Warn where an input moves the states against the model or far otherwise, in the first step.
 
     Two steps from one start differ by that input alone: neither noise that the seed repeats, nor
-    what is not linear in the states, gets in. It costs a step of the env for each input and start.
+    what is not linear in the states, gets in. The steps that this takes are returned.
     Estimates go at first where their model goes: where an estimator stands between, its readings
     count, and inputs are held for `SIGN_STEPS`, since outputs may answer late. ``played`` are the
     MPC's episodes from the seeds; ``theta`` and ``inputs`` map what the env shows and takes to the
@@ -97,10 +97,14 @@ def warn_of_signs(
     starts = [i for i in range(len(seeds)) if len(played.actions[i])][:SIGN_STARTS]
     when = "a step" if steps == 1 else f"{steps} steps"
 
+    taken = 0
+
     def hold(i: int, action: Array) -> Array:
+        nonlocal taken
         env.reset(seed=seeds[i])
         found: list[Any] = []
         for _ in range(steps):
+            taken += 1
             after = theta(env.step(action)[0][None])[0, states]
             found.append(after if estimating is None else estimating.readings)
         return np.array(found)
@@ -148,6 +152,7 @@ def warn_of_signs(
     swapped = _swapped(told, answers) if estimating is not None else ""
     for words in [swapped] if swapped else said:
         warn(words)
+    return taken
 
 
 def _swapped(told: Array, answers: Array) -> str:

@@ -244,7 +244,7 @@ class ImprovementGuard(BaseCallback):
 
     @property
     def steps(self) -> int:
-        """Steps of its simulator in all runs, but those that check it, or whether a run goes on."""
+        """Steps of its simulator in all runs, those of its checks included."""
         return self.player.steps
 
     def plot(self, axes: Axes | None = None) -> Axes:
@@ -291,7 +291,7 @@ class ImprovementGuard(BaseCallback):
                     f"The guard's env {settings.env} does not play the episodes of before: it is "
                     "another simulator of that name. The policies are tried anew.",
                 )
-        player.steps = known.steps if known else 0  # as if it had never stopped
+        player.steps += known.steps if known else 0
         if not goes_on:
             player.max_input_step = None
             evidence, leading, refusals = first_evidence(player, settings, known)

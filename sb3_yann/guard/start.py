@@ -145,7 +145,7 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
     player.pays_cost = not np.mean(error) > OTHER_REWARD * options.reward_scale * np.mean(cost)
     with preserve_rng(), player.envs.acquire(1) as (env,):
         maps = {"theta": player.theta, "inputs": policy.inputs}
-        warn_of_signs(policy.problem, env, seeds, mpc, **maps)
+        player.steps += warn_of_signs(policy.problem, env, seeds, mpc, **maps)
     if player.interrupted:  # and a simulator has made of it what it can
         raise KeyboardInterrupt
 

@@ -214,7 +214,7 @@ class GuardState:
     step: float = 1.0
     episodes: int = 0
     last_trial: int | None = None
-    steps: int = 0
+    steps: int = field(default=0, compare=False)  # with those that check a run that goes on
     decisions: list[Decision] = field(default_factory=list)
 
     @property

@@ -34,7 +34,7 @@ REMEMBERED = (
 LESS = 0.02  # share of the errors of one step that it must explain on held-out episodes
 MEMORY_RIDGE = 1e-3  # of its standardized regressors
 MIN_RUNS = 100  # from new starts, at least
-DRAWS = 10_000  # of weights
+DRAWS = 10_000  # of the episodes' weights: fifty lie beyond the farthest end, at .5 %
 STEPS_PER_WEIGHT = 4  # steps of a log for each coefficient, at least
 
 

@@ -226,6 +226,7 @@ def test_steps_of_the_mpc_beyond_a_bound_are_counted_and_alarm_nobody() -> None:
     seed = next(seed for seed in range(50) if plant.begin(seed)[0] > 1.3)
     played = plant.play(plant.begin(seed), plant.mpc, None)
     assert played.violations == np.sum(played.thetas[1:, 0] > 1.0) > 0 == played.unsafe
+    assert played.alarm is None
     ours = plant.play(plant.begin(seed), plant.policy, None, allowed=0.0)
     assert ours.unsafe > 0 and ours.alarm.kind == "violation"
 
