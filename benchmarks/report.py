@@ -31,21 +31,21 @@ ON_THE_PAGE = {
     networks.PREDICT: "",
     networks.TRAIN: "`model.train(1)` with a full replay buffer, no network at zero any more.",
     offline.SECTION: "ppopt's times are those of its solver alone, ours hold the check of every "
-    "region as well. All find the same number of regions.",
+    "region as well.",
     exactness.SECTION: "A third to a fifth of the points are random in the box, the others on "
-    "faces of every dimension of all regions. A plain scan looks for them, region by region.",
+    "faces of every dimension of all regions.",
     large.SECTION: "",
     online.LAW: "",
     online.EXACT: "The plan is solved for again, and its optimality checked.",
     deployment.SECTION: "",
 }
 """The sections of the page, and what each has to say; `make bench` prints all."""
-PRINTED_ALONE = {evaluation.LOCATE, offline.EACH, peers.NO_OVERLAP}
+PRINTED_ALONE = {evaluation.LOCATE, offline.EACH, peers.NO_OVERLAP, deployment.SINGLE}
 """Rows that `make bench` prints and the page leaves out."""
 LEGEND = (
     "What is compared was measured in turns, after a warm-up, and its answers were compared first. "
     "Cells are medians; after a colon, how many times the first row's time that is, turn by turn. "
-    "`make bench` prints the quartiles as well, and more sections."
+    "`make bench` prints more."
 )
 
 
@@ -101,4 +101,4 @@ def _sections(figures: Figures) -> Iterator[str]:
         rows = [[name, *cells] for name, cells in found if name not in PRINTED_ALONE]
         header = ["", *map(heading, figures.columns(section))]
         parts = (f"## {TITLES[section]}", ON_THE_PAGE[section], table(header, rows))
-        yield "\n\n".join(parts)
+        yield "\n\n".join(filter(None, parts))
