@@ -105,10 +105,28 @@ class _Replays:
         with np.errstate(all="ignore"):
             return self.dynamics.step(rows, u)
 
-    def costs(self, act: Feedback, starts: Array) -> Array:
+    def new_given(self, some: int, rng: np.random.Generator) -> Array:
+        """Return references and loads (T, N * some, p) of new episodes, ``some`` like each logged.
+
+        A smoothed bootstrap (Silverman, *Density Estimation*, section 6.4.1): at each step mean
+        and variance over the episodes stay.
+        """
+        part = self.dynamics.row.given
+        own = self.dynamics.problem.deviations
+        logged = self.rows[:-1, :, part]
+        count, p = logged.shape[1:]
+        width = count ** (-1 / (4 + p))  # of a kernel, in standard deviations
+        mean = logged.mean(axis=1, keepdims=True)
+        one, other = logged[:, rng.integers(count, size=(2, count * some))].swapaxes(0, 1)
+        moved = np.repeat(logged - mean, some, axis=1) + width * (one - other) / np.sqrt(2)
+        new = mean + moved / np.sqrt(1 + width**2)
+        return np.asarray(np.clip(new, own.theta_min[part], own.theta_max[part]))
+
+    def costs(self, act: Feedback, starts: Array, given: Array | None = None) -> Array:
         """Return what episodes like each logged one cost with a policy on average, (members, N).
 
-        Those that go on as episode i does begin at ``starts[i]`` (some, size).
+        Those that go on as episode i does begin at ``starts[i]`` (some, size). What is ``given``,
+        (T, N * some, p), is as logged by default.
         """
         problem = self.dynamics.problem
         row = self.dynamics.row
@@ -133,8 +151,9 @@ class _Replays:
 
         with np.errstate(all="ignore"):
             begins = np.repeat(starts.reshape(1, -1, size), self.members, axis=0)
-            given = row.given, self.rows[:-1, like, row.given]
-            rows, inputs = play(inputs_at, step, begins, steps, m, given)
+            if given is None:
+                given = self.rows[:-1, like, row.given]
+            rows, inputs = play(inputs_at, step, begins, steps, m, (row.given, given))
             found, _ = costs_of(problem, row.shown(rows), inputs, alive[:, None])
         found = np.where(np.isfinite(found), found, np.inf)
         return np.asarray(found.reshape(self.members, count, some).mean(axis=2))
@@ -193,19 +212,21 @@ def forecast(
     """Return what a policy changes on the plant: 90 % of true changes shall lie inside.
 
     It is the union of the judges' intervals, of runs from the log's own starts, and of others from
-    the box of all starts, which no policy was fitted to. Of each, the standard error is that over
-    the episodes, with that of a fit without each fold of them (the jackknife). Where its errors
-    follow earlier inputs and errors, the judge is asked again with a memory of them. The first
-    judge is the twin's own; ``loosest`` is the input that follows the MPC most closely.
+    the box of all starts at new set-points and loads, which no policy was fitted to. Of each, the
+    standard error is that over the episodes, with that of a fit without each fold of them (the
+    jackknife). Where its errors follow earlier inputs and errors, the judge is asked again with a
+    memory of them. The first judge is the twin's own; ``loosest`` is the input that follows the MPC
+    most closely.
     """
     independent = sum(len(each[::2]) for each in records(judges[0].dynamics.problem, episodes))
     count = len(episodes)
     rng = np.random.default_rng(0)
     some = -(-MIN_RUNS // count)
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
-    begins = [np.stack([each.thetas[:1] for each in episodes]), drawn.reshape(count, some, -1)]
-    found: list[tuple[float, float, float, str]] = []
     plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
+    logged = np.stack([each.thetas[:1] for each in episodes]), None
+    new = drawn.reshape(count, some, -1), plain.new_given(some, rng)
+    found: list[tuple[float, float, float, str]] = []
     for judge in bar("forecasts by models of the log", judges, timed=True):
         law = law_of(judge.dynamics.problem)
         for remembers in (False, True):
@@ -215,8 +236,8 @@ def forecast(
             if surely_worse(replays.left - (own if remembers else plain).left):
                 continue
             says = REMEMBERED if remembers else judge.says
-            for first in begins:
-                mpc, policy = (replays.costs(each, first) for each in (law, act))
+            for scenario in (logged, new):
+                mpc, policy = (replays.costs(each, *scenario) for each in (law, act))
                 found.append((*_changed(mpc, policy, independent), says))
     low = [each[1] for each in found]
     high = [each[2] for each in found]

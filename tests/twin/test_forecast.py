@@ -6,15 +6,17 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG
 
 from sample_plants import Sampled
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, improve
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import plant_twin
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.forecast import REMEMBERED, Forecast, _changed, _cure, _Replays
 from sb3_yann.twin.trust import costs_of
+from sb3_yann.wrappers import SetPoint
 from sb3_yann_envs import ProblemBox
 from twin_samples import POLYNOMIALS, problem
 from twin_samples import twin as cart_twin
@@ -85,6 +87,23 @@ def test_the_truth_lies_within_the_interval() -> None:
         after = evaluate(lambda x, act=act: act(x[None])[0], lambda: copy.copy(plant), seeds).costs
         _, low, high, _ = found.forecast(act)
         assert low <= after.sum() / before.sum() - 1 <= high and high - low < 0.2
+
+
+@pytest.mark.parametrize(("levels", "sure"), [((0.4, 0.4), True), ((-0.4, 0.4), False)])
+def test_new_set_points_lie_between_those_of_the_log(levels: tuple[float, float], sure) -> None:
+    tracking = Tracking([0], -0.5, 0.5)
+    mpc = LinearMPC(MPC.model, Q=[[1]], R=[[0.08]], horizon=3, u_min=-1, u_max=1,
+                    theta_min=-2, theta_max=2, tracking=tracking)  # fmt: skip
+    log = []
+    for r in levels:
+        env = TimeLimit(SetPoint(Lagging(0.0, 1.0), r, r), 30)
+        log += evaluate(mpc.law(), lambda env=env: copy.deepcopy(env), range(3)).pairs
+
+    def act(theta: np.ndarray) -> np.ndarray:
+        return law_of(mpc)(theta) + 0.5 * (np.abs(theta[:, 1:]) < 0.3)
+
+    _, low, high, _ = PlantTwin.fit(mpc, log, residuals=POLYNOMIALS).forecast(act)
+    assert low == 0 and (high == 0) == sure
 
 
 def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> None:

@@ -29,14 +29,6 @@ def test_a_simulation_is_the_law_on_its_model() -> None:
     assert np.abs(thetas[-1]).max() < 0.1
 
 
-def test_it_plays_the_law_that_was_chosen(monkeypatch) -> None:
-    mpc = small_mpc()
-    online = mpc.law("online")
-    monkeypatch.setattr(LinearMPC, "explicit", None)  # nothing is searched for
-    thetas, inputs = mpc.simulate([-3, 1], 5)
-    np.testing.assert_array_equal(inputs, online(thetas[:-1]))
-
-
 def test_r_stays_and_u_prev_follows() -> None:
     mpc = small_mpc(tracking=Tracking([0], -2, 2), rate=RateLimits(-0.5, 0.5))
     thetas, inputs = mpc.simulate([0, 0, 1.0, 0], 30)
@@ -147,11 +139,6 @@ def test_active_constraints_are_shares_of_the_feasible_parameters() -> None:
     assert "never: u[0] at its upper bound" in text
 
 
-def test_a_seed_below_zero_is_named() -> None:
-    with pytest.raises(ValueError, match="seed = -1 must be a whole number of at least 0"):
-        solved("servo").report(seed=-1)
-
-
 def test_a_parameter_without_a_solution_is_said_to_be_none() -> None:
     text = sample_problem("origin outside the box").report(samples=20)
     assert "\n  [0, 0] -> u = " in text and text.count("(not feasible)") == 1
@@ -191,15 +178,6 @@ def test_regions_of_a_very_large_program_are_not_looked_for(monkeypatch) -> None
     monkeypatch.setattr(LinearMPC, "_solved", None)
     with pytest.warns(OnlineLawWarning, match="801 constraints on 165 parameters, too many"):
         assert isinstance(wide_plant().law(), OnlineLaw)
-
-
-def test_a_law_that_fails_its_check_is_not_taken(monkeypatch) -> None:
-    def failing(self, *args, **kwargs):
-        raise ExplicitSolutionError("It is wrong: somewhere.")
-
-    monkeypatch.setattr(LinearMPC, "_solved", failing)
-    with pytest.warns(OnlineLawWarning, match="It is wrong"):
-        assert isinstance(servo().law(), OnlineLaw)
 
 
 def test_what_was_solved_is_taken_whatever_its_size(monkeypatch) -> None:
