@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import EXCESS_ROOM, less_safe, unsafe_columns
+from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import (
     labels_of,
@@ -19,7 +19,7 @@ from sb3_yann.control.linear_system import (
     missing_observer,
     with_units,
 )
-from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, costs_of
+from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, costs_of, penalty_rounding
 from sb3_yann.control.mpc.report import ActiveConstraints
 from sb3_yann.env_pool import one_env
 from sb3_yann.evaluation.plots import plot_regions
@@ -186,7 +186,10 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
             np.mean([costs_of(problem, *pair)[0] for pair in loops[who].pairs])
             for who in (OF_MPC, OF_POLICY)
         )
-        costs_more = new > old * (1 + 1e-6) and policy.penalty.mean() > mpc.penalty.mean()
+        steps = np.array([len(inputs) for _, inputs in loops[OF_POLICY].pairs])
+        rounding = np.mean(steps * penalty_rounding(problem, mpc.any_bound))
+        room = max(COST_ROUNDING * old, rounding)
+        costs_more = new > old + room and policy.penalty.mean() > mpc.penalty.mean()
         text = (
             "Penalty of the soft bounds in an episode, on average: "
             f"{policy.penalty.mean():.4g} with the policy, {mpc.penalty.mean():.4g} with the "

@@ -33,6 +33,7 @@ from sb3_yann import (
     NoActionNoise,
     PlantTwin,
     RateLimits,
+    SoftBounds,
     StateEstimator,
     offset_free,
     report,
@@ -42,6 +43,7 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement.confirmation import Check
 from sb3_yann.improvement.improving import Improvement
 from sb3_yann.reporting import evidence_parts, problem_parts
+from sb3_yann.reporting.subject import OF_MPC, OF_POLICY
 from sb3_yann.wrappers import EstimateState, PlantEnv, PreviousInput
 from sb3_yann_envs import problems
 from weights import last_layer, unpin
@@ -334,6 +336,21 @@ def test_starts_beyond_those_of_episodes_are_a_finding_of_their_own(takes) -> No
         with th.no_grad():
             for weights in model.actor.mu.network.parameters():
                 weights += 0.3
+
+
+def test_a_penalty_that_rounding_alone_makes_larger_is_no_failure() -> None:
+    tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
+    box = {"x_max": 13, "u_min": 0, "u_max": 10, "theta_min": 0, "theta_max": 20}
+    mpc = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=3, soft=SoftBounds(1), **box)
+    env = PlantEnv(lambda x, u: 0.1 * (32 - x) + 0.5 * (u - 3), mpc, start_low=13, start_high=14)
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": mpc})
+    unpin(model)
+    for size, verdict in ((3e-7, "passed"), (1e-5, "failed")):  # of the input's half range
+        with th.no_grad():
+            last_layer(model)[..., -1] = size
+        loops = subject_of(model, env=env).loops
+        assert np.all(loops[OF_POLICY].excess.penalty > loops[OF_MPC].excess.penalty)
+        assert problem_parts._bound_findings(mpc, loops)[1].verdict == verdict
 
 
 def check_that_costs_add_up(page: str) -> None:
