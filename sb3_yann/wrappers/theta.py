@@ -249,6 +249,8 @@ class SetPoint(Appending):
         self._last: Array = self.reference
         self._ahead: list[Array] = [self._last]
         self._own: np.random.Generator | None = None
+        for step in range(0 if schedule is None or callable(schedule) else len(schedule)):
+            self._next(step)  # an error for one beyond low and high
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode, with another reference: a seed draws the same one again."""

@@ -609,20 +609,21 @@ def _warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> No
 
 
 def _warn_of_unreachable(tracking: Tracking, bounds: Bounds, box: Bounds) -> None:
-    """Warn where bounds and box of the states leave a tracked output no set-point of its range."""
+    """Warn where bounds and box of the states leave a tracked output few set-points or none."""
     C = tracking.C[..., None]
     both = np.maximum(bounds[0], box[0]), np.minimum(bounds[1], box[1])
     with np.errstate(invalid="ignore"):  # 0 times an open side
         ends = np.where(C != 0, C * np.stack(both, axis=-1), 0.0)
-    low = ends.min(axis=-1).sum(axis=-1)
-    high = ends.max(axis=-1).sum(axis=-1)
-    beyond = np.flatnonzero((tracking.r_min > high) | (tracking.r_max < low))
-    if len(beyond):
-        i = beyond[0]
+        low = ends.min(axis=-1).sum(axis=-1)
+        high = ends.max(axis=-1).sum(axis=-1)
+        by = np.maximum(tracking.r_max - high, low - tracking.r_min)
+    none = (tracking.r_min > high) | (tracking.r_max < low)
+    for i in np.flatnonzero(none | (np.isfinite(by) & (by > high - low)))[:1]:
         warn(
             f"x_min and x_max, or theta_min and theta_max, keep r[{i}] between {low[i]:g} and "
             f"{high[i]:g}, and its set-points are {tracking.r_min[i]:g} to {tracking.r_max[i]:g}: "
-            "none can be reached. Have they the same units, and the same order?"
+            f"{'none' if none[i] else 'few'} can be reached. Have they the same units, and the "
+            "same order?"
         )
 
 
