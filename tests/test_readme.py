@@ -315,7 +315,7 @@ def normalized() -> DDPG:
 def shown_deviations() -> None:
     shown = Plant(observation_space=box(300, 400))
     shown.start = 0
-    plant = LinearModel([[0.9]], [[1]], 1, x_ss=[350], state_names=["T"])
+    plant = LinearModel([[0.9]], [[1]], 1, x_ss=[350], u_ss=[0], state_names=["T"])
     design = {"Q": [[1]], "R": [[1]], "horizon": 2, "x_min": 345, "x_max": 355}
     problem = LinearMPC(plant, **design, u_min=-1, u_max=1)
     built = DDPG(YannPolicy, shown, policy_kwargs={"problem": problem})

@@ -16,6 +16,7 @@ from sb3_yann._validation import (
     check_positive,
     check_vector,
     to_float,
+    warn,
 )
 from sb3_yann.control.gains import Gains
 from sb3_yann.control.identification.fit import fit_log
@@ -53,7 +54,7 @@ class LinearModel(LinearSystem):
     dt : float
         Sampling time, in the time unit of the plant.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
-        The operating point, zeros by default.
+        The operating point, zeros by default. Of x_ss and u_ss give both, or none.
     notes : sequence of str, optional
         Remarks on how the model was made. Equality ignores them, `dataclasses.replace` drops them.
     drift : array_like, shape (n,), optional
@@ -120,6 +121,12 @@ class LinearModel(LinearSystem):
         x = check_vector("x_ss", x_ss, n)
         u = check_vector("u_ss", u_ss, B.shape[1])
         d = check_vector("d_ss", d_ss, E.shape[1])
+        if (x_ss is None) != (u_ss is None) and (np.any(x) or np.any(u)):
+            given, other = ("u_ss", "x_ss") if x_ss is None else ("x_ss", "u_ss")
+            warn(
+                f"{given} is given without {other}, which counts as zero: the model rests at "
+                f"x_ss = {x.tolist()} with u_ss = {u.tolist()}. Pass {other} too."
+            )
         moved = check_vector("drift", drift, n)
         if gains is not None:
             check_array("gains.values", gains.values, B.shape)

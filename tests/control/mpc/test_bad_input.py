@@ -173,7 +173,8 @@ def test_an_infeasible_problem_is_a_value_error(changes: dict[str, Any]) -> None
 
 def test_an_unbounded_box_is_a_value_error() -> None:
     names = {"state_names": ["place", "speed"], "input_names": ["force"], "x_ss": [12, 0]}
-    cart = LinearModel([[1, 1], [0, 1]], [[0], [1]], 1, **names)
+    with pytest.warns(UserWarning, match=r"x_ss is given without u_ss.* rests .* u_ss = \[0.0\]"):
+        cart = LinearModel([[1, 1], [0, 1]], [[0], [1]], 1, **names)
     for changes, ends in (
         ({"x_min": None, "x_max": None}, "place from -inf to inf, speed from -inf to inf"),
         ({"x_min": [-1, -INF]}, "speed from -inf to 20"),
