@@ -118,6 +118,18 @@ class StateEstimator:
             )
         self.estimate: Array = np.zeros(n + d)
 
+    def require_model(self, model: LinearModel, parts: str = "A B E x_ss u_ss") -> None:
+        """Raise ValueError unless the estimator is of a model, in so many ``parts`` of it."""
+        for part in parts.split():
+            own = getattr(self.model, part)
+            wanted = getattr(model, part)
+            if own.shape != wanted.shape or not np.allclose(own, wanted):
+                raise ValueError(
+                    f"The estimator is of another model than the problem: its {part} is "
+                    f"{own.tolist()}, expected {wanted.tolist()}. Take found.estimator() of the "
+                    "MPC's model, or the observer that offset_free(mpc) returned with the MPC."
+                )
+
     def _measured(self, model: LinearModel) -> list[int]:
         """Return which disturbances are measured."""
         return [*model.measured]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_yann._validation import warn
+from sb3_yann.control.observer import StateEstimator
 
 if TYPE_CHECKING:
     from sb3_yann.control.mpc.problem import MPCProblem
@@ -31,6 +32,7 @@ def layers_of(env: Any) -> Iterator[Any]:
 def require_theta_order(env: Any, problem: MPCProblem) -> None:
     """Raise ValueError where one of our wrappers appends what has another place in theta.
 
+    So it is where one estimates by another model than the problem's.
     Of a vector env the first env counts; below a wrapper that shows another size, nothing does.
     Warn of set-points beyond those of the problem.
     """
@@ -50,6 +52,8 @@ def require_theta_order(env: Any, problem: MPCProblem) -> None:
                 )
             if start < end and "reference" in parts:
                 _warn_of_wide(layer, problem, slice(start, end))
+            if isinstance(observer := vars(layer).get("observer"), StateEstimator):
+                observer.require_model(problem.model)
             end = start
         elif "envs" not in vars(layer) and "venv" not in vars(layer):
             inner = vars(layer).get("env")

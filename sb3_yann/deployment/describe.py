@@ -72,6 +72,10 @@ class Checks:
     recover: int = 10
     transfer: int = 5
 
+    def __post_init__(self) -> None:
+        given: list[Any] = [self.obs_min, self.obs_max, self.missing]
+        self.arrays(max(map(np.size, given)))
+
     def arrays(self, size: int) -> dict[str, Any]:
         """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""
         low, high = check_bounds("obs", self.obs_min, self.obs_max, size)
@@ -109,13 +113,11 @@ def estimator_arrays(
     """
     model = problem.model
     layout = problem.layout
-    own = estimator.model
-    pairs = [(getattr(own, key), getattr(model, key)) for key in ("A", "B", "E", "x_ss", "u_ss")]
-    same = all(a.shape == b.shape and np.allclose(a, b) for a, b in pairs)
-    if not same or estimator.n_estimated != len(model.estimated):
+    estimator.require_model(model)
+    if estimator.n_estimated != len(model.estimated):
         raise ValueError(
-            "The estimator is of another model than the problem: take found.estimator() of the "
-            "model that the MPC has, or the observer that offset_free(mpc) returned with it."
+            f"The estimator estimates {estimator.n_estimated} disturbances, and the problem's "
+            f"model has estimated = {[*model.estimated]}: name them there."
         )
     q = estimator.n_measured
     size = len(estimator.A)

@@ -19,7 +19,7 @@ from sb3_yann import (
     offset_free,
 )
 from sb3_yann._validation import Array
-from sb3_yann.wrappers import EstimateState, ObserveDisturbance, SetPoint
+from sb3_yann.wrappers import EstimateState, ObserveDisturbance, SetPoint, StageCost
 
 
 def test_the_estimate_of_a_constant_disturbance_is_exact_in_the_end() -> None:
@@ -171,8 +171,15 @@ def test_tracking_from_outputs_alone_settles_without_offset(lost: int) -> None:
     assert observer.n_estimated == quiet.n_estimated == 1
     np.testing.assert_array_equal(quiet.noise["measurement_noise"], found.noise)
     assert np.linalg.norm(quiet.gain[n:]) < 0.5 * np.linalg.norm(observer.gain[n:])
-    with pytest.raises(ValueError, match=r"estimator reads .* measured is"):
-        offset_free(mpc, measured=np.eye(n), estimator=quiet)
+    other = StateEstimator(dataclasses.replace(model, A=model.A / 2))
+    of_another = "of another model than the problem: its A is"
+    for given, message in (
+        ({"measured": np.eye(n), "estimator": quiet}, r"estimator reads .* measured is"),
+        ({"every": 2, "estimator": quiet}, "every = 2 and an estimator, whose own every is"),
+        ({"estimator": other}, of_another),
+    ):
+        with pytest.raises(ValueError, match=message):
+            offset_free(mpc, **given)
     reference = 52.0
 
     def rest(law: Any, wrapped: Any) -> float:
@@ -190,6 +197,8 @@ def test_tracking_from_outputs_alone_settles_without_offset(lost: int) -> None:
     assert rest(free.online(), observed) == pytest.approx(reference, abs=1e-3)
     plain = EstimateState(followed(Hidden(0.4)), StateEstimator(model))
     assert abs(rest(mpc.online(), plain) - reference) > 0.1  # what the estimate takes away
+    with pytest.raises(ValueError, match=of_another):
+        StageCost(EstimateState(followed(Hidden()), other), mpc)
 
 
 def test_a_filter_of_two_rates_uses_the_rare_readings_fully() -> None:

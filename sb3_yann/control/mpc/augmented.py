@@ -30,7 +30,7 @@ def offset_free(
     mpc: LinearMPC,
     d_max: ArrayLike | None = None,
     measured: ArrayLike | Sequence[int] | None = None,
-    every: int | Sequence[int] = 1,
+    every: int | Sequence[int] | None = None,
     estimator: StateEstimator | None = None,
 ) -> tuple[LinearMPC, DisturbanceObserver]:
     """Return the MPC with a disturbance of each measured state, and the observer that estimates it.
@@ -57,8 +57,9 @@ def offset_free(
     measured : array_like, shape (q, n), or list of int, optional
         The measured outputs, or the indices of the measured states. The default is the model's C.
         The disturbances then act on these.
-    every : int or sequence of int, default 1
-        Each output is read every so many samples, as of :class:`StateEstimator`.
+    every : int or sequence of int, optional
+        Each output is read every so many samples, as of :class:`StateEstimator`. An ``estimator``
+        has its own.
     estimator : StateEstimator, optional
         Such as ``found.estimator()`` of `identify_outputs`. Its noise, and its ``every``, are the
         observer's, and a disturbance drifts slowly beside it: smoother where outputs are noisy.
@@ -66,8 +67,8 @@ def offset_free(
     Raises
     ------
     TypeError, ValueError
-        If the MPC has estimated disturbances already, tracks what is not measured, or the
-        measurements do not tell the disturbances.
+        If the MPC has estimated disturbances already, tracks what is not measured, the estimator is
+        of another model, or the measurements do not tell the disturbances.
 
     Examples
     --------
@@ -113,12 +114,18 @@ def offset_free(
     noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
     if estimator is not None:
         check_type("estimator", estimator, StateEstimator, "a StateEstimator: found.estimator()")
+        estimator.require_model(old, "A B x_ss u_ss")
         if not np.array_equal(estimator.C, C):
             raise ValueError(f"estimator reads {estimator.C.tolist()} x, measured is {C.tolist()}.")
+        if every is not None:
+            raise ValueError(
+                f"every = {every} and an estimator, whose own every is {estimator.every.tolist()}: "
+                "leave every out, or give the estimator another one, StateEstimator(every=...)."
+            )
         every = estimator.every.tolist()
         drifts = SLOW * np.sqrt(np.diag(estimator.noise["measurement_noise"]))
         noise = {**estimator.noise, "disturbance_noise": drifts}
-    return found, DisturbanceObserver(found.model, C, every=every, **noise)
+    return found, DisturbanceObserver(found.model, C, every=1 if every is None else every, **noise)
 
 
 def _changed(
