@@ -219,20 +219,18 @@ class Controller:
         Raises
         ------
         ValueError
-            If a shape is wrong, or ``request`` is none of the three.
+            If a shape is wrong, ``manual`` is not finite, or ``request`` is none of the three.
         """
-        rows, single = self._rows(obs, len(self._good))
-        if not single or self.request not in MODES:
-            raise ValueError(
-                f"obs has shape {rows.shape}, request is {self.request!r}; a step takes "
-                f"({self._good.size},) and one of {MODES}. Use evaluate(obs) for a batch."
-            )
+        rows, _ = self._rows(obs, len(self._good), batch=False)
+        if self.request not in MODES:
+            raise ValueError(f"request = {self.request!r} must be one of {MODES}.")
         data = self.data
         m = len(self._output)
-        given = np.full(m, np.nan) if manual is None else _as_readings("manual", manual)
-        if given.shape != (m,):
-            raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
-        known = self.counters["steps"] == 0 and bool(np.isfinite(given).all())
+        given = np.zeros(m) if manual is None else _as_readings("manual", manual)
+        if given.shape != (m,) or not np.isfinite(given).all():
+            wanted = f"{m} finite numbers, or None to hold the output"
+            raise ValueError(f"manual = {given.tolist()} must be {wanted}.")
+        known = self.counters["steps"] == 0 and manual is not None
         if known:
             self._warn_of_present(given)
             self._output = given.copy()
@@ -248,8 +246,8 @@ class Controller:
         shift = data["action_shift"]
         target = action[0] * scale + shift
         if mode == MANUAL:
-            by_hand = np.isfinite(given) & (self.request == MANUAL)
-            target = np.where(by_hand, given, self._output)
+            by_hand = manual is not None and self.request == MANUAL
+            target = given if by_hand else self._output
         if mode != self.mode or known:
             self.counters["changes"] += mode != self.mode
             self._left = int(data["transfer"])
@@ -343,11 +341,12 @@ class Controller:
             return MANUAL
         return MPC if self.request == MPC or self._sound < recover else POLICY
 
-    def _rows(self, obs: ArrayLike, size: int) -> tuple[Array, bool]:
+    def _rows(self, obs: ArrayLike, size: int, batch: bool = True) -> tuple[Array, bool]:
         given = _as_readings("obs", obs)
-        if given.ndim not in (1, 2) or given.shape[-1] != size:
+        if given.ndim not in (1, 1 + batch) or given.shape[-1] != size:
             names = f": {', '.join(self.obs_names)}" * (size == len(self.obs_names))
-            wanted = f"expected ({size},) or (batch, {size}){names}"
+            more = f" or (batch, {size})" if batch else ", as evaluate(obs) takes a batch"
+            wanted = f"expected ({size},){more}{names}"
             raise ValueError(f"obs has shape {given.shape}, {wanted}.")
         return np.atleast_2d(given), given.ndim == 1
 
