@@ -387,11 +387,16 @@ def _description(data: ControllerArrays, about: str, identity: str, units: list[
     listed = ET.SubElement(kind, "SourceFiles")
     for unit in units:
         ET.SubElement(listed, "File", name=unit)
+    variables = ET.Element("ModelVariables")
+    _add_variables(variables, data)
+    if named := sorted({each[0].get("unit", "") for each in variables} - {""}):
+        defined = ET.SubElement(root, "UnitDefinitions")
+        for unit in named:
+            ET.SubElement(defined, "Unit", name=unit)
     ET.SubElement(ET.SubElement(root, "LogCategories"), "Category", name="logStatusError")
     if data["dt"]:
         ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(float(data["dt"])))
-    variables = ET.SubElement(root, "ModelVariables")
-    _add_variables(variables, data)
+    root.append(variables)
     structure = ET.SubElement(root, "ModelStructure")
     found = [i + 1 for i, each in enumerate(variables) if each.get("causality") == "output"]
     for part in ("Outputs", "InitialUnknowns"):
@@ -404,8 +409,14 @@ def _description(data: ControllerArrays, about: str, identity: str, units: list[
 
 def _add_variables(within: ET.Element, data: ControllerArrays) -> None:
     """Add all variables, in the order of their value references."""
+    labels = dict(data.get("labels", ()))
     inputs = [*enumerate(map(str, data["action_names"]))]
     readings = enumerate(zip(data["obs_names"], data["obs_rest"], strict=True))
+    ends = data["bounds"] * data["action_scale"] + data["action_shift"]
+    limits = zip(data["obs_names"], data["obs_min"], data["obs_max"], strict=True)
+    spans = {f"obs[{i}]": each for i, each in enumerate(limits)}
+    spans |= {f"command[{i}]": (name, *ends[:, i]) for i, name in inputs}
+    spans |= {f"manual[{i}]": (name, -np.inf, np.inf) for i, name in inputs}
     who = "0 the policy, 1 the MPC, 2 manual"
     elapsed = "time since the last step in units of dt; 0 where it is not known"
     taken: list[tuple[str, str, str, str, str | None]] = [
@@ -420,6 +431,12 @@ def _add_variables(within: ET.Element, data: ControllerArrays) -> None:
     ]
     counts = dict.fromkeys(("Real", "Integer", "Boolean"), 0)
     for kind, causality, name, description, start_value in taken:
+        of, low, high = spans.get(name, ("", -np.inf, np.inf))
+        pairs = zip(of.split(", "), labels.get(of, of).split(", "), strict=False)
+        unit = next((label[len(own) + 2 : -1] for own, label in pairs if label != own), None)
+        said = {"unit": unit, "start": start_value}
+        said |= {"min": repr(float(low)) if np.isfinite(low) else None}
+        said |= {"max": repr(float(high)) if np.isfinite(high) else None}
         variable = ET.SubElement(
             within,
             "ScalarVariable",
@@ -430,4 +447,4 @@ def _add_variables(within: ET.Element, data: ControllerArrays) -> None:
             variability="discrete",
         )
         counts[kind] += 1
-        ET.SubElement(variable, kind, {} if start_value is None else {"start": start_value})
+        ET.SubElement(variable, kind, {key: each for key, each in said.items() if each})

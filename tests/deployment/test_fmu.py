@@ -16,13 +16,14 @@ import pytest
 from test_whole_controller import CHECKS, WITH_EXTRA, InPython, loop, noisy_steps, policy, problem
 
 from deployed import COMPILERS, STRICT, error, needs_compiler, observations, policy_of, with_faults
-from sb3_yann import Controller, export
+from sb3_yann import Checks, Controller, LinearModel, LinearMPC, Tracking, export
 from sb3_yann.deployment import c_code
 from sb3_yann.deployment.code import ROOM
 from sb3_yann.deployment.controller import MODES, Status
 
 fmpy = pytest.importorskip("fmpy")
 fmi2 = pytest.importorskip("fmpy.fmi2")
+validate_fmu = pytest.importorskip("fmpy.validation").validate_fmu
 
 OWN = c_code.LIBRARIES.get((platform.system(), platform.machine()))
 needs_library = pytest.mark.skipif(OWN is None or not COMPILERS, reason="no library is made here")
@@ -170,8 +171,6 @@ def test_a_wrong_identifier_is_no_instance(opened, tmp_path):
 
 @needs_library
 def test_fmpy_validates_and_simulates_it(opened, tmp_path):
-    from fmpy.validation import validate_fmu
-
     instance, controller = opened(policy_of("reactor"))
     path = str(tmp_path / "plant.fmu")
     assert validate_fmu(path) == []
@@ -199,6 +198,23 @@ def test_its_sources_compile_at_the_strictest(prefix, compiler, tmp_path):
     done = subprocess.run([*built, str(tmp_path / "all.so")], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert (b"plant_fmi2DoStep" in (tmp_path / "all.so").read_bytes()) == bool(prefix)
+
+
+def test_its_variables_have_the_units_and_limits_of_the_signals(tmp_path):
+    model = LinearModel([[0.9]], [[0.5]], 1, x_ss=[12], u_ss=[3], units=["m", "L/min"],
+                        state_names=["level"], input_names=["feed"])  # fmt: skip
+    mpc = LinearMPC(
+        model, Q=[[1]], R=[[1]], horizon=2, u_min=1, u_max=9, theta_min=2, theta_max=20,
+        tracking=Tracking([0], 5, 15, preview=1),
+    )  # fmt: skip
+    path = str(tmp_path / "plant.fmu")
+    export(mpc, path, checks=Checks(obs_min=[0, 4, 4], obs_max=[25, 16, 16]))
+    assert validate_fmu(path) == []
+    said = fmpy.read_model_description(path)
+    assert [each.name for each in said.unitDefinitions] == ["L/min", "m"]
+    found = [(each.unit, each.min, each.max) for each in said.modelVariables if each.unit]
+    assert found[:3] == [("m", "0.0", "25.0"), *[("m", "4.0", "16.0")] * 2]
+    assert found[3:] == [("L/min", None, None), ("L/min", "1.0", "9.0")]
 
 
 def test_without_a_compiler_it_holds_the_sources(tmp_path, monkeypatch):
