@@ -430,18 +430,23 @@ TOLERANCE = 1e-9
 BOUNDED_KINDS = "x", "u", "y", "mixed"
 
 
-def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
-    """Return the room to the upper and lower bounds of x, u, y and mixed ones, negative beyond."""
+def margins(problem: MPCProblem, r: Given, d: Given, thetas: Array | None = None) -> Array:
+    """Return the room to the upper and lower bounds of x, u, y and mixed ones, negative beyond.
+
+    Bounds that change are the widest ones, or those of thetas (..., n_theta).
+    """
     constant = _constants(problem, r, d)
     x = constant @ problem.steady_states.x.T
     u = constant @ problem.steady_states.u.T
     own = problem.deviations
-    mixed = x @ own.mixed.F.T + u @ own.mixed.G.T
-    value = np.concatenate([x, u, x @ own.outputs.C.T, mixed], axis=-1)
-    low, high = (np.concatenate([own.limits[kind][k] for kind in BOUNDED_KINDS]) for k in (0, 1))
-    room = np.concatenate([high - value, value - low], axis=-1)
-    bound = np.abs(np.concatenate([high, low]))
-    return np.asarray(room + TOLERANCE * np.where(np.isfinite(bound), bound, 0.0))
+    values = x, u, x @ own.outputs.C.T, x @ own.mixed.F.T + u @ own.mixed.G.T
+    below: list[Array] = []
+    above: list[Array] = []
+    for kind, value in zip(BOUNDED_KINDS, values, strict=True):
+        low, high = own.limits[kind] if thetas is None else own.limits_at(kind, thetas)
+        below.append(high - value + TOLERANCE * np.where(np.isfinite(high), np.abs(high), 0.0))
+        above.append(value - low + TOLERANCE * np.where(np.isfinite(low), np.abs(low), 0.0))
+    return np.concatenate([*below, *above], axis=-1)
 
 
 def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:

@@ -12,13 +12,13 @@ from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.linear_system import labels_of, labels_of_outputs
 from sb3_yann.control.mpc.condensing import condense
-from sb3_yann.control.mpc.problem import MPCProblem
+from sb3_yann.control.mpc.problem import MPCProblem, margins
 from sb3_yann.control.online import Law, OnlineLaw
 
 LOOP_STEPS = 50  # of a closed loop on the model
 BEYOND = 0.1  # widths of theta's box beyond it, in which states are tried
 APART = 0.05  # of an input's range, by which laws that differ by more are named
-BOUND = "bound, which may move in, of entry"
+BOUND = "bound of entry {}, which may move in"
 
 
 def report(
@@ -39,11 +39,9 @@ def report(
 
 
 def _parameters(problem: MPCProblem) -> Iterator[str]:
-    meanings = {"x": "state", "r": "reference of tracked output"}
-    meanings |= {
-        "d": "disturbance, constant over the horizon",
-        "u_prev": "input of the step before",
-    }
+    meanings = {"x": "state {}", "r": "reference of tracked output {}", "d": "disturbance {}"}
+    meanings["u_prev"] = "input {} of the step before"
+    previews = dict(zip("rd", problem.layout.previews, strict=True))
     points = problem.units.to_plant(problem.theta_rest)
     rests = problem.units.shifted
     how = "in plant units; the operating point is in brackets" if rests else "in theta"
@@ -59,9 +57,13 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
         kind, index = name[:-1].split("[")
         kind, _, ahead = (kind, "", "") if kind in meanings else kind.partition("_")
         what = meanings.get(kind if ahead.isdigit() or not ahead else "", BOUND)
-        later = f", {ahead} sample{'s' * (ahead != '1')} ahead" if ahead.isdigit() else ""
-        meaning = f"{shown[i]:<{room}}{what} {index}{later}"
-        if kind == "d" and int(index) in problem.model.estimated:
+        meaning = f"{shown[i]:<{room}}{what.format(index)}"
+        if ahead.isdigit():
+            meaning += f", {ahead} sample{'s' * (ahead != '1')} ahead"
+        is_estimated = kind == "d" and int(index) in problem.model.estimated
+        if kind in previews and (is_estimated or int(ahead or 0) == previews[kind]):
+            meaning += " and after" if ahead else ", constant over the horizon"
+        if is_estimated:
             meaning += ", which an observer estimates"
         yield f"  {label:<{width}} {low[i]:>10.4g} to {high[i]:<10.4g} {meaning}"
 
@@ -99,8 +101,9 @@ def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> It
     yield f"  {_percent(len(feasible), len(points))} are feasible;"
     if len(problem.tracking.C):
         parts = problem.layout
-        now = np.split(points[:, parts.now], [parts.n_references], axis=1)
-        share = _percent(problem.is_reachable(*now).sum(), len(points))
+        r, d = np.split(points[:, parts.now], [parts.n_references], axis=1)
+        reachable = np.all(margins(problem, r, d, points) >= 0, axis=-1)
+        share = _percent(reachable.sum(), len(points))
         yield f"  {share} have a reachable steady state, at other set-points some cost stays;"
     kept = _stay_feasible(problem, law, feasible).sum() if len(feasible) else 0
     kept_share = f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible"

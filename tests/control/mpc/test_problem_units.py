@@ -141,7 +141,7 @@ def test_the_report_calls_states_by_their_names() -> None:
         "T (K)                     310 to 390        [350]     state 0",
         "set-point of T (K)        345 to 355        [350]     reference of tracked output 0",
         "d[0]                        4 to 7          [5]       disturbance",
-        "previous u[0]               8 to 15         [10]      input of the step before 0",
+        "previous u[0]               8 to 15         [10]      input 0 of the step before",
         "few parameters (T, c, set-point of T, d[0], u_prev[0]):",
         "  [350, 2, 350, 5, 10] -> u = [10]",
     ):

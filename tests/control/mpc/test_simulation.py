@@ -95,8 +95,8 @@ def test_it_names_every_parameter_with_its_box_and_meaning() -> None:
         "Parameters of the law, 5,",
         "x[0]               -5 to 5          state 0",
         "r[0]               -1 to 1          reference of tracked output 0",
-        "d[0]             -0.3 to 0.3        disturbance, constant over the horizon 0",
-        "u_prev[0]          -1 to 2          input of the step before 0",
+        "d[0]             -0.3 to 0.3        disturbance 0, constant over the horizon",
+        "u_prev[0]          -1 to 2          input 0 of the step before",
     ):
         assert line in text
 
@@ -118,6 +118,14 @@ def test_shares_are_those_of_the_box() -> None:
     assert f"{share:.1f} % are feasible" in mpc.report()
     everywhere = input_bounds_only().report(samples=20)
     assert "100.0 % are feasible" in everywhere
+    moving = servo(parametric_bounds=["u_max"], tracking=Tracking([0], -1, 1, preview=1))
+    points = np.random.default_rng(0).uniform(moving.theta_min, moving.theta_max, (500, 5))
+    r, _, u_max = points[:, 2:5].T
+    kept = moving.is_reachable(r[:, None]) & (r * moving.steady_states.u[0] <= u_max)
+    assert 0 < kept.mean() < 0.9
+    text = moving.report()
+    assert f"{100 * kept.mean():.1f} % have a reachable steady state" in text
+    assert "output 0\n" in text and "output 0, 1 sample ahead and after\n" in text
 
 
 def test_how_far_the_explicit_law_is_from_the_online_one_beyond_the_box_is_said() -> None:
@@ -192,6 +200,7 @@ def test_what_was_solved_is_taken_whatever_its_size(monkeypatch) -> None:
 def test_what_was_chosen_is_kept(monkeypatch) -> None:
     mpc = servo()
     assert isinstance(mpc.law("online"), OnlineLaw)
+    assert "The law is solved online, with" in mpc.report(samples=20)
     monkeypatch.setattr(LinearMPC, "_solved", None)
     assert isinstance(mpc.law(), OnlineLaw)
     mpc.value_matrix(0.99)
@@ -231,9 +240,3 @@ def test_the_value_of_both_laws_is_the_same(name) -> None:
     other.law("online")
     expected = solved(name).value_matrix(0.95)
     assert np.abs(other.value_matrix(0.95) - expected).max() <= 1e-9 * np.abs(expected).max()
-
-
-def test_the_report_says_that_it_is_solved_online() -> None:
-    mpc = servo()
-    mpc.law("online")
-    assert "The law is solved online, with" in mpc.report(samples=20)
