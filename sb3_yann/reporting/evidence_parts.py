@@ -206,7 +206,7 @@ def statistics_part(subject: Subject) -> Part:
             f"On average the cost {'in the twin ' * _in_twin(subject)}changes by {mean:+.2f} %; "
             "the change lies between "
             f"{mean - width:+.2f} and {mean + width:+.2f} % with a confidence of 90 %, by "
-            f"Student's interval of {count} pairs, and of the MPC's mean."
+            f"Student's interval of the ratio of the two means, of {count} pairs."
         )
         if passed is None:
             text += " That it differs from the MPC at all is not shown."
