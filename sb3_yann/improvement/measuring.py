@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import Progress, shown
-from sb3_yann._validation import Array, check_int
+from sb3_yann._validation import Array, check_int, check_type
 from sb3_yann.compare import less_safe
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.augmented import SHARE
@@ -309,8 +309,7 @@ def headroom(
     >>> 0.01 < found.total < 0.05, found.verdict in ("learn", "keep the MPC")
     (True, False)
     """
-    if not isinstance(mpc, LinearMPC):
-        raise TypeError(f"mpc = {mpc!r} must be a LinearMPC.")
+    check_type("mpc", mpc, LinearMPC, "a LinearMPC")
     check_int("n_starts", n_starts, 2)
     check_int("seed", seed, 0)
     if max_steps is not None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import shown
-from sb3_yann._validation import Array, check_bool, check_int
+from sb3_yann._validation import Array, check_bool, check_int, check_type
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.identification.residuals import FOLDS
 from sb3_yann.control.linear_system import labels_of
@@ -178,8 +178,7 @@ class PlantTwin(LearntModel):
         TypeError, ValueError
             For a log that cannot be read; one that says little makes a twin that is not trusted.
         """
-        if not isinstance(problem, LinearMPC):
-            raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
+        check_type("problem", problem, LinearMPC, "a LinearMPC")
         check_int("n_members", n_members)
         check_int("seed", seed, 0)
         check_bool("units_confirmed", units_confirmed)

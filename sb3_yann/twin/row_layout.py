@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, check_type
 from sb3_yann.control import DisturbanceObserver, LinearMPC, StateEstimator
 
 ROUNDED = 1e-6  # so near to its bound, relative to their distance, an estimate may lie beyond it
@@ -42,11 +42,8 @@ class RowLayout:
         model = self.problem.model
         if estimator is None:
             return
-        if not isinstance(estimator, StateEstimator):
-            raise TypeError(
-                f"observer = {estimator!r} must be a StateEstimator, e.g. that of "
-                "mpc, observer = offset_free(mpc)."
-            )
+        wanted = "a StateEstimator, e.g. that of mpc, observer = offset_free(mpc)"
+        check_type("observer", estimator, StateEstimator, wanted)
         its, own = ((each.n_states, each.n_inputs) for each in (estimator.model, model))
         blind = model.n_disturbances - len(self.problem.extra)
         theirs = estimator.model.n_disturbances

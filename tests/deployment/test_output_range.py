@@ -61,7 +61,7 @@ def test_c_code_stays_in_the_action_space(bounds, precision, tmp_path) -> None:
 
 
 def test_a_law_stays_within_the_bounds_of_its_problem(tmp_path) -> None:
-    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, u_ss=[0.1])
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, x_ss=[0, 0], u_ss=[0.1])
     design = {"Q": np.eye(2), "R": [[0.1]], "horizon": 3, "x_min": -5, "x_max": 5}
     mpc = LinearMPC(model, **design, u_min=0, u_max=0.1 + 1 / 3)
     export(mpc, tmp_path / "law.npz")

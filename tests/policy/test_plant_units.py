@@ -144,8 +144,8 @@ def test_a_reading_that_is_lost_is_called_by_its_name(shows: str) -> None:
 
 def test_the_state_that_lies_at_zero_is_found() -> None:
     mpc = LinearMPC(
-        LinearModel(np.eye(2) / 2, np.eye(2), 1.0, x_ss=[1, -30]), Q=np.eye(2), R=np.eye(2),
-        horizon=1, x_min=[-1, -32], x_max=[3, -28],
+        LinearModel(np.eye(2) / 2, np.eye(2), 1.0, x_ss=[1, -30], u_ss=[0, 0]),
+        Q=np.eye(2), R=np.eye(2), horizon=1, x_min=[-1, -32], x_max=[3, -28],
     )  # fmt: skip
     assert mpc.shown_as_deviation(np.array([[0.2, -0.5], [-0.2, 1]])).startswith("x[1] = -0.5 is")
     for shown in (np.array([[1.2, -30.5]]), np.array([[2.5, 9]]), np.zeros((0, 2))):

@@ -123,10 +123,8 @@ class LinearModel(LinearSystem):
         d = check_vector("d_ss", d_ss, E.shape[1])
         if (x_ss is None) != (u_ss is None) and (np.any(x) or np.any(u)):
             given, other = ("u_ss", "x_ss") if x_ss is None else ("x_ss", "u_ss")
-            warn(
-                f"{given} is given without {other}, which counts as zero: the model rests at "
-                f"x_ss = {x.tolist()} with u_ss = {u.tolist()}. Pass {other} too."
-            )
+            rest = f"rests at x_ss = {x.tolist()} with u_ss = {u.tolist()}. Pass {other} too."
+            warn(f"{given} is given without {other}, which counts as zero: the model {rest}")
         moved = check_vector("drift", drift, n)
         if gains is not None:
             check_array("gains.values", gains.values, B.shape)
