@@ -12,7 +12,6 @@ from guard_samples import build as build_slide
 from policy_samples import build, scalar_mpc
 from sample_plants import LinearPlant
 from sb3_yann import (
-    Controller,
     DisturbanceObserver,
     ImprovementGuard,
     LinearModel,
@@ -152,15 +151,6 @@ def with_two_outputs() -> ObserveDisturbance:
 def test_a_wrong_argument_is_named_with_what_was_expected(call, message) -> None:
     with raises(message):
         call()
-
-
-def test_an_operators_output_has_the_shape_of_the_inputs(tmp_path) -> None:
-    export(scalar_mpc().explicit(), tmp_path / "law.npz")
-    controller = Controller.load(tmp_path / "law.npz")
-    controller.request = "manual"
-    for wrong in ([0, 0, 0], [np.nan]):
-        with pytest.raises(ValueError, match=r"manual = .* must be 1 finite numbers, or None"):
-            controller([0.1], manual=wrong)
 
 
 def test_a_plants_episode_that_never_ends_is_an_error(monkeypatch) -> None:

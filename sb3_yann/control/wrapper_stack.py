@@ -30,9 +30,8 @@ def layers_of(env: Any) -> Iterator[Any]:
 
 
 def require_theta_order(env: Any, problem: MPCProblem) -> None:
-    """Raise ValueError where one of our wrappers appends what has another place in theta.
+    """Raise ValueError where our wrappers append what has another place in theta, or another model.
 
-    So it is where one estimates by another model than the problem's.
     Of a vector env the first env counts; below a wrapper that shows another size, nothing does.
     Warn of set-points beyond those of the problem.
     """

@@ -19,7 +19,7 @@ from sb3_yann.control.linear_system import (
     missing_observer,
     with_units,
 )
-from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, costs_of, penalty_rounding
+from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, costs_of
 from sb3_yann.control.mpc.report import ActiveConstraints
 from sb3_yann.env_pool import one_env
 from sb3_yann.evaluation.plots import plot_regions
@@ -40,6 +40,7 @@ from sb3_yann.reporting.subject import (
     tag,
 )
 from sb3_yann.rollout import Trajectories
+from sb3_yann.units import FLOAT32_ROUNDING
 from sb3_yann.wrappers.theta import EstimateState, below
 
 
@@ -186,10 +187,12 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
             np.mean([costs_of(problem, *pair)[0] for pair in loops[who].pairs])
             for who in (OF_MPC, OF_POLICY)
         )
-        steps = np.array([len(inputs) for _, inputs in loops[OF_POLICY].pairs])
-        rounding = np.mean(steps * penalty_rounding(problem, mpc.any_bound))
-        room = max(COST_ROUNDING * old, rounding)
-        costs_more = new > old + room and policy.penalty.mean() > mpc.penalty.mean()
+        # A steep penalty multiplies what rounding moves a state by.
+        rounding = FLOAT32_ROUNDING * problem.theta_half
+        moved = [(x + np.copysign(rounding, x), u) for x, u in loops[OF_MPC].pairs]
+        rounded = np.mean([costs_of(problem, *pair)[0] for pair in moved])
+        most = max(old * (1 + COST_ROUNDING), rounded)
+        costs_more = new > most and policy.penalty.mean() > mpc.penalty.mean()
         text = (
             "Penalty of the soft bounds in an episode, on average: "
             f"{policy.penalty.mean():.4g} with the policy, {mpc.penalty.mean():.4g} with the "

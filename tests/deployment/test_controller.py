@@ -238,15 +238,6 @@ def test_networks_that_overflow_leave_the_law(tmp_path):
     assert controller.status == Status.NETWORK
 
 
-def test_weights_that_are_no_numbers_are_refused(tmp_path):
-    policy = disturbed(solved("reactor"))
-    with th.no_grad():
-        last_layer(policy)[0, 0, 0] = np.nan
-    with pytest.raises(ValueError, match="weights hold NaN"):
-        export(policy, tmp_path / "plant.c")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
     controller = controller_of(policy_of("reactor"), tmp_path)
     path = tmp_path / "plant.npz"
@@ -261,6 +252,9 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"obs has shape \(2, 4\).*, as evaluate") as told:
         controller(np.zeros((2, 4)))
     assert "request" not in str(told.value)
+    for wrong in ([0, 0, 0], [np.nan]):
+        with pytest.raises(ValueError, match=r"manual = .* must be 1 finite numbers, or None"):
+            controller(np.zeros(4), manual=wrong)
     controller.request = "off"
     with pytest.raises(ValueError, match=r"^request = 'off' must be one of"):
         controller(np.zeros(4))
@@ -333,6 +327,11 @@ def test_an_online_law_and_strange_networks_say_why_not(tmp_path):
     strange = disturbed(solved("reactor"), activation_fn=th.nn.Softsign)
     with pytest.raises(ValueError, match="Softsign"):
         export(strange, tmp_path / "plant.c")
+    policy = disturbed(solved("reactor"))
+    with th.no_grad():
+        last_layer(policy)[0, 0, 0] = np.nan
+    with pytest.raises(ValueError, match="weights hold NaN"):
+        export(policy, tmp_path / "plant.c")
     with pytest.raises(TypeError, match="dict cannot be exported"):
         export({}, tmp_path / "plant.c")
     assert list(tmp_path.iterdir()) == []

@@ -203,10 +203,9 @@ def test_its_sources_compile_at_the_strictest(prefix, compiler, tmp_path):
 def test_its_variables_have_the_units_and_limits_of_the_signals(tmp_path):
     model = LinearModel([[0.9]], [[0.5]], 1, x_ss=[12], u_ss=[3], units=["m", "L/min"],
                         state_names=["level"], input_names=["feed"])  # fmt: skip
-    mpc = LinearMPC(
-        model, Q=[[1]], R=[[1]], horizon=2, u_min=1, u_max=9, theta_min=2, theta_max=20,
-        tracking=Tracking([0], 5, 15, preview=1),
-    )  # fmt: skip
+    box = {"u_min": 1, "u_max": 9, "theta_min": 2, "theta_max": 20}
+    r = Tracking([0], 5, 15, preview=1)
+    mpc = LinearMPC(model, Q=[[1]], R=[[1]], horizon=2, tracking=r, **box)
     path = str(tmp_path / "plant.fmu")
     export(mpc, path, checks=Checks(obs_min=[0, 4, 4], obs_max=[25, 16, 16]))
     assert validate_fmu(path) == []

@@ -217,11 +217,7 @@ def test_a_map_that_does_not_fit_is_named(observation, error, message) -> None:
         (lambda: AffineObservation.identity(-1), ValueError, "size = -1 must be a whole number"),
         (lambda: AffineObservation.pick(["a"], 3), ValueError, r"entries = \['a'\] must be a list"),
         (lambda: AffineObservation.pick(0, 3), ValueError, "entries = 0 must be a list of ind"),
-        (
-            lambda: AffineObservation.minus_set_point([0], 3, 3),
-            ValueError,
-            "set_points = 3 must ha",
-        ),
+        (lambda: AffineObservation.minus_set_point([0], 3, 3), ValueError, "set_points = 3 must"),
         (lambda: AffineObservation.pick([3], 3), ValueError, "indices from 0 to 2"),
         (lambda: AffineObservation.newest_frame(3, 0), ValueError, "frames = 0"),
     ],

@@ -60,31 +60,20 @@ def test_spaces_that_do_not_fit_are_named(observation_space, action_space, error
         ({"pin_equilibrium": 1}, TypeError, "pin_equilibrium = 1"),
         ({"critic_warmup": -1}, ValueError, "critic_warmup = -1"),
         ({"max_correction": 1.5}, ValueError, r"max_correction = 1\.5"),
+        ({"critic": {"kind": "quadratic"}}, ValueError, "kind = 'quadratic'"),
+        ({"critic": {"scale": 3}}, TypeError, "critic has no 'scale'.*value_scale"),
+        ({"critic": {"prediction_model": 3}}, TypeError, "prediction_model = 3"),
+        (
+            {"critic": {"prediction_model": lambda theta, u: theta, "kind": "state_action"}},
+            ValueError,
+            "prediction_model is for kind='afterstate'",
+        ),
+        ({"critic": {"value_scale": 0}}, ValueError, "value_scale = 0"),
     ],
 )
 def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:
     with pytest.raises(error, match=message):
         make_policy(unbounded(), actions(), problem=scalar_mpc(), **kwargs)
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"kind": "quadratic"}, ValueError, "kind = 'quadratic'"),
-        ({"scale": 3}, TypeError, "critic has no 'scale'.*value_scale"),
-        ({"prediction_model": 3}, TypeError, "prediction_model = 3"),
-        ({"prediction_model": "f", "kind": "state_action"}, TypeError, "prediction_model = 'f'"),
-        (
-            {"prediction_model": lambda theta, u: theta, "kind": "state_action"},
-            ValueError,
-            "prediction_model is for kind='afterstate'",
-        ),
-        ({"value_scale": 0}, ValueError, "value_scale = 0"),
-    ],
-)
-def test_options_of_a_critic_that_mean_nothing_are_named(options, error, message) -> None:
-    with pytest.raises(error, match=message):
-        make_policy(unbounded(), actions(), problem=scalar_mpc(), critic=options)
 
 
 def test_a_net_arch_may_leave_out_or_join_actor_and_critic() -> None:
@@ -149,11 +138,6 @@ def test_a_problem_may_be_an_object_a_name_or_a_reference(reference) -> None:
     assert model.policy.problem == problems.cstr()
 
 
-def test_a_policy_without_a_problem_says_how_to_give_one() -> None:
-    with pytest.raises(ValueError, match=r'policy_kwargs=\{"problem": mpc\}'):
-        DDPG(YannPolicy, "Pendulum-v1")
-
-
 @pytest.mark.parametrize(
     ("problem", "error", "message"),
     [
@@ -178,11 +162,10 @@ def test_a_name_registered_again_means_the_new_problem() -> None:
         sb3_yann.register_problem("again", scalar_mpc(R=[[weight]]))
         model = DDPG(YannPolicy, env, policy_kwargs={"problem": "again"})
         assert model.policy.problem.R == [[weight]]
-
-
-def test_only_problems_can_be_registered() -> None:
     with pytest.raises(TypeError, match="problem = 3"):
         sb3_yann.register_problem("three", 3)
+    with pytest.raises(ValueError, match=r'policy_kwargs=\{"problem": mpc\}'):
+        DDPG(YannPolicy, "Pendulum-v1")
 
 
 # ---- Parameters of another problem are refused before anything is changed; own ones load ----
@@ -234,18 +217,12 @@ def test_parameters_of_another_problem_change_nothing(kind, other, exact_match) 
     require_refused(model, lambda: model.set_parameters(foreign, exact_match), r"actor\.mu\.")
 
 
-def test_a_guards_checkpoint_of_another_problem_changes_nothing() -> None:
+def test_a_guards_checkpoint_of_another_problem_and_a_critic_of_other_weights_are_told() -> None:
     model = build()
     foreign = ActorCheckpoint.of(build(mpc=scalar_mpc(R=[[2]])).policy)
     require_refused(model, lambda: foreign.restore(model.policy))
-
-
-def test_a_critic_of_other_weights_is_told_where_the_law_is_the_same() -> None:
-    model = build()
-    foreign = build(mpc=scalar_mpc(Q=[[2]], R=[[2]]))
-    require_refused(
-        model, lambda: model.set_parameters(foreign.get_parameters()), r"critic\.qf0\.W"
-    )
+    given = build(mpc=scalar_mpc(Q=[[2]], R=[[2]])).get_parameters()  # the law is the same
+    require_refused(model, lambda: model.set_parameters(given), r"critic\.qf0\.W")
 
 
 @pytest.mark.parametrize("kind", KINDS)

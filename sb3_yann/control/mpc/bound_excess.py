@@ -226,20 +226,6 @@ def bound_excess(
     )
 
 
-def penalty_rounding(problem: LinearMPC, any_bound: Array) -> Array:
-    """Return by how much float32 rounding moves the penalty of a step with such an excess, at most.
-
-    An excess is known to `FLOAT32_ROUNDING` half-widths.
-    """
-    bounds = Bounds.of(problem)
-    softness = np.concatenate([bounds.softness, problem.mixed.soft])
-    soft = softness > 0
-    half = np.concatenate([bounds.half, mixed_half(problem)])
-    units = np.max(half[soft] / softness[soft], initial=0.0)
-    slope = np.where(any_bound > 0, 1 + 2 * units * any_bound, 0.0)
-    return np.asarray(units * FLOAT32_ROUNDING * slope * problem.soft.penalty)
-
-
 def costs_of(
     problem: LinearMPC, thetas: Array, inputs: Array, taken: Mask | bool = True
 ) -> tuple[Array, BoundExcess]:

@@ -233,6 +233,8 @@ def test_an_excess_is_counted_from_the_first_step_on_in_half_widths_of_theta_s_b
     np.testing.assert_allclose(found.largest, [1 / 4, 0], atol=1e-5)
     np.testing.assert_allclose(found.summed, [1 / 4 + 0.5 / 4 + 2 / 50, 0], atol=1e-5)
     assert not found.penalty.any()
+    found = excess_of_episodes(mpc, [episode([[0, 0], [np.nan, 0]])])
+    assert np.isinf([found.largest, found.summed]).all()
 
 
 def test_an_output_s_excess_is_that_of_its_combination_of_states() -> None:
@@ -256,11 +258,6 @@ def test_a_soft_bound_is_no_hard_excess_and_costs_its_penalty_in_each_step() -> 
     # Of the states (3 - 2) / 0.5 counts, not (14 - 10) / 4; then the output, (5 - 4) / 2.
     np.testing.assert_allclose(found.penalty, [10 * (2 + 4) + 10 * (0.5 + 0.25)], rtol=1e-4)
     assert not found.largest.any() and found.any_bound[0] > 0
-
-
-def test_what_is_not_finite_exceeds_by_inf() -> None:
-    found = excess_of_episodes(tank(x_max=[2, 10]), [episode([[0, 0], [np.nan, 0]])])
-    assert np.isinf(found.largest[0]) and np.isinf(found.summed[0])
 
 
 def test_steps_that_are_not_taken_do_not_count_and_batches_are_episode_by_episode() -> None:
