@@ -182,6 +182,9 @@ def test_steps_with_faults_are_the_controllers(form, name, tmp_path) -> None:
         assert said in ([status, mode], [status, -1]), k
         met |= Status(status)
         modes.add(mode)
+    rest = coded.controller.data["obs_rest"]
+    held, status, _ = coded.step(rest, 1.0, 2, np.full(len(found), np.nan))
+    assert status & Status.NOT_FINITE and np.all(np.isfinite(held))
     assert modes == {0, 1, 2}
     assert Status.OUT_OF_RANGE | Status.FROZEN | Status.LATE | Status.NOT_FINITE in met
 

@@ -516,6 +516,11 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
         status |= YANN_LATE;
     }
     const yann_mode mode = who_acts(state, status, request);
+    for (int i = 0; i < N_INPUTS && manual != NULL; i++) {
+        if ((begins || request == YANN_MANUAL) && !isfinite(manual[i])) {
+            status |= YANN_NOT_FINITE; /* it is held, which is no fault of a sensor */
+        }
+    }
     look(state, good, begins, told, seen);
     status |= act(seen, mode == YANN_POLICY, target, low, high);
 #if RATE

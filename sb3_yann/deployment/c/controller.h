@@ -24,7 +24,7 @@ typedef @REAL@ yann_real;
 typedef enum { YANN_POLICY = 0, YANN_MPC = 1, YANN_MANUAL = 2 } yann_mode;
 
 /* What a step found; the first four are faults. */
-#define YANN_NOT_FINITE 1u   /* a reading is NaN or infinite */
+#define YANN_NOT_FINITE 1u   /* a reading, or manual where it counts, is NaN or infinite */
 #define YANN_OUT_OF_RANGE 2u /* a reading is beyond its limits */
 #define YANN_FROZEN 4u       /* a reading stays the same while others move */
 #define YANN_LATE 8u         /* too much time has passed since the last step */
