@@ -186,7 +186,7 @@ DICT = gym.spaces.Dict({"a": gym.spaces.Discrete(2)})
         (lambda: SetPoint(Counter(), [1], [0, 2]), ValueError, r"low has shape \(1,\) and high"),
         (lambda: SetPoint(Counter(), [0], [np.inf]), ValueError, "must be finite"),
         (lambda: SetPoint(Counter(), [0], [1], hold=0), ValueError, "hold = 0 must be"),
-        (lambda: SetPoint(Counter(), [0], [1], schedule=[2]), ValueError, r"\[2.0\] must .* between"),
+        (lambda: SetPoint(Counter(), [0], [1], schedule=[2]), ValueError, r"\[2.0\] must have"),
         (
             lambda: MeasuredDisturbance(Counter(), [0], [1], key="load").reset(),
             ValueError,
