@@ -73,8 +73,7 @@ class Checks:
     transfer: int = 5
 
     def __post_init__(self) -> None:
-        given: list[Any] = [self.obs_min, self.obs_max, self.missing]
-        self.arrays(max(map(np.size, given)))
+        self.arrays(max(map(np.size, vars(self).values())))
 
     def arrays(self, size: int) -> dict[str, Any]:
         """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""

@@ -175,7 +175,7 @@ def test_tracking_from_outputs_alone_settles_without_offset(lost: int) -> None:
     of_another = "of another model than the problem: its A is"
     for given, message in (
         ({"measured": np.eye(n), "estimator": quiet}, r"estimator reads .* measured is"),
-        ({"every": 2, "estimator": quiet}, "every = 2 and an estimator, whose own every is"),
+        ({"every": 2, "estimator": quiet}, r"every = 2, but the estimator has \[1\]: leave"),
         ({"estimator": other}, of_another),
     ):
         with pytest.raises(ValueError, match=message):

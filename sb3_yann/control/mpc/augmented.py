@@ -117,12 +117,10 @@ def offset_free(
         estimator.require_model(old, "A B x_ss u_ss")
         if not np.array_equal(estimator.C, C):
             raise ValueError(f"estimator reads {estimator.C.tolist()} x, measured is {C.tolist()}.")
+        rates = estimator.every.tolist()
         if every is not None:
-            raise ValueError(
-                f"every = {every} and an estimator, whose own every is {estimator.every.tolist()}: "
-                "leave every out, or give the estimator another one, StateEstimator(every=...)."
-            )
-        every = estimator.every.tolist()
+            raise ValueError(f"every = {every}, but the estimator has {rates}: leave every out.")
+        every = rates
         drifts = SLOW * np.sqrt(np.diag(estimator.noise["measurement_noise"]))
         noise = {**estimator.noise, "disturbance_noise": drifts}
     return found, DisturbanceObserver(found.model, C, every=1 if every is None else every, **noise)

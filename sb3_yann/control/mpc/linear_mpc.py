@@ -622,8 +622,7 @@ def _warn_of_unreachable(tracking: Tracking, bounds: Bounds, box: Bounds) -> Non
         warn(
             f"x_min and x_max, or theta_min and theta_max, keep r[{i}] between {low[i]:g} and "
             f"{high[i]:g}, and its set-points are {tracking.r_min[i]:g} to {tracking.r_max[i]:g}: "
-            f"{'none' if none[i] else 'few'} can be reached. Have they the same units, and the "
-            "same order?"
+            f"{'none' if none[i] else 'few'} can be reached. Have they the same units and order?"
         )
 
 

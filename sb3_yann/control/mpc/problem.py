@@ -431,10 +431,7 @@ BOUNDED_KINDS = "x", "u", "y", "mixed"
 
 
 def margins(problem: MPCProblem, r: Given, d: Given, thetas: Array | None = None) -> Array:
-    """Return the room to the upper and lower bounds of x, u, y and mixed ones, negative beyond.
-
-    Bounds that change are the widest ones, or those of thetas (..., n_theta).
-    """
+    """Return the room to the upper, then the lower bounds of x, u, y and mixed ones, at thetas."""
     constant = _constants(problem, r, d)
     x = constant @ problem.steady_states.x.T
     u = constant @ problem.steady_states.u.T
