@@ -18,7 +18,7 @@ from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation import change_in_percent
 from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
 from sb3_yann.networks.yann import LawLayer
-from sb3_yann.plan import PAUSE, Planning, Plans, follow, slopes_of_inputs
+from sb3_yann.plan import PAUSE, SETTLED, Planning, Plans, follow, slopes_of_inputs
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Controller, Rows
 from sb3_yann.twin.dynamics import law_of
@@ -236,14 +236,18 @@ def imitate(
     plans or the MPC: from their starts, and from where it had got to (S. Ross, G. Gordon and D.
     Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
     learning*, AISTATS 2011). Starts that it loses count more in the next fit. Then it descends the
-    costs of a simulator's model, see :func:`refine`. The layer ends with what cost the least.
-    Return what it saves in the model: see :meth:`Teacher.saved`.
+    costs of a simulator's model, see :func:`refine`: at once where no plan beats the MPC. The
+    layer ends with what cost the least. Return what it saves in the model: see
+    :meth:`Teacher.saved`.
     """
     most = -np.inf
     promised = 0.0
     since = 0
     best = copy.deepcopy(layer.state_dict())
-    for fit in range(FITS):
+    descends = teacher.scenarios.members is None
+    mpc = teacher.mpc.costs
+    better = np.any(mpc - teacher.best > SETTLED * np.abs(mpc))
+    for fit in range(FITS if better or not descends else 0):
         teacher.teach(layer, updates)
         played = teacher.play(layer)
         score = teacher.score(played.costs)
@@ -258,11 +262,10 @@ def imitate(
         done = teacher.is_near(played.costs)
         vain = since < fit and most >= NEARLY * teacher.gain
         over = (done and not objection) or fit == FITS - 1 or vain
-        descends = over and teacher.scenarios.members is None
         say(
             f"fit {fit + 1}, in the model: policy {change_in_percent(-saved)}, plans "
             f"{change_in_percent(-teacher.gain)}{'; ' * bool(objection)}{objection}"
-            f"{'; the descent is next' * descends}"
+            f"{'; the descent is next' * (over and descends)}"
         )
         if over:
             break
