@@ -147,10 +147,15 @@ class Log:
     @property
     def every(self) -> tuple[int, ...]:
         """Each state is read every so many samples, on average; 1 where none is missing."""
-        read = np.isfinite(np.concatenate([each.states for each in self.episodes]))
-        counts = read.sum(axis=0).tolist()
-        rows = len(read)
-        return tuple(1 if k == rows else max(2, round(rows / max(k, 1))) for k in counts)
+        read = [np.isfinite(each.states) for each in self.episodes]
+        whole = np.concatenate(read)
+        periods = np.ones(self.sizes[0], int)
+        for i in np.flatnonzero(~whole.all(axis=0)):
+            # From one reading to the next: gaps and ends of episodes leave out parts of periods.
+            apart = np.concatenate([np.diff(np.flatnonzero(each[:, i])) for each in read])
+            mean = apart.mean() if apart.size else len(whole) / max(whole[:, i].sum(), 1)
+            periods[i] = max(2, round(mean))
+        return tuple(periods.tolist())
 
     def cut(self, steps: int) -> Log:
         """Return the log in pieces of at most so many steps: a long record as many episodes."""

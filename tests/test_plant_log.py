@@ -197,7 +197,6 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(write) ->
     assert [len(each) for each in log.episodes] == [699, 499]
     assert (log.every, log.lost_steps) == ((1, 10), 2)
     found = identify_outputs(log)
-    assert found.every == (1, 10)
     assert "Read now and then: quality every 10 samples" in found.report()
     guess = found.predict(x, u[:, None], ahead=20)
     assert np.std((guess - x[20:])[40:], axis=0).max() < 0.05  # x moves by .7 and .5
@@ -211,6 +210,13 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(write) ->
     observer = StateEstimator(mpc.model, [0, 1], every=[1, 10])
     given = {"references": [[0.0], [0.0]], "observer": observer, "residuals": ["linear"]}
     assert len(PlantTwin.fit(mpc, log, **given).episodes) == 2
+
+
+def test_gaps_do_not_change_how_often_a_state_is_read() -> None:
+    x = np.zeros((201, 2))
+    x[np.arange(201) % 20 > 0, 1] = np.nan
+    x[[40, 50, 80, 120]] = np.nan
+    assert Log.with_gaps(x, np.ones((200, 1)), 1).every == (1, 20)
 
 
 @pytest.mark.filterwarnings("ignore:valve has no effect")

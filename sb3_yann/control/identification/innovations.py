@@ -227,7 +227,7 @@ class Past:
         some = ~self.rare
         own = noise + FLOOR * np.eye(q)
         K[:, self.rare] = 0.0  # stand-ins tell nothing of it
-        if spectral_radius(A - K @ C) >= 1:
+        if some.any() and spectral_radius(A - K @ C) >= 1:
             # The gain of the filter for what these states and outputs miss is stable.
             spread = K @ noise @ K.T + found.covariance
             cross = K @ noise[:, some]
@@ -270,7 +270,7 @@ class Chunks:
         self.gaps = bool(np.any(self.lost))
         self.samples = int(self.there.sum())
         self.readings: Array = self.read.sum(axis=(0, 1))
-        self.rare: NDArray[np.bool_] = self.readings < self.readings.max()
+        self.rare: NDArray[np.bool_] = self.readings < self.samples
 
     def forgets(self, model: Innovations) -> bool:
         """Return whether errors of the states decay, with and without the rare outputs."""

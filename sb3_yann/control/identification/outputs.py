@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
@@ -75,32 +74,17 @@ class Structure:
 
 
 def fit_structure(
-    episodes: Sequence[Episode],
-    order: int | None,
-    delays: Sequence[int] | None,
-    held_out: float,
-    read: Sequence[Episode] | None = None,
+    episodes: Sequence[Episode], order: int | None, delays: Sequence[int] | None, held_out: float
 ) -> Structure:
-    """Return the model of scaled episodes whose order and dead times are given, or None to find.
-
-    ``read`` are the same episodes with NaN where a stand-in takes the place of a reading.
-    """
-    read = episodes if read is None else read
-    fitted, _ = split_episodes(episodes, held_out)
-    known, tested = split_episodes(read, held_out)
-    m = episodes[0].inputs.shape[1]
-    trials = [tuple(delays)] if delays is not None else [(0,) * m]
-    if delays is None:
-        trials += [each for each in dict.fromkeys(dead_times(fitted, MAX_DELAY)) if any(each)]
+    """Return the model of scaled episodes whose order and dead times are given, or None to find."""
+    read, tested = split_episodes(episodes, held_out)
     with bar("models of the outputs") as tries:
-        searches = [Search(fitted, known, tested, lags, tries) for lags in trials]
-        rough = [each.rough(order) for each in searches]
-        best = int(np.argmin([each.criterion for each in rough]))
-        sure = rough[best].criterion < rough[0].criterion - SURE_DELAY / sum(map(len, fitted))
-        if not sure or rough[best].error > rough[0].error * WORSE:
-            best = 0
-        found = searches[best].best(order)
-        whole = Search(episodes, read, [], found.delays, tries)
+        if delays is None:
+            searches = delayed(read, tested, order, tries)
+        else:
+            searches = [Search(read, tested, tuple(delays), tries)]
+        found = min((each.best(order) for each in searches), key=lambda each: each.criterion)
+        whole = Search(episodes, [], found.delays, tries)
         final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
     past = whole.past
     *poles, integrators, gain_errors = errors_of(final.model, whole.chunks)
@@ -114,6 +98,32 @@ def fit_structure(
         integrators=integrators,
         gain_errors=gain_errors,
     )
+
+
+def delayed(
+    read: Sequence[Episode], tested: Sequence[Episode], order: int | None, tries: Any
+) -> list[Search]:
+    """Return the search with the dead times that the outputs show, or several to choose from.
+
+    Outputs that are read at each sample tell when an input begins to act on them. Others may follow
+    it sooner: where there are some, no dead time is the other choice.
+    """
+    trials = [(0,) * read[0].inputs.shape[1]]
+    fast = np.isfinite(np.concatenate([each.states for each in read])).all(axis=0)
+    if not fast.any():
+        return [Search(read, tested, trials[0], tries)]
+    fitted = [replace(each, states=each.states[:, fast]) for each in read]
+    judged = [replace(each, states=each.states[:, fast]) for each in tested]
+    trials += [each for each in dict.fromkeys(dead_times(fitted, MAX_DELAY)) if any(each)]
+    searches = [Search(fitted, judged, lags, tries) for lags in trials]
+    rough = [each.rough(order) for each in searches]
+    best = int(np.argmin([each.criterion for each in rough]))
+    sure = rough[best].criterion < rough[0].criterion - SURE_DELAY / sum(map(len, fitted))
+    if not sure or rough[best].error > rough[0].error * WORSE:
+        best = 0
+    if fast.all():
+        return [searches[best]]
+    return [Search(read, tested, lags, tries) for lags in dict.fromkeys((trials[0], trials[best]))]
 
 
 def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, float]]:
@@ -149,7 +159,6 @@ class Search:
 
     def __init__(
         self,
-        fitted: Sequence[Episode],
         read: Sequence[Episode],
         tested: Sequence[Episode],
         delays: tuple[int, ...],
@@ -160,7 +169,8 @@ class Search:
         self.tested = shifted(tested, delays)
         self.chunks = Chunks(self.fitted)
         self.delays = delays
-        self.past = Past(shifted(fitted, delays), self.chunks.rare)
+        # Of delayed inputs, or stand-ins would answer too soon.
+        self.past = Past(stand_ins(self.fitted), self.chunks.rare)
         self.largest = min(MAX_ORDER, self.past.limit)
         self.tried: list[Structure] = []
 
@@ -175,6 +185,8 @@ class Search:
 
     def best(self, order: int | None) -> Structure:
         """Return the best model near the rough one, or one that runs freely far better."""
+        if not self.tried:
+            self.rough(order)
         start = min(self.tried, key=lambda each: each.criterion).model.order
         found = {start: self.trial(start)}
         for step in (-1, 1) if order is None else ():
@@ -269,13 +281,16 @@ STAND_IN_RIDGE = 1e-3
 """Of the number of readings: filtered signals depend on each other."""
 
 
-def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Episode]:
-    """Return episodes whose slow outputs, read now and then, have a value at each sample.
+def stand_ins(episodes: Sequence[Episode]) -> list[Episode]:
+    """Return episodes whose slow outputs, NaN but now and then, have a value at each sample.
 
     That is a linear function of the other outputs and the inputs, filtered by several time
     constants, and what it leaves at the readings, drawn straight from one to the next.
     """
     y = [each.states for each in episodes]
+    slow = ~np.isfinite(np.concatenate(y)).all(axis=0)
+    if not slow.any():
+        return list(episodes)
     driven = [each.driven for each in episodes]
     longest = 8 / max(1 - np.mean(~np.isfinite(np.concatenate(y)[:, slow])), 1e-3)
     constants = np.exp2(np.arange(max(3, int(np.log2(longest)) + 1), dtype=np.float64))
@@ -288,8 +303,9 @@ def stand_ins(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Epis
     for i in np.flatnonzero(slow):
         wanted = np.concatenate([each[:, i] for each in y])
         at = np.isfinite(wanted)
-        mean = wanted[at].mean()
-        gram = rows[at].T @ rows[at] + STAND_IN_RIDGE * at.sum() * np.eye(rows.shape[1])
+        count = max(at.sum(), 1)  # the part that is fitted may have none
+        mean = wanted[at].sum() / count
+        gram = rows[at].T @ rows[at] + STAND_IN_RIDGE * count * np.eye(rows.shape[1])
         weights = np.linalg.solve(gram, rows[at].T @ (wanted[at] - mean))
         for part, each in zip(parts, filled, strict=True):
             guess = mean + part @ weights

@@ -189,6 +189,7 @@ def identify_outputs(
     delay : int, sequence of int, or "auto", default "auto"
         Dead time of the inputs in samples. "auto" takes one, up to 10, where the latest inputs
         have no effect, it lowers the criterion, and free runs over held-out data do not suffer.
+        Outputs that are read at each sample tell; where there is none, it takes 0.
     disturbances : array_like, shape (T, d), or a sequence of such, optional
         Measured disturbances, which make E.
     held_out : float, default 0.2
@@ -223,21 +224,18 @@ def identify_outputs(
     wanted = None if isinstance(order, str) and order == "auto" else check_int("order", order, 1)
     (q, m, d) = log.sizes
     read = list(log.episodes)
-    every = log.every
-    slow = np.array(every) > 1
-    episodes = stand_ins(read, slow) if slow.any() else read
+    episodes = stand_ins(read)
     try:
         require_moving(episodes, log.sizes)
         plain = regress(episodes, log.sizes, None, 0.0)
         center = plain.center
         scale = np.where(plain.spread > 0, plain.spread, 1.0)
-        scaled = [_scaled(each, center, scale, q, m) for each in episodes]
-        follows = feedback(scaled)
+        scaled = [_scaled(each, center, scale, q, m) for each in read]
+        follows = feedback(stand_ins(scaled))
     except ValueError as error:
         raise ValueError(log.in_names(str(error).replace("x[", "y["))) from None
     share = check_range("held_out", held_out, 0, 0.5, "[]")
-    known = [_scaled(each, center, scale, q, m) for each in read]
-    found = fit_structure(scaled, wanted, as_delays(delay, m), share, known)
+    found = fit_structure(scaled, wanted, as_delays(delay, m), share)
     model, start = _in_plant_units(found, center, scale, q)
     states = [
         replace(x, states=filtered(model, x.states, x.driven @ model.B.T + model.c, start))
@@ -285,7 +283,7 @@ def identify_outputs(
         long_fit=found.fits[1],
         excitation=plain.excitation,
         start=(mean, linalg.block_diag(start[1], memory)),
-        every=every,
+        every=log.every,
         drift=np.append(drift - system.x_ss, np.zeros(len(late))),
     )
 

@@ -3,12 +3,11 @@
 import copy
 import pickle
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from experiments.outputs import inputs, random_plant
+from experiments.outputs import Plant, inputs, random_plant
 from sb3_yann import IdentifiedOutputs, LinearModel, Log, identify_outputs
 from sb3_yann._validation import Array
 
@@ -38,27 +37,11 @@ def steps(count: int, m: int, seed: int, hold: int = 4) -> Array:
     return 3 + np.repeat(rng.uniform(-1, 1, (-(-count // hold), m)), hold, axis=0)[:count]
 
 
-def best_possible(model: dict[str, Any], y: Array, u: Array, noise: float, ahead: int) -> Array:
-    """Return what the plant's own Kalman filter predicts (T + 1 - ahead, q)."""
-    A = model["A"]
-    B = model["B"]
-    C = model["C"]
-    delay = model.get("delay", 0)
+def best_possible(A: Array, B: Array, C: Array, y: Array, u: Array, delay: int = 0) -> Array:
+    """Return what the Kalman filter of a plant of `played` predicts, 20 samples ahead."""
     offset = np.array([20.0, -3.0])[: len(C)]
-    v = np.vstack([np.zeros((delay, u.shape[1])), u])[: len(u)]
-    x = np.zeros(len(A))
-    P = np.eye(len(A))
-    found = []
-    for k in range(len(u) + 1 - ahead):
-        gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + noise**2 * np.eye(len(C)))
-        z = x + gain @ (y[k] - offset - C @ x)
-        P = A @ (P - gain @ C @ P) @ A.T + (noise / 5) ** 2 * np.eye(len(A))
-        x = A @ z + B @ v[k]
-        z = x
-        for step in range(1, ahead):
-            z = A @ z + B @ v[k + step]
-        found.append(C @ z + offset)
-    return np.array(found)
+    plant = Plant(A, B, C, np.full(u.shape[1], delay), 0.01, np.full(len(C), 0.05))
+    return plant.predict(y - offset, u) + offset
 
 
 def rms(errors: Array) -> float:
@@ -77,8 +60,7 @@ def test_predictions_come_close_to_the_best_possible_on_another_record(
     u = steps(600, 2, 5)
     y = played(u, A, B, C, 6)
     guess = found.predict(y, u, ahead=20)
-    assert guess.shape == (581, 2)
-    best = best_possible({"A": A, "B": B, "C": C}, y, u, 0.05, 20)
+    best = best_possible(A, B, C, y, u)
     assert rms(guess - y[20:]) < 1.1 * rms(best - y[20:])
 
 
@@ -109,7 +91,7 @@ def test_dead_time_is_told_from_order() -> None:
     assert (prompt.order, prompt.delays) == (2, (0,))
     fresh = steps(500, 1, 8)
     y = played(fresh, a, b, c, 9, delay=5)
-    best = best_possible({"A": a, "B": b, "C": c, "delay": 5}, y, fresh, 0.05, 20)
+    best = best_possible(a, b, c, y, fresh, delay=5)
     late = slice(40, None)  # the plant began at rest, which no record tells
     assert rms((found.predict(y, fresh) - y[20:])[late]) < 1.1 * rms((best - y[20:])[late])
 
@@ -166,7 +148,7 @@ def test_a_measured_disturbance_makes_E() -> None:
     found = identify_outputs(replace(log, disturbance_names=("feed",)))
     assert (found.model.n_inputs, found.model.disturbance_labels) == (1, ["feed"])
     guess = found.predict(y, both[:, :1], 20, disturbances=both[:, 1:])
-    best = best_possible({"A": A, "B": B, "C": C}, y, both, 0.05, 20)
+    best = best_possible(A, B, C, y, both)
     assert rms(guess - y[20:]) < 1.1 * rms(best - y[20:])
 
 
@@ -241,7 +223,7 @@ def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
     assert found.every == (1, 10) and "Read now and then: y[1] every 10" in found.report()
     fresh = steps(800, 2, 5)
     z = played(fresh, A, B, C, 6)
-    best = best_possible({"A": A, "B": B, "C": C}, z, fresh, 0.05, 20)
+    best = best_possible(A, B, C, z, fresh)
     shown = z.copy()
     shown[np.arange(len(z)) % 10 > 0, 1] = np.nan
     guess = found.predict(shown, fresh, ahead=20)
@@ -251,6 +233,18 @@ def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
     estimator = found.estimator()
     assert estimator.every.tolist() == [1, 10]
     np.testing.assert_allclose(estimator.noise["measurement_noise"], found.noise)  # offset_free
+
+
+def test_a_slow_output_hides_dead_time_only_if_it_answers_sooner() -> None:
+    u = steps(1200, 1, 2)
+    b = np.array([[0.3], [0.0], [0.5]])
+    y = played(u, A, b, C, 3, delay=5)
+    y[np.arange(len(y)) % 10 > 0, 1] = np.nan
+    assert identify_outputs(y, u, dt=1).delays == (5,)
+    y[::10, 1] = played(u, A, b, C, 4)[::10, 1]
+    assert identify_outputs(y, u, dt=1).delays == (0,)
+    alone = identify_outputs(y[:, 1:], u, dt=1)
+    assert (alone.every, alone.delays) == ((10,), (0,)) and alone.long_fit > 80
 
 
 @pytest.mark.nightly
