@@ -33,7 +33,7 @@ MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
 class Status(IntFlag):
     """What a step found. The first four are faults, upon which the controller falls back."""
 
-    NOT_FINITE = 1  # a reading is NaN or infinite
+    NOT_FINITE = 1  # a reading, or manual where it counts, is NaN or infinite
     OUT_OF_RANGE = 2  # a reading is beyond the limits that the export was given
     FROZEN = 4  # a reading stays the same to the bit while others move
     LATE = 8  # more time has passed since the last step than it may
@@ -219,25 +219,19 @@ class Controller:
         Raises
         ------
         ValueError
-            If a shape is wrong, ``manual`` is not finite, or ``request`` is none of the three.
+            If a shape is wrong, or ``request`` is none of the three.
         """
         rows, _ = self._rows(obs, len(self._good), batch=False)
         if self.request not in MODES:
             raise ValueError(f"request = {self.request!r} must be one of {MODES}.")
         data = self.data
         m = len(self._output)
-        given = np.zeros(m) if manual is None else _as_readings("manual", manual)
-        if given.shape != (m,) or not np.isfinite(given).all():
-            wanted = f"{m} finite numbers, or None to hold the output"
-            raise ValueError(f"manual = {given.tolist()} must be {wanted}.")
-        known = self.counters["steps"] == 0 and manual is not None
-        if known:
-            self._warn_of_present(given)
-            self._output = given.copy()
+        given, known, fault = self._by_hand(manual)
         faulty, status = self._readings(rows[0])
         if elapsed is not None and elapsed > float(data["late_after"]):
             status |= Status.LATE
         mode = self._mode(status)
+        status |= fault  # no fault of a sensor, which mode would follow
         seen = self._seen(rows[0], faulty, known)
         action, low, high, inside, sound = self._act(seen[None], mode == POLICY)
         status |= Status(0) if inside[0] else Status.OUTSIDE
@@ -246,8 +240,8 @@ class Controller:
         shift = data["action_shift"]
         target = action[0] * scale + shift
         if mode == MANUAL:
-            by_hand = manual is not None and self.request == MANUAL
-            target = given if by_hand else self._output
+            by_hand = np.isfinite(given) & (self.request == MANUAL)
+            target = np.where(by_hand, given, self._output)
         if mode != self.mode or known:
             self.counters["changes"] += mode != self.mode
             self._left = int(data["transfer"])
@@ -271,6 +265,20 @@ class Controller:
             self.counters[name] += 1
         return self._output.copy()
 
+    def _by_hand(self, manual: ArrayLike | None) -> tuple[Array, bool, Status]:
+        """Return manual (m,), whether the output goes on from it, and what is wrong with it."""
+        m = len(self._output)
+        given = np.full(m, np.nan) if manual is None else _as_readings("manual", manual)
+        if given.shape != (m,):
+            raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
+        begins = self.counters["steps"] == 0
+        finite = bool(np.isfinite(given).all())
+        if begins and finite:
+            self._warn_of_present(given)
+            self._output = given.copy()
+        counts = manual is not None and (begins or self.request == MANUAL)
+        return given, begins and finite, Status.NOT_FINITE if counts and not finite else Status(0)
+
     def _warn_of_present(self, given: Array) -> None:
         """Warn of a present input (m,) that is further beyond its bounds than half their width."""
         low, high = self.data["bounds"] * self.data["action_scale"] + self.data["action_shift"]
@@ -280,7 +288,7 @@ class Controller:
                 f"The plant's present input, manual = {given[i]:g} of {self.action_names[i]}, is "
                 f"far beyond its bounds, {low[i]:g} to {high[i]:g}: the output begins at one of "
                 "them. Is it in another unit?",
-                stacklevel=3,
+                stacklevel=4,
             )
 
     def _readings(self, obs: Array) -> tuple[NDArray[np.bool_], Status]:

@@ -252,9 +252,10 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"obs has shape \(2, 4\).*, as evaluate") as told:
         controller(np.zeros((2, 4)))
     assert "request" not in str(told.value)
-    for wrong in ([0, 0, 0], [np.nan]):
-        with pytest.raises(ValueError, match=r"manual = .* must be 1 finite numbers, or None"):
-            controller(np.zeros(4), manual=wrong)
+    with pytest.raises(ValueError, match=r"manual has shape \(3,\), expected \(1,\)"):
+        controller(np.zeros(4), manual=[0, 0, 0])
+    controller(np.zeros(4), manual=[np.nan])
+    assert controller.status == Status.NOT_FINITE and controller.mode == "policy"
     controller.request = "off"
     with pytest.raises(ValueError, match=r"^request = 'off' must be one of"):
         controller(np.zeros(4))
