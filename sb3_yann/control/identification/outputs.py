@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
@@ -84,7 +85,10 @@ def fit_structure(
         else:
             searches = [Search(read, tested, tuple(delays), tries)]
         found = min((each.best(order) for each in searches), key=lambda each: each.criterion)
-        whole = Search(episodes, [], found.delays, tries)
+        whole = Search(episodes, [], found.delays, tries, found)
+        if whole.chunks.rare.any():  # the model tells more of slow outputs than a regression
+            again = Search(read, tested, found.delays, tries, found).best(order)
+            found = min(found, again, key=lambda each: each.criterion)
         final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
     past = whole.past
     *poles, integrators, gain_errors = errors_of(final.model, whole.chunks)
@@ -163,6 +167,7 @@ class Search:
         tested: Sequence[Episode],
         delays: tuple[int, ...],
         tries: Any,
+        told: Structure | None = None,
     ) -> None:
         self.tries = tries
         self.fitted = shifted(read, delays)
@@ -170,7 +175,7 @@ class Search:
         self.chunks = Chunks(self.fitted)
         self.delays = delays
         # Of delayed inputs, or stand-ins would answer too soon.
-        self.past = Past(stand_ins(self.fitted), self.chunks.rare)
+        self.past = Past(stand_ins(self.fitted, told), self.chunks.rare)
         self.largest = min(MAX_ORDER, self.past.limit)
         self.tried: list[Structure] = []
 
@@ -281,49 +286,59 @@ STAND_IN_RIDGE = 1e-3
 """Of the number of readings: filtered signals depend on each other."""
 
 
-def stand_ins(episodes: Sequence[Episode]) -> list[Episode]:
+def stand_ins(episodes: Sequence[Episode], told: Structure | None = None) -> list[Episode]:
     """Return episodes whose slow outputs, NaN but now and then, have a value at each sample.
 
-    That is a linear function of the other outputs and the inputs, filtered by several time
-    constants, and what it leaves at the readings, drawn straight from one to the next.
+    That is what a model tells, or else a regression, and what it leaves at the readings, drawn
+    straight from one to the next.
     """
-    y = [each.states for each in episodes]
-    slow = ~np.isfinite(np.concatenate(y)).all(axis=0)
+    slow = ~np.isfinite(np.concatenate([each.states for each in episodes])).all(axis=0)
     if not slow.any():
         return list(episodes)
-    driven = [each.driven for each in episodes]
-    longest = 8 / max(1 - np.mean(~np.isfinite(np.concatenate(y)[:, slow])), 1e-3)
+    if told is None or not np.isfinite(told.criterion):
+        guesses = _regressed(episodes, slow)
+    else:
+        first = told.model.C @ told.start[0] + told.model.y_0
+        ahead = [predicted(told.model, each, told.start, 1) for each in episodes]
+        guesses = [np.vstack([first, each]) for each in ahead]
+    filled = []
+    for each, guess in zip(episodes, guesses, strict=True):
+        left = each.states - guess
+        rows = np.arange(len(guess))
+        for column in left.T:
+            seen = np.isfinite(column)
+            column[:] = np.interp(rows, rows[seen], column[seen]) if seen.any() else 0.0
+        filled.append(replace(each, states=guess + left))
+    return filled
+
+
+def _regressed(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Array]:
+    """Return outputs (T + 1, q), the slow ones as linear functions of the others and the inputs.
+
+    These are taken as of now, of inputs as of before, and filtered by several time constants.
+    """
+    from scipy.signal import lfilter  # takes half a second to import
+
+    y = np.concatenate([each.states for each in episodes])
+    longest = 8 / max(np.mean(np.isfinite(y[:, slow])), 1e-3)
     constants = np.exp2(np.arange(max(3, int(np.log2(longest)) + 1), dtype=np.float64))
-    parts = [_filtered(a[:, ~slow], b, constants) for a, b in zip(y, driven, strict=True)]
+    parts = []
+    for each in episodes:
+        before = np.vstack([each.driven[:1], each.driven])  # acts from the second sample on
+        signals = np.hstack([each.states[:, ~slow], before])
+        smooth = [
+            lfilter([1 - pole], [1, -pole], signals, axis=0, zi=pole * signals[:1])[0]
+            for pole in np.exp(-1 / constants)
+        ]
+        parts.append(np.hstack([signals, *smooth]))
     rows = np.concatenate(parts)
     scale = rows.std(axis=0)
     rows = (rows - rows.mean(axis=0)) / np.where(scale > 0, scale, 1.0)
-    parts = np.split(rows, np.cumsum([*map(len, parts)])[:-1])
-    filled = [each.copy() for each in y]
+    found = y.copy()
     for i in np.flatnonzero(slow):
-        wanted = np.concatenate([each[:, i] for each in y])
-        at = np.isfinite(wanted)
+        at = np.isfinite(y[:, i])
         count = max(at.sum(), 1)  # the part that is fitted may have none
-        mean = wanted[at].sum() / count
+        mean = y[at, i].sum() / count
         gram = rows[at].T @ rows[at] + STAND_IN_RIDGE * count * np.eye(rows.shape[1])
-        weights = np.linalg.solve(gram, rows[at].T @ (wanted[at] - mean))
-        for part, each in zip(parts, filled, strict=True):
-            guess = mean + part @ weights
-            seen = np.flatnonzero(np.isfinite(each[:, i]))
-            left = each[seen, i] - guess[seen]
-            rest = np.interp(np.arange(len(guess)), seen, left) if len(seen) else 0.0
-            each[:, i] = guess + rest
-    return [replace(each, states=x) for each, x in zip(episodes, filled, strict=True)]
-
-
-def _filtered(fast: Array, driven: Array, constants: Array) -> Array:
-    """Return (T + 1, k): fast outputs now and filtered, and inputs of before, filtered."""
-    from scipy.signal import lfilter  # takes half a second to import
-
-    before = np.vstack([driven[:1], driven])  # the first input acts from the second sample on
-    signals = np.hstack([fast, before])
-    found = [signals]
-    for pole in np.exp(-1 / constants):
-        smooth, _ = lfilter([1 - pole], [1, -pole], signals, axis=0, zi=pole * signals[:1])
-        found.append(smooth)
-    return np.hstack(found)
+        found[:, i] = mean + rows @ np.linalg.solve(gram, rows[at].T @ (y[at, i] - mean))
+    return np.split(found, np.cumsum([*map(len, parts)])[:-1])
