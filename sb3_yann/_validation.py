@@ -97,17 +97,18 @@ def check_symmetric(name: str, value: ArrayLike, size: int) -> Array:
 
 
 def check_bounds(
-    name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int
+    name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int, equal: bool = False
 ) -> tuple[Array, Array]:
-    """Return bounds of shape ``(size,)``, the lower below the upper.
+    """Return bounds of shape ``(size,)``, the lower below the upper, or ``equal``.
 
     A scalar is for all entries; None and infinity are no bound. A finite one has at most 1e100.
     """
     below, above = sides_of(name)
     low = _bound(below, lower, size, -np.inf)
     high = _bound(above, upper, size, np.inf)
-    if np.any(low >= high):
-        i = int(np.argmax(low >= high))
+    wrong = low > high if equal else low >= high
+    if np.any(wrong):
+        i = int(np.argmax(wrong))
         given = f"{below} = {low[i]:g} and {above} = {high[i]:g}"
         raise ValueError(f"{below} must lie below {above}, but entry {i} has {given}.")
     return low, high

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -248,7 +249,12 @@ class Log:
     ) -> Log:
         """Return the log of records, cut at gaps and where a step takes another time."""
         dt = check_positive("dt", dt)
-        _warn_of_other_units(records, [names.get(f"{of}_names", ()) for of in ("state", "input")])
+        x, u = (np.concatenate([getattr(e, of) for e in records]) for of in ("states", "inputs"))
+        labels = [*(names.get("state_names") or [f"x[{i}]" for i in range(x.shape[1])])]
+        labels += names.get("input_names") or [f"u[{i}]" for i in range(u.shape[1])]
+        columns = [*x.T, *u.T]
+        _warn_of_marks(labels, columns)
+        _warn_of_other_units(labels, columns, x.shape[1])
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
@@ -257,7 +263,7 @@ class Log:
         return cls(tuple(episodes), dt, lost_steps=sum(map(len, records)) - kept, **names)
 
     @classmethod
-    def from_csv(
+    def from_csv(  # noqa: PLR0913 (what a file is like, by name)
         cls,
         path: str | os.PathLike[str],
         states: Sequence[str],
@@ -270,6 +276,8 @@ class Log:
         time: str | None = None,
         delimiter: str = ",",
         time_unit: str = "",
+        decimal: str = ".",
+        encoding: str = "utf-8-sig",
     ) -> Log:
         """Return the log of a CSV file with a header, as a historian writes it.
 
@@ -298,6 +306,8 @@ class Log:
             Between two columns.
         time_unit : str, optional
             Of ``dt``; by default that of the column of times.
+        decimal, encoding : str
+            The decimal sign, a point by default, and the file's encoding, UTF-8.
 
         Raises
         ------
@@ -309,15 +319,20 @@ class Log:
         for name, given in (("states", states), ("inputs", inputs)):
             if isinstance(given, str) or not given:
                 raise ValueError(f"{name} = {given!r} must be a list of column names.")
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, delimiter=delimiter)
-            header = list(rows.fieldnames or [])
-            columns = {
-                name: _column(path, name, header)
-                for name in (*states, *inputs, *disturbances, *references, episode, time)
-                if name is not None
-            }
-            content = list(rows)
+        try:
+            text = Path(path).read_text(encoding)
+        except UnicodeError:
+            raise ValueError(
+                f"{path} is not in {encoding}: pass encoding='latin-1', 'utf-16' or what it is in."
+            ) from None
+        rows = csv.DictReader(StringIO(text), delimiter=delimiter)
+        header = list(rows.fieldnames or [])
+        columns = {
+            name: _column(path, name, header)
+            for name in (*states, *inputs, *disturbances, *references, episode, time)
+            if name is not None
+        }
+        content = list(rows)
         wanted = [columns[name] for name in (*states, *inputs, *disturbances, *references)]
         if twice := [name for name in wanted if wanted.count(name) > 1]:
             raise ValueError(
@@ -327,14 +342,15 @@ class Log:
         if longer := [k for k, row in enumerate(content) if rows.restkey in row]:
             raise ValueError(
                 f"{path}, row {longer[0] + 2} has more entries than the header has names. Numbers "
-                f"with a decimal comma need another delimiter than {delimiter!r}, and a point."
+                f"with a decimal comma need another delimiter than {delimiter!r}, and decimal=','."
             )
+        for row in content:
+            row |= {name: (row[name] or "").replace(decimal, ".") for name in wanted}
         table = np.array(
             [[_number(path, k, row, name) for name in wanted] for k, row in enumerate(content)]
         )
         if not len(table):
             raise ValueError(f"{path} has no rows below its header.")
-        _warn_of_marks(path, wanted, table)
         unread = [each for each in header if each not in wanted]
         if unread and episode is None and time is None:
             warn(
@@ -461,18 +477,19 @@ def _name_and_unit(header: str) -> tuple[str, str]:
     return (name.strip(), unit.strip()) if bracket and header.endswith("]") else (header, "")
 
 
-def _warn_of_marks(path: object, names: Sequence[str], table: Array) -> None:
+def _warn_of_marks(names: Sequence[str], columns: Sequence[Array]) -> None:
     """Warn where a column holds what historians write for no reading, far from all else."""
-    for name, column in zip(names, table.T, strict=True):
-        marks = np.isin(column, NO_READING)
+    for name, column in zip(names, columns, strict=True):
+        marks = np.isin(np.trunc(column), NO_READING)
         rest = column[~marks & np.isfinite(column)]
         if not (marks.any() and len(rest)):
             continue
         far = np.abs(column[marks] - np.median(rest)) > 10 * np.ptp(rest)
         if far.any():
             warn(
-                f"{path}: {name} is {column[marks][far][0]:g} in {np.count_nonzero(far)} rows, far "
-                "from all others. If that stands for no reading, leave these cells empty."
+                f"{name} of the log is {column[marks][far][0]:g} in {np.count_nonzero(far)} rows, "
+                "far from all others. If that stands for no reading, leave these cells empty, or "
+                "NaN."
             )
 
 
@@ -486,13 +503,12 @@ JUMP = 5.0  # times any other step of a column that a change of its unit is, at 
 LEAST_READ = 10  # readings on either side of it
 
 
-def _warn_of_other_units(records: Sequence[Episode], names: Sequence[Sequence[str]]) -> None:
-    """Warn where a column goes on in another unit: where it jumps so far, and its steps grow so."""
-    n = records[0].states.shape[1]
-    x, u = (np.concatenate([getattr(e, part) for e in records]) for part in ("states", "inputs"))
-    labels = [*(names[0] or [f"x[{i}]" for i in range(n)])]
-    labels += names[1] or [f"u[{i}]" for i in range(u.shape[1])]
-    for i, (name, column) in enumerate(zip(labels, [*x.T, *u.T], strict=True)):
+def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int) -> None:
+    """Warn where a column goes on in another unit: where it jumps so far, and its steps grow so.
+
+    The first n are states.
+    """
+    for i, (name, column) in enumerate(zip(labels, columns, strict=True)):
         rows = np.flatnonzero(np.isfinite(column))
         z = column[rows]
         steps = np.diff(z)
@@ -520,7 +536,7 @@ def _number(path: object, row: int, content: dict[str, str], name: str) -> float
     except ValueError:
         raise ValueError(
             f"{path}, row {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
-            "where there is no reading."
+            "where there is no reading; of decimal commas pass decimal=','."
         ) from None
 
 
@@ -591,6 +607,9 @@ def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np
             "in the same unit; of time stamps dt is in seconds, or in "
             f'time_unit="{[*fits, "min"][0]}".'
         )
+    mean = float(whole[~uneven].mean()) if not uneven.all() else dt
+    if not uneven.any() and abs(mean - dt) > 0.02 * dt:
+        warn(f"dt = {dt:g}, but a step of the log takes {mean:.4g} on average: pass dt={mean:.4g}.")
     if most or np.sum(uneven & (np.abs(whole - dt) < 0.5 * dt)) > 5 + 0.02 * len(whole):
         words = (
             f"{np.mean(uneven):.0%} of the log's steps differ from dt = {dt:g} by more than a "

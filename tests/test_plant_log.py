@@ -128,6 +128,14 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
     assert log.lost_steps == 3 and log.state_names == ("level", "T")
     assert log.every == (1, 1) and log.with_all_states() is log
     assert log.episodes[0].disturbances.tolist() == [[7], [7]]
+    given = {"states": ["level", "Tä"], "inputs": ["valve"], "dt": 10, "delimiter": ";", **columns}
+    path = write()
+    path.write_text(CSV.replace(",", ";").replace(".", ",").replace("T", "Tä"), "latin-1")
+    read = Log.from_csv(path, **given, decimal=",", encoding="latin-1")
+    assert [each.states[:, 0].tolist() for each in read.episodes] == states
+    for wrong, match in ((given, "pass encoding="), (given | {"encoding": "latin-1"}, "decimal=")):
+        with pytest.raises(ValueError, match=match):
+            Log.from_csv(path, **wrong)
     with pytest.warns(UserWarning, match=r"All 10 rows .* one episode .*\['run', 't', 'T', 'load'"):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10)
     with pytest.raises(ValueError, match=r"begins anew in each episode, name .* episode="):
@@ -136,8 +144,8 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
 
 def test_a_mark_for_no_reading_is_named(write) -> None:
     given = {"states": ["T"], "inputs": ["valve"], "dt": 10, "episode": "run"}
-    with pytest.warns(UserWarning, match="T is -9999 in 2 rows, far from all others"):
-        Log.from_csv(write(CSV.replace(",24,", ",-9999,").replace(",27,", ",-9999,")), **given)
+    with pytest.warns(UserWarning, match="T of the log is -999.25 in 2 rows, far from all others"):
+        Log.from_csv(write(CSV.replace(",24,", ",-999.25,").replace(",27,", ",-999.25,")), **given)
     Log.from_csv(write(CSV.replace(",24,", ",999,").replace(",27,", ",900,")), **given)  # no mark
 
 

@@ -12,6 +12,7 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import LinearSystem
 
+FAST = 1e6  # times that a mode may grow in a sample: its feedback cancels all but ten digits
 NEAR_CIRCLE = 1e-3
 """Distance from the unit circle at which rounding may put the poles of a chain of integrators."""
 NUDGE = 1e-12  # of the largest weight: it is given to all inputs where there is no solution without
@@ -111,6 +112,12 @@ def unreached(A: Array, B: Array) -> complex | None:
 
 def _why_no_solution(A: Array, B: Array) -> str:
     """Return which condition of the Riccati equation fails."""
+    fastest = np.abs(np.linalg.eigvals(A)).max()
+    if fastest > FAST:
+        return (
+            f"The model grows {fastest:.2g} times in a sample, and float64 holds no feedback for "
+            "that. Is dt in the unit of the model's time? Else sample faster."
+        )
     pole = unreached(A, B)
     if pole is not None:
         shown = pole if pole.imag else pole.real

@@ -245,11 +245,15 @@ def ascii_text(lines: Iterable[str]) -> str:
 
 
 def sample_observations(controller: Controller, count: int, seed: int = 0) -> Array:
-    """Return observations (count, n_obs): the operating point, then some in and around the box."""
+    """Return observations (count, n_obs): the operating point, then some in and around the box.
+
+    Every other one is nearer to the operating point, where the MPC of a wide box has a solution.
+    """
     data = controller.data
     generator = np.random.default_rng(seed)
     low, high = data["box"]
     theta = (low + high) / 2 + generator.uniform(-0.65, 0.65, (count, len(low))) * (high - low)
+    theta[::2] *= 2.0 ** -(np.arange(len(theta[::2])) % 8)[:, None]
     theta[0] = 0.0
     return np.asarray((theta - data["obs_offset"]) @ np.linalg.pinv(data["obs_matrix"]).T)
 

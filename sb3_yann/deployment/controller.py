@@ -353,8 +353,9 @@ class Controller:
         given = _as_readings("obs", obs)
         if given.ndim not in (1, 1 + batch) or given.shape[-1] != size:
             names = f": {', '.join(self.obs_names)}" * (size == len(self.obs_names))
-            more = f" or (batch, {size})" if batch else ", as evaluate(obs) takes a batch"
+            more = f" or (batch, {size})" if batch else ""
             wanted = f"expected ({size},){more}{names}"
+            wanted += ". evaluate(obs) takes a batch" * (not batch and given.ndim > 1)
             raise ValueError(f"obs has shape {given.shape}, {wanted}.")
         return np.atleast_2d(given), given.ndim == 1
 

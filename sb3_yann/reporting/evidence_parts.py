@@ -241,7 +241,8 @@ def _beyond(subject: Subject) -> Finding:
     high = begins.max(axis=0)
     ends = zip(with_units(problem.model)[0], map(number, low), map(number, high), strict=True)
     box = ", ".join(f"{name} {a}" + f" to {b}" * (a != b) for name, a, b in ends)
-    states = problem.units.to_plant(subject.samples)[:, part]
+    solved = subject.samples[subject.law.in_domain(subject.samples)]
+    states = problem.units.to_plant(solved)[:, part]
     loops = subject.loops_from(states[((states < low) | (states > high)).any(axis=1)])
     mpc, policy = (Scores(loops[who].costs, loops[who].unsafe()) for who in (OF_MPC, OF_POLICY))
     text = f"Episodes begin at {box}."
@@ -253,7 +254,7 @@ def _beyond(subject: Subject) -> Finding:
     more = int(np.sum(change > COST_ROUNDING))
     reason = no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
     text += (
-        f" From {count} states beyond, anywhere in the box of parameters, the cost changes by "
+        f" From {count} states beyond, where the MPC has a solution, the cost changes by "
         f"{change_in_percent(float(np.median(change)))} in the median; from {more or 'none'} it is "
         f"more{f', by {change_in_percent(change.max())} at most' * bool(more)}"
         f"{'; ' * bool(reason)}{reason}."

@@ -213,7 +213,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         high = np.minimum(x_ss + half, box[1])
         lowest = low if start_low is None else start_low
         highest = high if start_high is None else start_high
-        start = check_bounds("start_", lowest, highest, n)
+        start = check_bounds("start_", lowest, highest, n, equal=True)
         if not np.all(np.isfinite(start)):
             raise ValueError(
                 "The MPC's box of states is not bounded, so it is not known where episodes begin: "

@@ -249,7 +249,7 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
         Controller.load(tmp_path / "none.npz")
     with pytest.raises(ValueError, match=r"obs has shape \(3,\), expected \(4,\).*C_A"):
         controller([1, 2, 3])
-    with pytest.raises(ValueError, match=r"obs has shape \(2, 4\).*, as evaluate") as told:
+    with pytest.raises(ValueError, match=r"obs has shape \(2, 4\).*\. evaluate") as told:
         controller(np.zeros((2, 4)))
     assert "request" not in str(told.value)
     with pytest.raises(ValueError, match=r"manual has shape \(3,\), expected \(1,\)"):

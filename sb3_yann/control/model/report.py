@@ -214,7 +214,10 @@ def _gains(model: LinearSystem) -> list[str]:
         )
     if np.any(width):
         unsure = np.argwhere((np.abs(values) <= width) & (width > 0))
-        none = ", ".join(f"{inputs[j]} on {states[i]}" for i, j in unsure)
+        none = ", ".join(
+            f"{inputs[j]} on {states[i]}{', its rate' * bool(gains.degrees[i, j])}"
+            for i, j in unsure
+        )
         noise = "process noise" if model.C is None else "process and sensor noise"
         text = f" Not distinguishable from zero: {none}." if none else ""
         if any(each.endswith(UNTOLD) for each in model.notes):

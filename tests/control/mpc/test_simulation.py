@@ -104,7 +104,8 @@ def test_it_names_every_parameter_with_its_box_and_meaning() -> None:
 def test_it_counts_regions_half_spaces_and_rows_of_the_terminal_set() -> None:
     mpc = solved("invariant")
     law = mpc.explicit()
-    text = mpc.report(samples=50)
+    text = mpc.report(samples=100)
+    assert "100.0 % stay feasible" in text
     assert f"{law.n_regions} regions and {law.n_halfspaces} half-spaces" in text
     assert f"The terminal set has {len(mpc.terminal.set[1])} half-spaces." in text
     assert "There is no terminal set." in small_mpc().report(samples=10)
@@ -135,10 +136,6 @@ def test_how_far_the_explicit_law_is_from_the_online_one_beyond_the_box_is_said(
     assert words in said
     most = float(re.search(r"range, by (\d+) % at most", said)[1])
     assert 5 < most <= 100
-
-
-def test_an_invariant_terminal_set_shows_as_a_closed_loop_that_stays_feasible() -> None:
-    assert "100.0 % stay feasible" in solved("invariant").report(samples=100)
 
 
 def test_active_constraints_are_shares_of_the_feasible_parameters() -> None:
@@ -188,22 +185,21 @@ def test_regions_of_a_very_large_program_are_not_looked_for(monkeypatch) -> None
         assert isinstance(wide_plant().law(), OnlineLaw)
 
 
-def test_what_was_solved_is_taken_whatever_its_size(monkeypatch) -> None:
+def test_what_was_solved_or_chosen_is_kept_whatever_its_size(monkeypatch) -> None:
     monkeypatch.setattr(linear_mpc, "REGIONS", 2)
     mpc = servo()
     explicit = mpc.explicit()
     assert mpc.law() is explicit
     assert mpc.law("online") is mpc.online()
     assert mpc.law("explicit") is explicit
-
-
-def test_what_was_chosen_is_kept(monkeypatch) -> None:
     mpc = servo()
     assert isinstance(mpc.law("online"), OnlineLaw)
     assert "The law is solved online, with" in mpc.report(samples=20)
     monkeypatch.setattr(LinearMPC, "_solved", None)
     assert isinstance(mpc.law(), OnlineLaw)
     mpc.value_matrix(0.99)
+    with pytest.raises(ValueError, match="kind"):
+        mpc.law("implicit")
 
 
 def test_auto_gives_up_by_what_it_counts_and_not_by_the_clock(monkeypatch) -> None:
@@ -227,11 +223,6 @@ def test_auto_takes_the_online_law_where_the_search_fails(monkeypatch) -> None:
         servo().explicit()
     with pytest.warns(OnlineLawWarning, match="no solution in float64"):
         assert isinstance(servo().law(), OnlineLaw)
-
-
-def test_an_unknown_kind_is_named() -> None:
-    with pytest.raises(ValueError, match="kind"):
-        servo().law("implicit")
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
