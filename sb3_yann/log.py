@@ -249,12 +249,14 @@ class Log:
     ) -> Log:
         """Return the log of records, cut at gaps and where a step takes another time."""
         dt = check_positive("dt", dt)
-        x, u = (np.concatenate([getattr(e, of) for e in records]) for of in ("states", "inputs"))
-        labels = [*(names.get("state_names") or [f"x[{i}]" for i in range(x.shape[1])])]
-        labels += names.get("input_names") or [f"u[{i}]" for i in range(u.shape[1])]
-        columns = [*x.T, *u.T]
+        labels: list[str] = []
+        columns: list[Array] = []
+        for of, letter in (("state", "x"), ("input", "u"), ("disturbance", "d")):
+            part = np.concatenate([getattr(each, f"{of}s") for each in records])
+            labels += names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(part.shape[1])]
+            columns += [*part.T]
         _warn_of_marks(labels, columns)
-        _warn_of_other_units(labels, columns, x.shape[1])
+        _warn_of_other_units(labels, columns, records[0].states.shape[1])
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
@@ -345,7 +347,10 @@ class Log:
                 f"with a decimal comma need another delimiter than {delimiter!r}, and decimal=','."
             )
         for row in content:
-            row |= {name: (row[name] or "").replace(decimal, ".") for name in wanted}
+            row |= {
+                name: (row[name] or "").replace(decimal, ".")
+                for name in (*wanted, *([columns[time]] if time else []))
+            }
         table = np.array(
             [[_number(path, k, row, name) for name in wanted] for k, row in enumerate(content)]
         )
