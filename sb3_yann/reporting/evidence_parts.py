@@ -243,13 +243,17 @@ def _beyond(subject: Subject) -> Finding:
     box = ", ".join(f"{name} {a}" + f" to {b}" * (a != b) for name, a, b in ends)
     solved = subject.samples[subject.law.in_domain(subject.samples)]
     states = problem.units.to_plant(solved)[:, part]
-    loops = subject.loops_from(states[((states < low) | (states > high)).any(axis=1)])
+    states = states[((states < low) | (states > high)).any(axis=1)]
+    loops = subject.loops_from(states)
     mpc, policy = (Scores(loops[who].costs, loops[who].unsafe()) for who in (OF_MPC, OF_POLICY))
     text = f"Episodes begin at {box}."
     count = len(mpc.costs)
     if not count:
-        taken = 'The env takes no reset(options={"state": x})'
-        return Finding("note", f"{text} {taken}: other starts are not tried.")
+        why = 'The env takes no reset(options={"state": x})'
+        if not len(states):
+            count = len(subject.samples)
+            why = f"None of {count} states of the box is beyond, where the MPC has a solution"
+        return Finding("note", f"{text} {why}: other starts are not tried.")
     change = relative_costs(policy.costs - mpc.costs, mpc.costs)
     more = int(np.sum(change > COST_ROUNDING))
     reason = no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason

@@ -336,6 +336,9 @@ def test_starts_beyond_those_of_episodes_are_a_finding_of_their_own(takes) -> No
         with th.no_grad():
             for weights in model.actor.mu.network.parameters():
                 weights += 0.3
+    within = subject_of(model, env=make)
+    vars(within)["samples"] = np.zeros((5, 1))
+    assert "None of 5 states" in evidence_parts._beyond(within).text
 
 
 def test_a_penalty_that_rounding_alone_makes_larger_is_no_failure() -> None:
