@@ -346,13 +346,11 @@ class Log:
                 f"{path}, row {longer[0] + 2} has more entries than the header has names. Numbers "
                 f"with a decimal comma need another delimiter than {delimiter!r}, and decimal=','."
             )
-        for row in content:
-            row |= {
-                name: (row[name] or "").replace(decimal, ".")
-                for name in (*wanted, *([columns[time]] if time else []))
-            }
         table = np.array(
-            [[_number(path, k, row, name) for name in wanted] for k, row in enumerate(content)]
+            [
+                [_number(path, k, row, name, decimal) for name in wanted]
+                for k, row in enumerate(content)
+            ]
         )
         if not len(table):
             raise ValueError(f"{path} has no rows below its header.")
@@ -376,7 +374,9 @@ class Log:
         times = None
         if time is not None:
             unit = time_unit or _name_and_unit(columns[time])[1]
-            pairs = [_time(path, k, row, columns[time], unit) for k, row in enumerate(content)]
+            pairs = [
+                _time(path, k, row, columns[time], unit, decimal) for k, row in enumerate(content)
+            ]
             instants, stamped = np.array(pairs).T
             if np.any(stamped):
                 time_unit = unit or "s"
@@ -534,10 +534,10 @@ def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int
                 )
 
 
-def _number(path: object, row: int, content: dict[str, str], name: str) -> float:
+def _number(path: object, row: int, content: dict[str, str], name: str, decimal: str) -> float:
     text = (content[name] or "").strip()
     try:
-        return float(text) if text else np.nan
+        return float(text.replace(decimal, ".")) if text else np.nan
     except ValueError:
         raise ValueError(
             f"{path}, row {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
@@ -546,11 +546,11 @@ def _number(path: object, row: int, content: dict[str, str], name: str) -> float
 
 
 def _time(
-    path: object, row: int, content: dict[str, str], name: str, unit: str
+    path: object, row: int, content: dict[str, str], name: str, unit: str, decimal: str
 ) -> tuple[float, bool]:
     """Return a time as it is given, an ISO 8601 time stamp in the unit, and which of them it is."""
     try:
-        return _number(path, row, content, name), False
+        return _number(path, row, content, name, decimal), False
     except ValueError:
         try:
             stamp = datetime.fromisoformat(content[name].strip())
@@ -612,9 +612,10 @@ def _on_time(records: list[Episode], time: Arrays, dt: float) -> list[NDArray[np
             "in the same unit; of time stamps dt is in seconds, or in "
             f'time_unit="{[*fits, "min"][0]}".'
         )
-    mean = float(whole[~uneven].mean()) if not uneven.all() else dt
-    if not uneven.any() and abs(mean - dt) > 0.02 * dt:
-        warn(f"dt = {dt:g}, but a step of the log takes {mean:.4g} on average: pass dt={mean:.4g}.")
+    even = whole[~uneven]
+    if len(even) > 0.9 * len(whole) and abs(even.mean() - dt) > 0.02 * dt:
+        own = f"{even.mean():.4g}"
+        warn(f"dt = {dt:g}, but a step of the log takes {own} on average: pass dt={own}.")
     if most or np.sum(uneven & (np.abs(whole - dt) < 0.5 * dt)) > 5 + 0.02 * len(whole):
         words = (
             f"{np.mean(uneven):.0%} of the log's steps differ from dt = {dt:g} by more than a "

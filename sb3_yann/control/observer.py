@@ -118,9 +118,11 @@ class StateEstimator:
             )
         self.estimate: Array = np.zeros(n + d)
 
-    def require_model(self, model: LinearModel, parts: str = "A B E x_ss u_ss") -> None:
+    def require_model(
+        self, model: LinearModel, parts: Sequence[str] = ("A", "B", "E", "x_ss", "u_ss")
+    ) -> None:
         """Raise ValueError unless the estimator is of a model, in so many ``parts`` of it."""
-        for part in parts.split():
+        for part in parts:
             own = getattr(self.model, part)
             wanted = getattr(model, part)
             if own.shape != wanted.shape or not np.allclose(own, wanted):

@@ -264,7 +264,9 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     A policy with a network for each region jumps from one to the next.
     """
     size = 1e-6 if precision == "float" else 1e-13
-    scale = np.abs(obs).max(0)
+    largest = np.maximum(np.abs(obs).max(0), np.finfo(float).tiny)
+    # A small row's roundings are small: what is near to rest is kept beside a wide box.
+    scale = largest * (np.abs(obs) / largest).max(axis=1, keepdims=True)
     actions = controller.evaluate(obs)
     kept = np.ones(len(obs), bool)
     half = input_ranges(controller, actions) / 2
@@ -275,7 +277,7 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     for sign in (-1, 1):
         for j in [slice(None)] if is_online else range(obs.shape[1]):
             moved = obs.copy()
-            moved[:, j] += sign * 2 * size * scale[j]
+            moved[:, j] += sign * 2 * size * scale[:, j]
             change = np.abs(controller.evaluate(moved) - actions) / half
             kept &= (change < room).all(1)
             kept &= controller.in_domain(moved) == inside

@@ -276,8 +276,9 @@ class Controller:
         if begins and finite:
             self._warn_of_present(given)
             self._output = given.copy()
-        counts = manual is not None and (begins or self.request == MANUAL)
-        return given, begins and finite, Status.NOT_FINITE if counts and not finite else Status(0)
+        wanted = manual is not None and (begins or self.request == MANUAL)
+        fault = Status.NOT_FINITE if wanted and not finite else Status(0)
+        return given, begins and finite, fault
 
     def _warn_of_present(self, given: Array) -> None:
         """Warn of a present input (m,) that is further beyond its bounds than half their width."""

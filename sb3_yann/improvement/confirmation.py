@@ -16,6 +16,7 @@ from sb3_yann._validation import Array, Feedback
 from sb3_yann.compare import (
     LARGEST_EXCESS,
     RULE,
+    UNSAFE,
     Difference,
     PairedTrial,
     Scores,
@@ -200,7 +201,7 @@ class Trial:
         policy, mpc = (Scores(c[known], u[known]) for c, u in (played, self.mpc))
         allowed_more = RULE.tolerance(self.mpc[0][known], BoundNames.of(self.twin.problem))
         reason = no_worse(policy, mpc, mpc, allowed_more).reason
-        reason = reason.replace("with violations", "that leave what the log shows")
+        reason = reason.replace(UNSAFE[0], "states beyond what the log shows")
         logged, error = self._as_logged(excess)
         if not reason and not logged <= 0:
             reason = f"episodes like the log's cost {100 * logged / mean:.2g} % more"

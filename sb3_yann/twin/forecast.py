@@ -117,8 +117,9 @@ class _Replays:
         count, p = logged.shape[1:]
         width = count ** (-1 / (4 + p))  # of a kernel, in standard deviations
         mean = logged.mean(axis=1, keepdims=True)
-        one, other = logged[:, rng.integers(count, size=(2, count * some))].swapaxes(0, 1)
-        moved = np.repeat(logged - mean, some, axis=1) + width * (one - other) / np.sqrt(2)
+        drawn = rng.integers(count, size=(2, count * some))
+        apart = logged[:, drawn[0]] - logged[:, drawn[1]]
+        moved = np.repeat(logged - mean, some, axis=1) + width * apart / np.sqrt(2)
         new = mean + moved / np.sqrt(1 + width**2)
         return np.asarray(np.clip(new, own.theta_min[part], own.theta_max[part]))
 

@@ -120,10 +120,12 @@ def test_a_reading_that_is_huge_is_outside(precision, tmp_path):
         assert error(actions, wanted, compiled.controller) < 1e-5
 
 
-def test_inputs_without_bounds(tmp_path):
+@pytest.mark.parametrize("wide", [False, True])
+def test_inputs_without_bounds_and_a_box_that_mostly_has_no_solution(wide, tmp_path):
+    box = {"theta_min": -5e3, "theta_max": 5e3, "u_min": -1, "u_max": 1} if wide else {}
     model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
     bounds = {"x_min": [-5, -2], "x_max": [5, 2]}
-    mpc = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds)
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds, **box)
     export(mpc.explicit(), tmp_path / "plant.c")
     assert self_test(tmp_path).returncode == 0
 

@@ -91,9 +91,8 @@ def test_the_truth_lies_within_the_interval() -> None:
 
 @pytest.mark.parametrize(("levels", "sure"), [((0.4, 0.4), True), ((-0.4, 0.4), False)])
 def test_new_set_points_lie_between_those_of_the_log(levels: tuple[float, float], sure) -> None:
-    tracking = Tracking([0], -0.5, 0.5)
     mpc = LinearMPC(MPC.model, Q=[[1]], R=[[0.08]], horizon=3, u_min=-1, u_max=1,
-                    theta_min=-2, theta_max=2, tracking=tracking)  # fmt: skip
+                    theta_min=-2, theta_max=2, tracking=Tracking([0], -0.5, 0.5))  # fmt: skip
     log = []
     for r in levels:
         env = TimeLimit(SetPoint(Lagging(0.0, 1.0), r, r), 30)

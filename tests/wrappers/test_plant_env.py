@@ -50,13 +50,15 @@ def full() -> LinearMPC:
 
 
 def test_it_rests_where_the_model_does_and_begins_in_its_box() -> None:
-    env = PlantEnv(slope, LinearMPC(TANK, **WEIGHTS, **BOX))
+    mpc = LinearMPC(TANK, **WEIGHTS, **BOX)
+    env = PlantEnv(slope, mpc)
     env.reset(options={"state": [350.0]})
     x, reward, *ends, info = env.step(np.array([2.0]))
     assert x == pytest.approx([350]) and reward == pytest.approx(0) and ends == [False, False]
     assert info["state"].tolist() == x.tolist()
     starts = np.array([env.reset(seed=k)[0] for k in range(50)])
     assert 325 <= starts.min() < 335 and 365 < starts.max() <= 375
+    assert PlantEnv(slope, mpc, start_low=340, start_high=340).reset()[0] == 340
 
 
 def test_its_name_is_that_of_its_function_and_none_is_a_lambda_s() -> None:
@@ -232,10 +234,7 @@ def test_a_seed_repeats_an_episode_and_another_does_not() -> None:
     assert walk(env, 1) == first
     assert walk(env, None) == later != first
     assert walk(env, 2) != first
-
-
-def test_the_global_generators_are_left_alone() -> None:
-    env = SeededGlobals(Walk())
+    # The global generators are left alone.
     np.random.seed(3), random.seed(3)  # noqa: NPY002 (what is to be left alone)
     before = np.random.normal(), random.random()  # noqa: NPY002
     np.random.seed(3), random.seed(3)  # noqa: NPY002
@@ -263,8 +262,5 @@ def test_the_end_at_the_limit_is_truncation_and_an_earlier_one_is_not() -> None:
     late, early = (TruncateAtTimeLimit(Walk(last), 5) for last in (5, 3))
     assert ends(late) == ends(late) == [(False, False)] * 4 + [(False, True)]
     assert ends(early)[2] == (True, False)
-
-
-def test_a_limit_must_be_a_number_of_steps() -> None:
     with pytest.raises(ValueError, match="steps = 0 must be a whole number of at least 1"):
         TruncateAtTimeLimit(Walk(), 0)

@@ -114,7 +114,7 @@ def offset_free(
     noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
     if estimator is not None:
         check_type("estimator", estimator, StateEstimator, "a StateEstimator: found.estimator()")
-        estimator.require_model(old, "A B x_ss u_ss")
+        estimator.require_model(old, ("A", "B", "x_ss", "u_ss"))
         if not np.array_equal(estimator.C, C):
             raise ValueError(f"estimator reads {estimator.C.tolist()} x, measured is {C.tolist()}.")
         rates = estimator.every.tolist()

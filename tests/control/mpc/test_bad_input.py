@@ -143,10 +143,12 @@ def test_a_mode_on_the_unit_circle_without_weight_is_an_error(
 @pytest.mark.parametrize("size", [1e20, 1e50])
 def test_a_model_that_is_badly_scaled_is_called_that(size: float) -> None:
     model = LinearModel([[0.5, size], [0, 0.5]], [[0], [1]], 1.0)
-    with pytest.raises(
-        ValueError, match=rf"badly scaled, .* from 0\.5 to {size:.2g} in".replace("+", ".")
-    ):
+    words = rf"badly scaled, .* from 0\.5 to {size:.2g} in".replace("+", ".")
+    with pytest.raises(ValueError, match=words):
         LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=2)
+    fast = LinearModel.from_continuous([[0, 1], [1, 0]], [[0], [1]], dt=100.0)  # e to the 100
+    with pytest.raises(ValueError, match=r"grows 2.7e\+43 times .* Is dt in the unit"):
+        LinearMPC(fast, Q=np.eye(2), R=[[1]], horizon=2)
 
 
 def test_a_terminal_cost_stands_in_for_the_riccati_solution() -> None:
