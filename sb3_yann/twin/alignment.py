@@ -139,11 +139,13 @@ def objections(log: Logged) -> list[str]:
     readings = {s: _on_law(log, s) for s in ROW_NAMES}
     logged = np.diagonal(readings[0].left)
     proven = np.diagonal(readings[0].as_it_is).copy()
+    exact = log.made_by_law.copy()  # a plant at rest repeats its inputs: so it seems amid any row
     for s in (-1, 1):
         clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
-        proven &= ~(clearly & np.diagonal(readings[s].as_it_is & readings[s].alone))
+        other = clearly & np.diagonal(readings[s].as_it_is & readings[s].alone)
+        proven &= ~other
+        exact &= ~other
     found = [] if log.units_confirmed else [*_other_pace(log)]
-    exact = log.made_by_law
     if np.all(exact | (proven & (logged < EXACT_SHARE))):
         return found
     proven |= exact

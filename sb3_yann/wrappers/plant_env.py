@@ -23,7 +23,7 @@ from sb3_yann._validation import (
     warn,
 )
 from sb3_yann.compare import EXCESS_ROOM
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.control.linearization import called_as, require_order, slope_of
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
@@ -32,7 +32,7 @@ from sb3_yann.env_pool import name_of
 from sb3_yann.units import ActionUnits
 from sb3_yann.wrappers.theta import (
     Env,
-    ObserveDisturbance,
+    EstimateState,
     PreviousInput,
     SetPoint,
     Vector,
@@ -167,8 +167,9 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     max_episode_steps : int, default 100
     hold : int, optional
         Steps after which another set-point is drawn; by default it stays for the episode.
-    observer : DisturbanceObserver, optional
-        What estimates the disturbances of the MPC, as :func:`offset_free` returns it.
+    observer : StateEstimator, optional
+        What estimates the disturbances of the MPC, as :func:`offset_free` returns it, or the states
+        that no sensor shows. It reads ``C x`` of the state.
     substeps : int, default 10
 
     Examples
@@ -192,7 +193,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         start_high: ArrayLike | None = None,
         max_episode_steps: int = 100,
         hold: int | None = None,
-        observer: DisturbanceObserver | None = None,
+        observer: StateEstimator | None = None,
         substeps: int = 10,
     ) -> None:
         if not callable(f):
@@ -227,7 +228,10 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
                 "Change start_low and start_high, or widen theta_min and theta_max."
             )
         check_int("substeps", substeps)
-        plant = Equations(f, mpc, start, substeps)
+        if observer is not None:
+            check_type("observer", observer, StateEstimator, "that of offset_free(mpc)")
+        C = np.eye(n) if observer is None else observer.C
+        plant = Equations(f, mpc, start, substeps, C)
         with np.errstate(all="ignore"):
             plant.slope(x_ss, mpc.model.u_ss)
         if plant.fault:
@@ -247,7 +251,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
             r = mpc.tracking
             env = SetPoint(env, r.r_min, r.r_max, hold=hold, preview=r.preview)
         if observer is not None:
-            env = ObserveDisturbance(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)
+            env = EstimateState(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)
         if layout.bounds:
             part = layout.limits
             env = SetPoint(env, mpc.theta_min[part], mpc.theta_max[part], hold=hold)
@@ -292,20 +296,23 @@ def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) 
 
 
 class Equations(gym.Env[Array, Array]):
-    """A plant that shows its state and takes its inputs.
+    """A plant that shows outputs ``C x`` of its state and takes its inputs.
 
     The 1st, 10th, 100th step in which a function was not finite is warned of, over all envs of it.
     """
 
     lost = Counter[Any]()
 
-    def __init__(self, f: Slope, mpc: LinearMPC, start: tuple[Array, Array], substeps: int) -> None:
+    def __init__(
+        self, f: Slope, mpc: LinearMPC, start: tuple[Array, Array], substeps: int, C: Array
+    ) -> None:
         self.f = f
+        self.C = C
         self.plant_name = name_of(f)
         self.start = start
         self.substeps = substeps
         self.dt = mpc.model.dt
-        self.observation_space = spaces.Box(-np.inf, np.inf, (mpc.model.n_states,), np.float64)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (len(C),), np.float64)
         self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
         self.state: Array = mpc.model.x_ss
         self.model = mpc.model
@@ -325,7 +332,7 @@ class Equations(gym.Env[Array, Array]):
                 wanted = f"{len(self.state)} finite numbers"
                 raise ValueError(f"options['state'] = {options['state']!r} must be {wanted}.")
             self.state = given
-        return self.state.copy(), {"state": self.state.copy()}
+        return self.C @ self.state, {"state": self.state.copy()}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Hold the inputs, clipped to their bounds, for a sample."""
@@ -347,7 +354,7 @@ class Equations(gym.Env[Array, Array]):
             self.state = reached
         self.time += self.dt
         info = {"state": self.state.copy(), **({"violation": True} if lost else {})}
-        return self.state.copy(), 0.0, lost, False, info
+        return self.C @ self.state, 0.0, lost, False, info
 
     def _advance(self, u: Array) -> Array:
         x = self.state

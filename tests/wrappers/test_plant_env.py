@@ -10,7 +10,6 @@ from numpy.random.mtrand import get_bit_generator
 from stable_baselines3 import DDPG
 
 from errors import told
-from improvement_samples import quick
 from sample_problems import small_mpc
 from sb3_yann import (
     CostAudit,
@@ -20,7 +19,6 @@ from sb3_yann import (
     NoActionNoise,
     NonFiniteWarning,
     PlantEnv,
-    PlantTwin,
     RateLimits,
     Tracking,
     headroom,
@@ -117,11 +115,16 @@ def test_an_observer_takes_the_offset_of_another_plant() -> None:
     assert apart[1] < 0.1 * apart[0]
 
 
-def test_plans_are_made_in_its_own_states(monkeypatch) -> None:
-    quick(monkeypatch)
-    monkeypatch.setattr(PlantTwin, "fit", None)  # no twin is needed
-    found = headroom(full(), lambda: PlantEnv(slope, full(), max_episode_steps=30), n_starts=2)
-    assert found.total >= 0
+def test_an_observer_of_some_states_reads_these_alone() -> None:
+    chain = lambda x, u: np.append(u[0] - x[0], x[0] - x[1]) / [4, 5]  # noqa: E731
+    model = LinearModel.from_dynamics(chain, x_ss=[2, 2], u_ss=[2], dt=1)
+    box = BOX | {"theta_min": 0, "theta_max": 9, "tracking": Tracking([1], 1, 3)}
+    mpc, observer = offset_free(LinearMPC(model, **WEIGHTS | {"Q": np.eye(2)}, **box), measured=[1])
+    env = PlantEnv(lambda x, u: chain(x, 0.9 * u), mpc, observer=observer)
+    theta, _ = env.reset(seed=0)
+    for _ in range(100):
+        theta, *_, info = env.step(mpc.law().plant_input(theta))
+    assert abs(info["state"][1] - theta[2]) < 1e-3
 
 
 def test_equations_that_fail_are_named_with_state_input_and_time() -> None:

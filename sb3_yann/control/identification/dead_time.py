@@ -158,6 +158,49 @@ def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Arr
     return A, B
 
 
+MOST_EARLY = 3  # rows by which inputs may stand too early, at most
+EARLY = 0.1  # share of a state's squared errors that inputs of later rows leave, where they act
+HELD = 1 / 3
+"""Share of the rows in which no input moves, at least: in these a feedback would tell no noise."""
+
+
+def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
+    """Return a note where states answer inputs of later rows, which no plant does.
+
+    It is looked for where inputs are held: those of a feedback follow the noise of each sample.
+    """
+    rows = [(e.states, e.inputs) for e in episodes if len(e) > lags + MOST_EARLY + 1]
+    moves = [np.any(np.diff(u, axis=0), axis=1) for _, u in rows]
+    if not rows or np.mean(np.concatenate(moves)) > 1 - HELD:
+        return []
+    left = []
+    for early in range(MOST_EARLY + 1):
+        known = []
+        for x, u in rows:
+            count = len(u) - lags - MOST_EARLY
+            past = [a[lags - i :][:count] for i in range(lags + 1) for a in (x, u[early:])]
+            known.append(np.hstack([np.ones((count, 1)), *past]))
+        after = np.concatenate(
+            [x[lags + 1 :][: len(z)] for (x, _), z in zip(rows, known, strict=True)]
+        )
+        if len(after) < 4 * known[0].shape[1]:
+            return []
+        left.append(np.mean(project_out(np.concatenate(known), after) ** 2, axis=0))
+    floor = 1e-10 * np.var(after, axis=0) + np.finfo(float).tiny
+    shares = (np.array(left[1:]) + floor) / (left[0] + floor)
+    least = np.mean(shares, axis=1)  # with earlier inputs beside, still later rows do as well
+    early = int(np.argmax(least < np.min(least) + EARLY))
+    if np.min(shares[early]) > EARLY or np.mean(shares[early]) > 1:
+        return []
+    share = 100 * np.min(shares[early])
+    rows_later = f"{early + 1} row{'s' * (early > 0)}"
+    return [
+        f"The log's states answer inputs that stand {rows_later} later: with these the squared "
+        f"errors of one step fall to {share:.2g} %. A row holds the inputs that act from it to the "
+        f"next row: move all inputs {rows_later} up."
+    ]
+
+
 EFFECT_LEVEL = 0.01  # significance level of an input's effect
 
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, check_choice, check_range, check_vector, warn
 from sb3_yann.control.identification.dead_time import (
     as_delays,
+    early_note,
     exact_memory,
     found_delays,
     input_notes,
@@ -109,7 +110,7 @@ def fit_log(
             f"inputs on their way, {', '.join(past)}. Show them to a policy: "
             f"sb3_yann.wrappers.PastInputs(env, {delays}, initial=[{rest}])."
         )
-    late = [] if any(delays) else input_notes(found, episodes, sizes)
+    late = [] if any(delays) else early_note(episodes) or input_notes(found, episodes, sizes)
     if late:
         warn(log.in_names(" ".join(late)))
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))

@@ -9,9 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_range
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_range, warn
 from sb3_yann.control.gains import CURVED, Gains
-from sb3_yann.control.identification.dead_time import as_delays, exact_memory, memory_labels
+from sb3_yann.control.identification.dead_time import (
+    as_delays,
+    early_note,
+    exact_memory,
+    memory_labels,
+)
 from sb3_yann.control.identification.fit import require_moving, system_of
 from sb3_yann.control.identification.innovations import TINY_RIDGE, Innovations, filtered, shifted
 from sb3_yann.control.identification.least_squares import WEAK, Regression, pole_note, regress
@@ -29,6 +34,7 @@ from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
 from sb3_yann.log import Arrays, Episode, Log
 
+EARLY_LAGS = 4  # earlier outputs beside which inputs of later rows are tried
 MAX_CONDITION = 1e3
 """Condition number of C up to which outputs serve as states."""
 
@@ -232,8 +238,11 @@ def identify_outputs(
         scale = np.where(plain.spread > 0, plain.spread, 1.0)
         scaled = [_scaled(each, center, scale, q, m) for each in read]
         follows = feedback(stand_ins(scaled))
+        early = early_note(stand_ins(scaled), EARLY_LAGS)
     except ValueError as error:
         raise ValueError(log.in_names(str(error).replace("x[", "y["))) from None
+    if early:
+        warn(early[0])
     share = check_range("held_out", held_out, 0, 0.5, "[]")
     found = fit_structure(scaled, wanted, as_delays(delay, m), share)
     model, start = _in_plant_units(found, center, scale, q)
@@ -261,7 +270,7 @@ def identify_outputs(
         system.u_ss,
         E if d else None,
         system.d_ss if d else None,
-        notes=[*system.notes, *_notes(log, found, plain, step, model.noise, follows)],
+        notes=[*system.notes, *early, *_notes(log, found, plain, step, model.noise, follows)],
         gains=Gains.of(A, B, found.integrators, errors),
         state_names=state_names,
         input_names=log.input_names,

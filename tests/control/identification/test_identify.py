@@ -10,7 +10,15 @@ from scipy import stats
 
 from errors import Message, raises
 from sample_plants import played
-from sb3_yann import Identified, LinearModel, LinearMPC, Log, Tracking, identify
+from sb3_yann import (
+    Identified,
+    LinearModel,
+    LinearMPC,
+    Log,
+    Tracking,
+    identify,
+    identify_outputs,
+)
 from sb3_yann.control.gains import Gains, responses
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.least_squares import gains_of, regress
@@ -197,13 +205,6 @@ def test_input_that_holds_a_given_state_is_found() -> None:
     np.testing.assert_allclose(model.u_ss, [5.3], atol=1e-6)  # (1 - .7) * 1 = .3
 
 
-def test_given_operating_point_that_moves_is_kept_and_reported() -> None:
-    x, u, _ = record(0)
-    model = LinearModel.from_data(x, u, dt=1, x_ss=[0, 1.0], u_ss=[0.0])
-    assert (model.x_ss.tolist(), model.u_ss.tolist()) == ([0, 1], [0])
-    assert "moves by 0.2, -0.3 in one step" in model.report()
-
-
 def test_integrator_keeps_an_operating_point_inside_its_data() -> None:
     rng = np.random.default_rng(0)
     u = rng.normal(size=(500, 1))
@@ -234,6 +235,8 @@ def test_double_integrator_rests_at_its_operating_point(seed: int) -> None:
 
 def test_law_of_a_model_whose_operating_point_moves_is_warned_of() -> None:
     model = LinearModel.from_data(*drive(0), dt=0.1, x_ss=[0, 0.5], u_ss=[0])
+    assert (model.x_ss.tolist(), model.u_ss.tolist()) == ([0, 0.5], [0])
+    assert "moves by 0.05" in model.report()
     np.testing.assert_allclose(model.drift, [0.05, 0], atol=1e-3)
     box = {"theta_min": -5, "theta_max": 5, "u_min": -1, "u_max": 1}
     with pytest.warns(UserWarning, match=r"moves by \[0\.0.* will rest beside its references"):
@@ -260,6 +263,14 @@ def test_delayed_input_is_named_with_its_delay(steps: int, process: float) -> No
 def test_delay_of_an_input_that_is_held_is_named() -> None:
     with pytest.warns(UserWarning, match=r"The residuals follow u\[0\] of \d steps before"):
         identify(*delayed(3, hold=5), dt=1)
+
+
+@pytest.mark.parametrize("early", [1, 2])
+def test_inputs_that_stand_some_rows_too_early_are_named(early: int) -> None:
+    x, u = delayed(0, hold=5)
+    for fit, shown in ((identify, x), (identify_outputs, x[:, 1:])):
+        with pytest.warns(UserWarning, match=f"answer inputs that stand {early} rows? later"):
+            fit(shown[early:], u[:-early], dt=1)
 
 
 def test_input_without_effect_is_warned_of_by_the_log_s_name() -> None:
