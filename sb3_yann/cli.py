@@ -68,7 +68,12 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("law", help=f"a law's .npz file, {model}, or {problem}")
     one.add_argument("picture", help="where to write it: .png, .svg or .pdf")
     one.add_argument(
-        "--axes", type=int, nargs=2, default=(0, 1), metavar=("I", "J"), help="coordinates of theta"
+        "--axes",
+        type=lambda given: int(given) if given.isdigit() else given,
+        nargs=2,
+        default=(0, 1),
+        metavar=("I", "J"),
+        help="entries of theta: numbers or names",
     )
 
     one = add("evaluate", _evaluate, "play episodes of a model and of its MPC")

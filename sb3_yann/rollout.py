@@ -162,6 +162,7 @@ def evaluate(
     """
 
     def check(env: Any) -> None:
+        _require_same_spaces(policy, env)
         _require_same_inputs(policy, getattr(env, "single_action_space", env.action_space))
         if not isinstance(env, VectorEnv):
             _require_state_shown(policy, env)
@@ -481,6 +482,18 @@ def _require_state_shown(policy: Any, env: gym.Env[Any, Any]) -> None:
     owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
     if isinstance(owner, PiecewiseAffine | OnlineLaw) or hasattr(owner, "observation_given"):
         require_state_shown(env, getattr(owner, "observation_given", False))
+
+
+def _require_same_spaces(policy: Any, env: Any) -> None:
+    """Raise unless a model sees and gives as many numbers as an env shows and takes."""
+    for name in ("observation_space", "action_space"):
+        own = getattr(getattr(policy, name, None), "shape", None)
+        its = getattr(env, f"single_{name}", getattr(env, name)).shape
+        if own is not None and own != its:
+            raise ValueError(
+                f"The model's {name} has the shape {own}, the env's {its}: the env is of another "
+                "problem, or lacks the model's wrappers."
+            )
 
 
 def _require_same_inputs(policy: Any, space: Any) -> None:

@@ -522,7 +522,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
 def rows_of_pairs(journal: Journal, problem: LinearMPC) -> dict[str, str]:
     """Return what the pairs of the policy on trial cost, in words; the interval has all looks."""
     if not journal.pairs:
-        return {"change": "no pair of episodes has been played yet"}
+        return {"change": "no pair of the policy on trial has been played yet"}
     pays_own = pays_its_own(problem, journal.episodes)
     ours, its = (_costs(problem, each, pays_own) for each in zip(*journal.pairs, strict=True))
     level = level_of_look(RULE.significance, len(journal.trial))

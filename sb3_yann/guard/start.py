@@ -61,7 +61,13 @@ def first_evidence(
             continue
         evidence, refusal = try_before_training(evidence, candidate, player, settings)
         leading = candidate if refusal is None else evidence.accepted
-        decisions += [] if refusal is None else [refusal]
+        if refusal is not None:
+            decisions.append(refusal)
+            warn(
+                "What the policy had learnt is refused by the starts of this guard, "
+                f"{refusal.reason}. Training begins without it. If another guard has accepted it, "
+                "one with that guard's settings goes on from there."
+            )
     for checkpoint in () if known is None else known.evidence.passed:
         evidence = evidence.with_passed(checkpoint)
     return evidence.with_passed(evidence.accepted), leading, decisions

@@ -176,7 +176,10 @@ class Improvement:
         if not self.accepted:
             said = f"{self.reason} The model is as it was."
             last = self._last
-            refused = f"a candidate, {self._change(last.change, last)}" if last else ""
+            refused = f"the last candidate, {self._change(last.change, last)}" if last else ""
+            most = min((each.change for each in self.checks), default=0.0)
+            if last and most < last.change:
+                refused += f"; of another one it was {change_in_percent(most)}"
             return summary_lines(said, refused=refused, steps=steps, next=self._next())
         last = self._accepted
         rows = {"change": self.change_in_words}

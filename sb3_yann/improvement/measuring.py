@@ -159,7 +159,7 @@ class Headroom:
         where = "twin" if self._in_twin else "env"
         steps = f"{self.steps:,} of the {where}. {self.note}".strip() if self.steps else self.note
         return summary_lines(
-            f"Verdict: {self.verdict}. By its own stage cost, from starts of {self.source}:",
+            f"Verdict: {self.verdict}. By its own cost, from starts of {self.source}:",
             **paired_rows(self.best_costs, self.mpc_costs),
             of_that=", ".join(parts),
             observer=self._as_played(self.observer_played, "observer"),
@@ -514,6 +514,10 @@ class _Search:
         if excess is not None and (beyond := np.count_nonzero(excess.largest)):
             some = f"{beyond} of {len(base)} episodes"
             note = f"{note} The MPC exceeds a hard bound in {some}.".strip()
+        if excess is not None and (paid := np.count_nonzero(excess.penalty)):
+            share = 100 * float(np.mean(excess.penalty) / (abs(np.mean(base)) or 1.0))
+            some = f"of the MPC's cost is for soft bounds, from {paid} of {len(base)} starts"
+            note = f"{note} {share:.2g} % {some}.".strip()
         # The MPC's own where another one is not better on average.
         both = (self.fair.get(name, base) for name in ("observer", "model"))
         observer, model = (each if each.mean() < base.mean() else base for each in both)

@@ -257,7 +257,8 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
         if (more := len(trust.actual) - 10) > 0:
             said.append(f"  ... and {more} more")
         said.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
-    said.append("Inputs: how much they move, and what share of it neither states nor MPC tell:")
+    told = "neither states nor the MPC at held set-points tell"
+    said.append(f"Inputs: how much they move, and what share of it {told}:")
     inputs = labels_of(problem.model)[1]
     for name, own, moves in zip(inputs, trust.excitation, trust.moves, strict=True):
         rests = "rests on the given B" if own < ALONE else "is known from the log"

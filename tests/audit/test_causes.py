@@ -361,7 +361,7 @@ def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:
     env = Rewarded(OTHER["a profit"])
     problem = mpc()
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
-        assert "By its own stage cost" in str(headroom(problem, env, n_starts=2))
+        assert "By its own cost" in str(headroom(problem, env, n_starts=2))
     assert [each.filename for each in found] == [__file__]
     model = DDPG("YannPolicy", env, policy_kwargs={"problem": problem})
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:

@@ -10,14 +10,11 @@ from experiments.learning import (
     FROM_A_LOG,
     HEADER,
     IMPROVED,
-    LOGS,
     PLANNED,
-    SEEDS,
     execute,
     log_rows,
     main,
     rows,
-    runs,
 )
 from experiments.measures import OBSERVER
 from experiments.pictures import _shares, save_in_short
@@ -86,14 +83,6 @@ def test_the_tables_are_quoted_between_their_marks(tmp_path) -> None:
     main(["--report-only", "--results", str(results), "--report", str(tmp_path)])
     text = page.read_text(encoding="utf-8")
     assert "| pH | 20.00 |" in text and "| five episodes | 1 of 1 |" in text
-
-
-def test_each_plant_is_planned_once_and_improved_with_every_seed() -> None:
-    done = runs(["pH", FROM_A_LOG])
-    assert done[:2] == [Run("pH", PLANNED, 0, 0), Run(FROM_A_LOG, PLANNED, 0, 0)]
-    assert [run.seed for run in done if run.learner == IMPROVED] == [*SEEDS]
-    assert done[2] == Run("pH", OBSERVER, 0, 0)
-    assert len(done) == 3 + len(SEEDS) * (1 + len(LOGS))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -42,13 +42,6 @@ def test_rows_are_medians_against_the_offset_free_mpc(tmp_path):
     assert pcgym.write_report({}, tmp_path) == pcgym.rows({}) == []
 
 
-def test_every_seed_of_every_controller_is_run_once():
-    runs = pcgym.runs()
-    assert len(set(runs)) == len(runs)
-    assert {run.learner for run in runs} == {*pcgym.FIXED, *pcgym.SEEDS}
-    assert {run.plant for run in runs} == {*pcgym.PLANTS}
-
-
 @needs_pcgym
 @pytest.mark.parametrize("name", pcgym.HORIZONS)
 def test_controllers_are_played_on_the_plant_they_know(name):

@@ -120,7 +120,8 @@ def test_a_policy_that_is_worse_before_training_gives_way_to_the_mpc(kind) -> No
     model = build(gradient_steps=0)
     guard = make_guard()
     SABOTAGE[kind](model.policy)
-    train(model, STEPS, guard)
+    with pytest.warns(UserWarning, match="refused by the starts of this guard, before training, "):
+        train(model, STEPS, guard)
     assert guard.decisions[0].reason.startswith("before training, ")
     assert is_mpc(model) and is_mpc(model.policy.actor_target)
     assert not np.isnan(guard.decisions[0].accepted_cost)

@@ -555,7 +555,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     where = "of the MPC's mean cost in the twin, from starts like the log's"
     assert Improvement((refused,), 0.0, accepted=False).report().splitlines()[:3] == [
         "Nothing better was found: 2 starts with violations. The model is as it was.",
-        f"  refused      a candidate, -3.00 % {where}",
+        f"  refused      the last candidate, -3.00 % {where}",
         "  steps        1 candidate tried",
     ]
     small = Check(1, True, "", -4e-4, 0.0, True)

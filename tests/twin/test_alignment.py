@@ -343,7 +343,7 @@ def test_set_points_excite_a_closed_loop() -> None:
     log = evaluate(mpc.explicit(), worn, seeds=range(5))
     twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], residuals=SELECT)
     assert "its gain is known from the log" in twin.report() and not twin.trust.advice
-    assert "and what share of it neither states nor MPC tell:\n" in twin.report()
+    assert "share of it neither states nor the MPC at held set-points tell:\n" in twin.report()
     assert twin.reidentified().model.B == pytest.approx(0.8 * mpc.model.B, rel=0.01)
 
 

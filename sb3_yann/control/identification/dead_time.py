@@ -133,6 +133,13 @@ def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]
     return extended
 
 
+def longest_note(delays: Sequence[int]) -> str:
+    """Return what to do where a dead time is the longest that is looked for; empty for others."""
+    if max(delays, default=0) != MAX_DELAY:
+        return ""
+    return f" None beyond {MAX_DELAY} samples is looked for: pass it as delay, or sample slower."
+
+
 def memory_labels(delays: Sequence[int], inputs: Sequence[str]) -> list[str]:
     """Return the names of the states that hold past inputs: ``u[0](k-1), u[0](k-2), ...``."""
     return [

@@ -16,6 +16,7 @@ from sb3_yann.control.identification.dead_time import (
     exact_memory,
     found_delays,
     input_notes,
+    longest_note,
     memory_labels,
     with_memory,
 )
@@ -109,6 +110,7 @@ def fit_log(
             f"Dead time: inputs act for {delays} samples. The states from x[{own}] on are the "
             f"inputs on their way, {', '.join(past)}. Show them to a policy: "
             f"sb3_yann.wrappers.PastInputs(env, {delays}, initial=[{rest}])."
+            f"{longest_note(delays)}"
         )
     late = [] if any(delays) else early_note(episodes) or input_notes(found, episodes, sizes)
     if late:

@@ -15,6 +15,7 @@ from sb3_yann.control.identification.dead_time import (
     as_delays,
     early_note,
     exact_memory,
+    longest_note,
     memory_labels,
 )
 from sb3_yann.control.identification.fit import require_moving, system_of
@@ -399,7 +400,7 @@ def _notes(
     if any(found.delays):
         notes.append(
             f"Dead time: inputs act for {[*found.delays]} samples. The states from "
-            f"x[{step.reached.size}] on are the inputs on their way."
+            f"x[{step.reached.size}] on are the inputs on their way.{longest_note(found.delays)}"
         )
     if plain.excitation < WEAK:
         notes.append(

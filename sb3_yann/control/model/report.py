@@ -242,6 +242,9 @@ def _sampling(model: LinearSystem) -> list[str]:
     moving = [constant for constant in constants if GONE <= constant < np.inf]
     angles = [abs(np.angle(pole)) for pole in found if abs(pole) > 1e-9]
     period = 2 * np.pi / max(angles) if angles and max(angles) > 1e-9 else np.inf
+    if all(constant < GONE for constant in constants):
+        cure = "Is dt in the unit of time of the equations, or of the log?"
+        return [f"Sampling: within one sample the plant has settled, but for dead time. {cure}"]
     if not moving and np.isinf(period):
         return ["Sampling: the plant only integrates or delays: no time scale to compare dt with."]
     lines = [f"Sampling: the shortest oscillation takes {period:.3g} samples."]
