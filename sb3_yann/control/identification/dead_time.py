@@ -8,14 +8,13 @@ import numpy as np
 from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
+from sb3_yann.control.identification.innovations import dead_times
 from sb3_yann.control.identification.least_squares import Regression
-from sb3_yann.control.identification.residuals import features, leftover, project_out
+from sb3_yann.control.identification.residuals import leftover, project_out
 from sb3_yann.control.linear_system import names
 from sb3_yann.log import Episode
 
 MAX_DELAY = 10  # longest dead time in samples that is looked for
-CURVED = 0.05  # share of the linear fit's residual variance that is left to higher curvature
-GAIN = 0.3  # share of a state's residual variance by which dead time must lower it
 
 
 def as_delays(delay: int | str | Sequence[int], n_inputs: int) -> list[int] | None:
@@ -36,37 +35,34 @@ def as_delays(delay: int | str | Sequence[int], n_inputs: int) -> list[int] | No
 
 
 def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
-    """Return the dead time of each input that explains the log best, by Schwarz's criterion.
+    """Return the dead time of each input that the log shows: see `dead_times`.
 
-    Squares and products of states and inputs stand beside: curvature is no dead time. The inputs
-    take turns, each with the others' dead times as found so far.
+    Long ARX models tell it from sensor noise and from curvature.
     """
-    best = [0] * n_inputs
+    none = [0] * n_inputs
     longer = [episode for episode in episodes if len(episode) > MAX_DELAY + 1]
     steps = sum(len(episode) - MAX_DELAY for episode in longer)
     n = episodes[0].states.shape[1]
     if steps <= 4 * (episodes[0].regressors.shape[1] + 1 + MAX_DELAY * n_inputs):
-        return best
+        return none
+    unit = np.std(np.concatenate([each.regressors for each in longer]), axis=0)
+    unit = np.where(unit > 0, unit, 1.0)
+    m = longer[0].inputs.shape[1]
+    scaled = [
+        Episode(e.states / unit[:n], e.inputs / unit[n : n + m], e.disturbances / unit[n + m :])
+        for e in longer
+    ]
+    best = dead_times(scaled, MAX_DELAY, n_inputs)[0]
+    if not any(best):
+        return none
     now = np.concatenate([episode.regressors[MAX_DELAY:] for episode in longer])
     target = np.concatenate([episode.states[MAX_DELAY + 1 :] for episode in longer])
-    past = [
-        np.concatenate([e.driven[MAX_DELAY - lag : len(e) - lag, :n_inputs] for e in longer])
-        for lag in range(1, MAX_DELAY + 1)
+    plain = np.column_stack([np.ones(steps), now - np.mean(now, axis=0)])
+    taps = [
+        np.concatenate([e.driven[MAX_DELAY - lag : len(e) - lag, j] for e in longer])
+        for j, delay in enumerate(best)
+        for lag in range(1, delay + 1)
     ]
-    centered = now - np.mean(now, axis=0)
-    plain = np.column_stack([np.ones(steps), centered])
-    basis = np.column_stack([plain, features(centered)])
-    whole = project_out(basis, np.hstack([target, *past]))  # lag after lag, input by input
-    # Below it, all is rounding, or curvature of higher order.
-    floor = 1e-10 * np.var(target, axis=0) + np.finfo(float).tiny
-    floor += CURVED * np.mean(project_out(plain, target) ** 2, axis=0)
-    gram = whole.T @ whole / steps
-    for _ in range(2 if n_inputs > 1 else 1):
-        for j in range(n_inputs):
-            trials = [[*best[:j], lag, *best[j + 1 :]] for lag in range(MAX_DELAY + 1)]
-            left = np.array([_left(gram, trial, n) + floor for trial in trials])
-            best = trials[_chosen(left, steps, n)]
-    taps = [past[lag][:, j] for j, delay in enumerate(best) for lag in range(delay)]
     regressors = np.column_stack([plain, *taps])
     # Behind sensor noise earlier inputs tell of the state, too, but it is the latest that acts.
     prompt = [
@@ -74,9 +70,9 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
         > _explained(regressors, plain.shape[1] + sum(best[: j + 1]) - 1, target)
         for j in range(n_inputs)
     ]
-    best = [0 if each else lag for lag, each in zip(best, prompt, strict=True)]
+    found = [0 if each else lag for lag, each in zip(best, prompt, strict=True)]
     # A hidden state makes earlier inputs count too, but earlier states with them.
-    return [0] * n_inputs if any(best) and leftover(longer, best).is_hidden else best
+    return none if any(found) and leftover(longer, found).is_hidden else found
 
 
 def _explained(regressors: Array, column: int, target: Array) -> float:
@@ -86,30 +82,6 @@ def _explained(regressors: Array, column: int, target: Array) -> float:
     sizes = np.sum(left**2, axis=0)
     explained = (left[:, :-1].T @ left[:, -1]) ** 2
     return float(np.sum(explained / np.maximum(sizes[:-1] * sizes[-1], np.finfo(float).tiny)))
-
-
-def _left(gram: Array, delays: list[int], n: int) -> Array:
-    """Return the mean squares (n,) of what so many past inputs leave of the targets.
-
-    The Gram matrix is that of the targets, followed by the inputs lag after lag.
-    """
-    m = len(delays)
-    total = np.diag(gram)[:n]
-    taps = [n + lag * m + j for j, delay in enumerate(delays) for lag in range(delay)]
-    if not taps:
-        return np.asarray(total)
-    size = np.sqrt(np.diag(gram)[taps])
-    size = np.where(size > 0, size, 1.0)
-    inner = gram[np.ix_(taps, taps)] / np.outer(size, size)
-    cross = gram[taps, :n] / size[:, None]
-    explained = np.sum(cross * (np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ cross), axis=0)
-    return np.asarray(np.maximum(total - explained, 0.0))
-
-
-def _chosen(left: Array, steps: int, n: int) -> int:
-    """Return the shortest dead time to which that of least criterion (k, n) adds little."""
-    criterion = steps * np.sum(np.log(left), axis=1) + np.log(steps) * n * np.arange(len(left))
-    return int(np.argmax(np.all(left[np.argmin(criterion)] > (1 - GAIN) * left, axis=1)))
 
 
 def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]:

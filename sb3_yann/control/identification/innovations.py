@@ -131,15 +131,19 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
     return lags, arx(episodes, lags, lags - 1)
 
 
-def dead_times(episodes: Sequence[Episode], limit: int) -> list[tuple[int, ...]]:
+def dead_times(
+    episodes: Sequence[Episode], limit: int, n_driven: int | None = None
+) -> list[tuple[int, ...]]:
     """Return for each input how many of its latest values have no effect on the next output.
+
+    With ``n_driven`` for so many of the inputs and disturbances. Outputs and inputs are scaled.
 
     Wald's test that their coefficients in a long ARX model are zero, for one sample more as long as
     it does not speak against it, at each of the levels ``CHANCES``: among many inputs and outputs
     one that is too strict ends it too early.
     """
     q = episodes[0].states.shape[1]
-    m = episodes[0].inputs.shape[1]
+    m = n_driven or episodes[0].inputs.shape[1]
     lags, found = lags_by_criterion(episodes)
     longest = min(limit + 4, max((len(each) for each in episodes), default=0) - 1)
     if lags < longest:
