@@ -622,6 +622,7 @@ def _rest_of(
     notes = [f"Solved for the steady state: {solved} {'entry' if solved == 1 else 'entries'}."]
     if solved > n:
         notes[0] += f" The equations determine {n}: it is one of many. Give more entries."
+        warn(f"{notes[0]} It is x_ss = {found[0][:n].tolist()}, and {found[0][n:].tolist()}.")
     elif len(found) > 1:
         others = "; ".join(str([float(f"{v:.4g}") for v in other]) for other in found[1:])
         notes[0] += f" There are others, {others}: give an entry that separates them."

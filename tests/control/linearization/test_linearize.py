@@ -42,7 +42,7 @@ def test_a_plant_that_rests_anywhere_asks_for_the_state_to_hold() -> None:
 
 def test_what_is_solved_for_is_zero_rather_than_rounding() -> None:
     tanks = LinearModel.from_dynamics(
-        lambda x, u: [u[0] - u[1], 0.1 * (x[0] - x[1])], [4, np.nan], [np.nan] * 2, dt=0.5
+        lambda x, u: [u[0] - u[1], 0.1 * (x[0] - x[1])], [4, np.nan], [np.nan, 0], dt=0.5
     )
     assert tanks.u_ss.tolist() == [0.0, 0.0]
 
