@@ -58,6 +58,20 @@ class Episode:
         return Episode(self.states[start : stop + 1], *given)
 
 
+def in_names(
+    text: str, states: Sequence[str], inputs: Sequence[str], disturbances: Sequence[str]
+) -> str:
+    """Return a text with names in place of ``x[0]``, ``y[0]``, ``u[0]``, ``d[0]``."""
+    of = {"u": inputs, "d": disturbances}
+
+    def name(found: re.Match[str]) -> str:
+        known = of.get(found[1], states)
+        number = int(found[2])
+        return known[number] if number < len(known) else found[0]
+
+    return re.sub(r"\b([xyud])\[(\d+)\]", name, text)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Log:
     """Episodes of one plant, with the names of what was logged.
@@ -135,15 +149,8 @@ class Log:
         return dict(zip(names, self.units, strict=False))
 
     def in_names(self, text: str) -> str:
-        """Return a text with the log's names in place of ``x[0]``, ``y[0]``, ``u[0]``, ``d[0]``."""
-        of = {"u": self.input_names, "d": self.disturbance_names}
-
-        def name(found: re.Match[str]) -> str:
-            known = of.get(found[1], self.state_names)
-            number = int(found[2])
-            return known[number] if number < len(known) else found[0]
-
-        return re.sub(r"\b([xyud])\[(\d+)\]", name, text)
+        """Return a text with the log's names: see :func:`in_names`."""
+        return in_names(text, self.state_names, self.input_names, self.disturbance_names)
 
     @property
     def every(self) -> tuple[int, ...]:

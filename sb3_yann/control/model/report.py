@@ -9,6 +9,7 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control.gains import CURVED, NORMAL, ON_CIRCLE, SURE_ERRORS, UNTOLD, Gains
 from sb3_yann.control.linear_system import LinearSystem, combination, labels_of, with_units
+from sb3_yann.log import in_names
 
 MAY_INTEGRATE = f"may integrate: it is 1 within {SURE_ERRORS:g} standard errors"
 UNREACHED = 1e-6
@@ -33,7 +34,8 @@ def describe(model: LinearSystem) -> str:
     ]
     lines = [*_head(model), "Poles:", *modes, _stability(model, others)]
     lines += [*_reach(model), *_scaling(model), *_gains(model), *_sampling(model)]
-    return "\n".join([*lines, *(f"Note: {note}" for note in model.notes)])
+    names = model.state_names, model.input_names, model.disturbance_names
+    return "\n".join([*lines, *(f"Note: {in_names(note, *names)}" for note in model.notes)])
 
 
 def _head(model: LinearSystem) -> list[str]:
