@@ -86,10 +86,10 @@ static int qp_add(int entering, real violation, int size, int most, int soft)
                 leaving = i;
             }
         }
-        const real full = rest > 1e-11 ? violation / rest : INFINITY;
+        const real full = rest > 1e-11 ? violation / rest : (real)INFINITY;
         const int is_full = full <= length;
         length = is_full ? full : length;
-        if (!(length < INFINITY) || (is_full && size == most)) {
+        if (!(length < (real)INFINITY) || (is_full && size == most)) {
             return -1;
         }
         for (int i = 0; i < size; i++) {
