@@ -410,10 +410,10 @@ class _Search:
         self.say(f"{len(self.seeds)} episodes of the MPC")
 
     def observe(self) -> None:
-        """Play the same MPC with an observer, unless it has one or measures disturbances."""
+        """Play the same MPC with an observer, unless it has one or knows disturbances to come."""
         mpc = self.mpc
-        if mpc.layout.n_disturbances:
-            self.why["observer"] = "theta of the MPC holds disturbances already"
+        if mpc.disturbances.preview:
+            self.why["observer"] = "theta of the MPC holds disturbances to come"
             return
         thetas, inputs, following = self.base.steps()
         beyond = np.abs(following - mpc.deviations.predict(thetas, inputs)).max(axis=0)
@@ -575,20 +575,28 @@ class Observing:
         self.observer = observer
         self.observers: list[DisturbanceObserver] = []
         self.u: Array = np.zeros((0, 0))
+        self.loads: Array = np.zeros((0, 0))  # the measured disturbances that acted with u
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
         layout = self.problem.layout
         bounds = self.other.deviations.disturbances
         x = theta[:, layout.state]
+        measured = theta[:, layout.disturbance]
         if t == 0:
             self.observers = [copy.copy(self.observer) for _ in x]
             self.u = np.zeros((len(x), self.other.model.n_inputs))
+            self.loads = measured.copy()
             found = [each.reset(y) for each, y in zip(self.observers, x, strict=True)]
         else:
-            found = [self.observers[i].update(y, self.u[i]) for i, y in zip(rows, x, strict=True)]
+            found = [
+                self.observers[i].update(y, self.u[i], self.loads[i] if measured.size else None)
+                for i, y in zip(rows, x, strict=True)
+            ]
+        self.loads[rows] = measured
         x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
-        d = np.clip(d_hat, bounds.d_min, bounds.d_max)
+        k = measured.shape[1]
+        d = np.hstack([measured, np.clip(d_hat, bounds.d_min[k:], bounds.d_max[k:])])
         rest = theta[:, layout.limits], theta[:, layout.previous]
         parts = x_hat, theta[:, layout.reference], d, *rest
         self.u[rows] = self.other.online()(np.concatenate(parts, axis=1))
