@@ -222,13 +222,15 @@ class Commissioning:
             elif (kept := state.kept.policy) != "MPC":
                 verdict += f" That of {kept} surely costs less than the MPC, and is kept."
             rows = rows_of_pairs(journal, self.policy.problem)
+            verdict += " Costs above are means of each one's own episodes; only pairs compare them."
         ours = [each for each, by in zip(journal.episodes, journal.by_policy, strict=True) if by]
         every = sum(len(each.actions) for each in journal.episodes)
         violations = sum(each.violations for each in journal.episodes)
         of_policies = sum(each.violations for each in ours)
-        more = self._size_of_batch()
+        more = self._size_of_batch() - len(journal.batch)
         moved = sum(each.excited for each in journal.episodes)
         aside = f"; {moved} moved at random do not count in costs" if moved else ""
+        aside += f"; {journal.unended} that never ended are left out" if journal.unended else ""
         return summary_lines(
             f"{journal.report()}\n{verdict}",
             **rows,

@@ -235,6 +235,7 @@ class Journal:
         self._first_of_batch = 0
         self._cut_off = 0
         self._open = ""
+        self.unended = 0  # episodes of the record that began and never ended
         begin: Event = {"event": "begin", **settings}
         if not record.events:
             record.append(begin)
@@ -345,6 +346,7 @@ class Journal:
         """Do what an event says: as it happens, and again from the record."""
         if event["event"] == "start":
             self._cut_off = self.cut_off
+            self.unended += bool(self._open)
             self._open = event["acts"]
         elif event["event"] == "interrupted":
             self._open = ""

@@ -169,8 +169,15 @@ class Plant:
         return PlantEpisode(*played, reward, violations, alarm, step, apart, excited, unsafe)
 
     def _theta(self, observation: Any) -> Array:
-        seen = normalized(self.model, observation)
-        return np.asarray(self.yann.theta(np.asarray(seen)[None]).double().cpu().numpy()[0])
+        """Return theta; NaN where it follows from a reading that is not finite."""
+        seen = np.array(normalized(self.model, observation))
+        lost = ~np.isfinite(seen)
+        if not lost.any():
+            return np.asarray(self.yann.theta(seen[None]).double().cpu().numpy()[0])
+        both = np.stack([seen, seen])
+        both[:, lost] = [[0.0], [1.0]]
+        one, other = self.yann.theta(both).double().cpu().numpy()
+        return np.where(one == other, one, np.nan)
 
     def _known(self, before: Array, u: Array, read: Array) -> Array:
         """Return a reading, with the model's prediction in place of what is not finite."""

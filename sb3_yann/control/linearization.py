@@ -478,7 +478,7 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Ja
 STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
 MOVES = 0.01  # the same relative to its own size: beyond it, a state smaller than 1 gets a warning
 AT_REST = 1e-8  # largest motion in one sample of a steady state that was solved for
-STARTS = (0.0, 1.0, -1.0, 0.1, 10.0)
+STARTS = (0.0, 1.0, -1.0, 0.1, 10.0, 100.0)
 """Scales of the free entries from which the steady state is sought, in turn."""
 RATE_STEP = 1e-6  # of the slopes that a search takes, in scales
 ANOTHER = 1e-3  # distance, in scales, from which two steady states are different ones

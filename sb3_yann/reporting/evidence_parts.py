@@ -27,7 +27,7 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
-from sb3_yann.control.mpc.bound_excess import BoundNames
+from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds
 from sb3_yann.control.mpc.misreading import misread_states
 from sb3_yann.evaluation import change_in_percent, plots
 from sb3_yann.guard import Decision
@@ -292,7 +292,9 @@ def distance_part(subject: Subject) -> Part:
     counts = "It counts everywhere."
     if policy.actor.mu.confines.any():
         counts = "It counts in a box of parameters only, and fades beyond."
-    keeps = "It knows the bounds of states and outputs by its training alone."
+    keeps = "The problem bounds no states and no outputs."
+    if Bounds.of(problem).used.any():
+        keeps = "It knows the bounds of states and outputs by its training alone."
     if len(policy.actor.mu.constants[2]):
         kept = problem.kept_set
         margin = 100 * policy.bounds_margin
