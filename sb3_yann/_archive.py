@@ -46,6 +46,8 @@ def atomic_write(path: str | PathLike[str]) -> Iterator[Path]:
     disk before the file is renamed, so a crash leaves the old file or the new one.
     """
     target = Path(path)
+    if target.exists() and not target.is_file():
+        raise OSError(f"{target} is a folder or a device, not a file that can be replaced.")
     part = target.with_name(f"{target.name}.{os.getpid()}.part")  # others may write the same
     try:
         yield part
