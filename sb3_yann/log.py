@@ -58,14 +58,11 @@ class Episode:
         return Episode(self.states[start : stop + 1], *given)
 
 
-def in_names(
-    text: str, states: Sequence[str], inputs: Sequence[str], disturbances: Sequence[str]
-) -> str:
-    """Return a text with names in place of ``x[0]``, ``y[0]``, ``u[0]``, ``d[0]``."""
-    of = {"u": inputs, "d": disturbances}
+def in_names(text: str, **names: Sequence[str]) -> str:
+    """Return a text with names in place of ``x[0]``, ``y[0]``, ``u[0]`` and ``d[0]``, by letter."""
 
     def name(found: re.Match[str]) -> str:
-        known = of.get(found[1], states)
+        known = names.get(found[1], ())
         number = int(found[2])
         return known[number] if number < len(known) else found[0]
 
@@ -150,7 +147,9 @@ class Log:
 
     def in_names(self, text: str) -> str:
         """Return a text with the log's names: see :func:`in_names`."""
-        return in_names(text, self.state_names, self.input_names, self.disturbance_names)
+        shown = self.state_names
+        own = {"u": self.input_names, "d": self.disturbance_names}
+        return in_names(text, x=shown, y=shown, **own)
 
     @property
     def every(self) -> tuple[int, ...]:

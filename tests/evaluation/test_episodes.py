@@ -6,6 +6,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
 
 import unit_samples as units
 from sb3_yann._validation import said_by
@@ -117,6 +118,12 @@ def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> 
     np.testing.assert_array_equal(again.costs, evaluate(Tenth(), Countdown, [3, 1, 4]).costs)
     pool.close()
     assert Countdown.open == before
+
+
+def test_a_model_of_another_env_is_named() -> None:
+    model = DDPG("YannPolicy", "ClippedPendulum-v0", device="cpu")
+    with pytest.raises(ValueError, match=r"observation_space has the shape \(2,\), the env's \(4,"):
+        evaluate(model, "CSTR-v0", seeds=[0])
 
 
 def test_an_env_that_is_given_stays_open() -> None:

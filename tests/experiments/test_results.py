@@ -14,7 +14,7 @@ import torch
 import experiments
 from experiments import runner
 from experiments.__main__ import BEGIN, END, main
-from experiments.markdown import number, quote, spread, table
+from experiments.markdown import quote
 from experiments.measures import rows_of
 from experiments.published import paper_table
 from experiments.results import in_short, write_report
@@ -72,14 +72,6 @@ def test_the_papers_table_takes_the_best_and_the_worst_beginning() -> None:
         "| pendulum, Q = I | YANN-RL | 100.50 | 15.50 | 270.99 | 26.08 |",
     ]
     assert paper_table(reactor(plant="CSTR, true model"), 50) == ""
-
-
-def test_numbers_and_tables() -> None:
-    cells = [number(None), number(-0.001), number(12345.678), number(2.5e5), number(1.0, 1, "+")]
-    assert cells == ["—", "0.00", "12,345.68", "2.50e+05", "+1.0"]
-    assert table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
-    assert spread([10, -10.0, 4]) == "+4.00 (-10.00 to +10.00)"
-    assert spread([-1e-9, 0.0, -0.4], 0, "") == "0 (0 to 0)"  # never -0
 
 
 def test_the_report_is_whole(tmp_path) -> None:
@@ -305,15 +297,3 @@ def test_dask_gives_the_same_with_one_thread_each(results) -> None:
     assert all(same(found[run], outcome(run)) for run in RUNS)
     assert os.getpid() not in {int(each.extra["pid"]) for each in found.values()}
     assert {int(each.extra["threads"]) for each in found.values()} == {1}
-
-
-def test_a_long_run_holds_the_short_one() -> None:
-    long = outcome(Run("CSTR", "YANN-RL", 3, 20))
-    short = long.at(10)
-    assert short.checkpoints.tolist() == [0, 5, 10]
-    assert short.test_costs.tolist() == long.test_costs[:3].tolist()
-    assert short.training_costs.tolist() == long.training_costs[:10].tolist()
-    with pytest.raises(ValueError, match="7 training episodes"):
-        long.at(7)
-    fixed = outcome(Run("CSTR", "MPC", 0, 0))
-    assert fixed.at(50) is fixed

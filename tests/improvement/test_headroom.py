@@ -15,6 +15,7 @@ import unit_samples as units
 from experiments.optimum import clipped_pendulum_optimum, cstr_optimum
 from sample_plants import Sampled
 from sb3_yann import (
+    DisturbanceBounds,
     Headroom,
     LinearModel,
     LinearMPC,
@@ -116,6 +117,18 @@ def test_it_takes_no_step_more_than_it_may() -> None:
     assert found.verdict == "not known" and "from 5 of 5 starts no plan" in found.report()
     with pytest.raises(ValueError, match="max_steps = 100 are too few for 5 episodes of the MPC"):
         headroom(heater(), Counted, n_starts=5, max_steps=100)
+
+
+def test_an_observer_is_played_beside_a_measured_disturbance() -> None:
+    model = LinearModel([[0.8]], [[0.5]], dt=1.0, E=[[1.0]])
+    box = {"theta_min": -5, "theta_max": 5, "disturbances": DisturbanceBounds(-1, 1)}
+    space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    measured = partial(np.append, values=np.float32(0.1))  # of a load of .3
+    shown = lambda: gym.wrappers.TransformObservation(Heater(0.3), measured, space)  # noqa: E731
+    mpc = dataclasses.replace(heater(), model=model, terminal=None, **box)
+    found = headroom(mpc, shown, n_starts=4, max_steps=NO_PLANS)
+    assert found.observer_played is not None
+    assert found.observer_played.mean() < 0.7 * found.mpc_costs.mean()
 
 
 def test_ctrl_c_prints_what_has_been_played_so_far(capsys, monkeypatch) -> None:

@@ -174,9 +174,9 @@ def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
     share = 100 * np.min(shares[early])
     rows_later = f"{early + 1} row{'s' * (early > 0)}"
     return [
-        f"The log's states answer inputs that stand {rows_later} later: with these the squared "
-        f"errors of one step fall to {share:.2g} %. A row holds the inputs that act from it to the "
-        f"next row: move all inputs {rows_later} up."
+        f"The log answers inputs that stand {rows_later} later: with these the squared errors of "
+        f"one step fall to {share:.2g} %. A row holds the inputs that act from it to the next row: "
+        f"move all inputs {rows_later} up."
     ]
 
 

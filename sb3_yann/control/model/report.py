@@ -34,8 +34,8 @@ def describe(model: LinearSystem) -> str:
     ]
     lines = [*_head(model), "Poles:", *modes, _stability(model, others)]
     lines += [*_reach(model), *_scaling(model), *_gains(model), *_sampling(model)]
-    names = model.state_names, model.input_names, model.disturbance_names
-    return "\n".join([*lines, *(f"Note: {in_names(note, *names)}" for note in model.notes)])
+    names = {"x": model.state_names, "u": model.input_names, "d": model.disturbance_names}
+    return "\n".join([*lines, *(f"Note: {in_names(note, **names)}" for note in model.notes)])
 
 
 def _head(model: LinearSystem) -> list[str]:

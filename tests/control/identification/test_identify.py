@@ -269,7 +269,7 @@ def test_delay_of_an_input_that_is_held_is_named() -> None:
 def test_inputs_that_stand_some_rows_too_early_are_named(early: int) -> None:
     x, u = delayed(0, hold=5)
     for fit, shown in ((identify, x), (identify_outputs, x[:, 1:])):
-        with pytest.warns(UserWarning, match=f"answer inputs that stand {early} rows? later"):
+        with pytest.warns(UserWarning, match=f"answers inputs that stand {early} rows? later"):
             fit(shown[early:], u[:-early], dt=1)
 
 
