@@ -139,8 +139,13 @@ def _parts(data: ControllerArrays, precision: str) -> tuple[str, list[str], list
             text = text.replace(f"@{key}@", entry)
         texts.append(text)
     interface, variables, body = texts
+    used = set(re.findall(r"\w+", body))
     declared = [line.strip() for line in variables.splitlines() if line.strip()]
-    return interface, _constants(data, precision, kind), declared, body
+    constants, own = (
+        [line for line in lines if line.partition(" : ")[0] in used]
+        for lines in (_constants(data, precision, kind), declared)
+    )
+    return interface, constants, own, body
 
 
 def _chosen(text: str, flags: set[str]) -> str:

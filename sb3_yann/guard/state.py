@@ -257,6 +257,7 @@ class Record:
         A run that goes on from a checkpoint drops what it had decided after it.
         """
         self.path = path
+        self.failed = False  # to be written: a warning has said so
         if path.is_file():
             ours = as_csv(decisions)
             theirs = path.read_bytes().decode(errors="replace")
@@ -268,12 +269,16 @@ class Record:
         self.write(decisions)
 
     def write(self, decisions: list[Decision]) -> None:
-        """Write all decisions, or none of them; warn where that fails."""
+        """Write all decisions, or none of them; warn once where that fails."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(self.path) as part:
                 part.write_text(as_csv(decisions), encoding="utf-8", newline="")
+            self.failed = False
         except OSError as error:
+            if self.failed:
+                return
+            self.failed = True
             warn(
                 f"The guard's record {self.path} could not be written ({error}). Training goes on, "
                 "and guard.decisions has all decisions; the record is completed once there is "
