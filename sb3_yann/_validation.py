@@ -53,7 +53,7 @@ def add_note(error: BaseException, words: str) -> None:
         error.args = (*error.args, words)
 
 
-def said_by(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """Return an error's message with its notes."""
     return str(error) + "".join(f" ({each})" for each in getattr(error, "__notes__", []))
 

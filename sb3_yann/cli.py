@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_yann import __version__
-from sb3_yann._validation import check_int, said_by
+from sb3_yann._validation import check_int, message_of
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,8 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.traceback:
             raise
         kind = "" if isinstance(error, OSError | TypeError | ValueError) else type(error).__name__
-        said = f"{kind}{': ' * bool(kind)}{said_by(error)}"
-        print(f"sb3-yann {options.command}: {said}", file=sys.stderr)
+        message = f"{kind}{': ' * bool(kind)}{message_of(error)}"
+        print(f"sb3-yann {options.command}: {message}", file=sys.stderr)
         return 1
     return 0
 

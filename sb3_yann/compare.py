@@ -533,8 +533,8 @@ class PairedTrial:
         if enough and found.is_sure:
             return found
         error = Difference.of(relative_costs(more, mpc.costs)).error
-        said = f"{100 * change:+.2g} % (± {100 * error:.1g}) in {len(more)} pairs"
-        return found._replace(reason=f"{said}: {'not sure' if enough else TOO_LITTLE}")
+        measured = f"{100 * change:+.2g} % (± {100 * error:.1g}) in {len(more)} pairs"
+        return found._replace(reason=f"{measured}: {'not sure' if enough else TOO_LITTLE}")
 
 
 def relative_costs(more: Array, mpc_costs: Array) -> Array:

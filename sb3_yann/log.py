@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import datetime, timezone
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
@@ -307,9 +307,9 @@ class Log:
         episode : str, optional
             A column that changes from one episode to the next, such as a batch's number.
         time : str, optional
-            A column of times in the unit of ``dt``, or of ISO 8601 time stamps: then ``dt`` is in
-            seconds, or in the ``time_unit`` "min", "h" or "d". An episode ends where a step takes
-            another time.
+            A column of times in the unit of its header, else in that of ``dt``; or of ISO 8601 time
+            stamps: then ``dt`` is in seconds, or in the ``time_unit`` "min", "h" or "d". An episode
+            ends where a step takes another time.
         delimiter : str, default ","
             Between two columns.
         time_unit : str, optional
@@ -378,14 +378,17 @@ class Log:
         if not records:
             raise ValueError(f"{path} holds no two rows of an episode.")
         times = None
+        own = _name_and_unit(columns[time])[1] if time else ""
         if time is not None:
-            unit = time_unit or _name_and_unit(columns[time])[1]
+            unit = time_unit or own
             pairs = [
                 _time(path, k, row, columns[time], unit, decimal) for k, row in enumerate(content)
             ]
             instants, stamped = np.array(pairs).T
             if np.any(stamped):
                 time_unit = unit or "s"
+            elif own in SECONDS and unit in SECONDS:
+                instants = instants * SECONDS[own] / SECONDS[unit]
             times = [instants[part] for part in parts]
         names, units = zip(*map(_name_and_unit, wanted[: n + m + d]), strict=True)
         return cls._of(
@@ -396,7 +399,7 @@ class Log:
             input_names=names[n : n + m],
             disturbance_names=names[n + m :],
             units=units if any(units) else (),
-            time_unit=time_unit or _name_and_unit(columns[time] if time else "")[1],
+            time_unit=time_unit or own,
         )
 
 
@@ -547,7 +550,8 @@ def _number(path: object, row: int, content: dict[str, str], name: str, decimal:
     except ValueError:
         raise ValueError(
             f"{path}, row {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
-            "where there is no reading; of decimal commas pass decimal=','."
+            "where there is no reading; for decimal commas pass decimal=','; leave out thousands' "
+            "separators."
         ) from None
 
 
@@ -570,7 +574,9 @@ def _time(
             f"{path} has time stamps, and time_unit = {unit!r}: expected one of {[*SECONDS]}, "
             "that of dt."
         )
-    passed = (stamp - datetime(1970, 1, 1, tzinfo=stamp.tzinfo)).total_seconds()
+    # A stamp with an offset from UTC counts in UTC: local time runs twice where clocks go back.
+    epoch = datetime(1970, 1, 1, tzinfo=stamp.tzinfo and timezone.utc)
+    passed = (stamp - epoch).total_seconds()
     return passed / SECONDS[unit or "s"], True
 
 

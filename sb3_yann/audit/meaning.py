@@ -110,9 +110,9 @@ def warn_of_signs(
         return np.array(found)
 
     unmoved: dict[int, Array] = {}
-    told = np.array([response[..., j] @ C.T for j in range(len(names))])
-    answers = np.zeros_like(told)
-    said = list[str]()
+    modelled = np.array([response[..., j] @ C.T for j in range(len(names))])
+    answers = np.zeros_like(modelled)
+    warnings = list[str]()
     for j, name in enumerate(names):
         gains = []
         for i in starts:
@@ -128,7 +128,7 @@ def warn_of_signs(
             by = np.diff(inputs(np.array([action, pushed])), axis=0)[0, j]
             answers[j] += change / by
             effect = weight * change
-            expected = weight * told[j] * by
+            expected = weight * modelled[j] * by
             expected[~np.isfinite(effect)] = 0  # readings that come now and then
             effect = np.nan_to_num(effect)
             size = float(np.sum(expected**2))
@@ -139,33 +139,33 @@ def warn_of_signs(
         starts_in_words = f"{len(gains)} start{'s' * (len(gains) > 1)}"
         found = f"{np.median(gains):.2g} times as far in {when}, from {starts_in_words}"
         if max(gains) < 0:
-            said.append(
+            warnings.append(
                 f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "
                 "the wrong way. Look at the sign and the order of the actions, and at B.",
             )
         elif min(gains) > FAR or (0 < min(gains) and max(gains) < 1 / FAR):
-            said.append(
+            warnings.append(
                 f"{name} moves the env otherwise than the model's B says: {found}. Is a step of "
                 f"the env the model's dt, {model.step_length}, and the input in the "
                 "same unit? Else identify the model anew.",
             )
-    swapped = _swapped(told, answers) if estimating is not None else ""
-    for words in [swapped] if swapped else said:
+    swapped = _swapped(modelled, answers) if estimating is not None else ""
+    for words in [swapped] if swapped else warnings:
         warn(words)
     return taken
 
 
-def _swapped(told: Array, answers: Array) -> str:
-    """Return in which other order alone outputs answer pushes (m, steps, q) as they are told to."""
+def _swapped(modelled: Array, answers: Array) -> str:
+    """Return in which other order alone outputs answer pushes (m, steps, q) as the model says."""
 
     def likeness(shown: Sequence[int], taken: Sequence[int]) -> float:
-        both = np.stack([answers[:, :, shown], told[[*taken]]]) / units
-        both = both.reshape(2, len(told), -1)
+        both = np.stack([answers[:, :, shown], modelled[[*taken]]]) / units
+        both = both.reshape(2, len(modelled), -1)
         sizes = np.maximum(np.linalg.norm(both, axis=-1).prod(axis=0), 1e-300)
         return float(np.min(both.prod(axis=0).sum(axis=-1) / sizes))
 
-    m, _, q = told.shape
-    units = np.maximum(np.linalg.norm(told, axis=(0, 1)), 1e-300)
+    m, _, q = modelled.shape
+    units = np.maximum(np.linalg.norm(modelled, axis=(0, 1)), 1e-300)
     orders = [*product(permutations(range(q)), permutations(range(m)))] if max(q, m) <= 4 else []
     found = max(orders, key=lambda each: likeness(*each), default=None)
     if found is None or not likeness(range(q), range(m)) < UNLIKE < ALIKE < likeness(*found):

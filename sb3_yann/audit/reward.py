@@ -290,7 +290,7 @@ class CostAudit(BaseCallback):
         if (scale, offset) != (1, 0):
             expected = f"{scale:g} * (-cost) {offset:+g}, as the policy assumes"
         error = np.abs(compared.implied - compared.cost)
-        said = [
+        sentences = [
             f"The reward is not {expected}: over {len(error)} steps the two differ by "
             f"{error.mean():.3g} on average, where the cost is {np.abs(compared.cost).mean():.3g}.",
             f"Likely cause: {explanation}",
@@ -299,8 +299,9 @@ class CostAudit(BaseCallback):
         ]
         if line.scale > 0 and line.r2 > 0.99:
             numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
-            said.append(f'Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.')
-        return " ".join(said)
+            on_purpose = f'policy_kwargs={{"critic": {{{numbers}}}}}'
+            sentences.append(f"Where that is on purpose: {on_purpose}.")
+        return " ".join(sentences)
 
     def _rounding(self, observations: Array) -> Array:
         """Return by how much theta may err, (steps, n_theta); see AffineObservation."""

@@ -329,25 +329,25 @@ class Commissioning:
     ) -> tuple[CommissioningState, Verdict, str]:
         """Decide by the pairs, and improve where no policy is on trial."""
         if why := why_taken_back(self.journal, costs):
-            said = f"The policy was taken back: {why}."
+            text = f"The policy was taken back: {why}."
             kept = state.kept
             if kept.policy in ("MPC", state.policy):
-                return replace(state, max_correction=self._first_bound), "the MPC acts", said
+                return replace(state, max_correction=self._first_bound), "the MPC acts", text
             self._become(self._kept, kept.bound)
             state = replace(state, acting=kept, max_correction=kept.bound, since=number)
-            return state, "stays", said
-        said = ""
+            return state, "stays", text
+        text = ""
         if self.journal.accepted and not state.is_kept:
             if not is_kept(costs):
                 return state, "stays", f"{costs.difference.pairs} pairs are not enough."
             state = replace(state, kept=state.acting)
-            said = f"{costs.difference.pairs} pairs show that it costs less. "
+            text = f"{costs.difference.pairs} pairs show that it costs less. "
         verdict: Verdict = "stays" if state.is_kept else "the MPC acts"
         if twin is None or not twin.trusted:
             why = f"There are {len(self.journal.log)} episodes to learn from."
             if twin is not None:
                 why = " ".join(["The twin is not trusted.", *twin.trust.problems])
-            return state, verdict, f"{said}{why}"
+            return state, verdict, f"{text}{why}"
         state = replace(state, tried=True)
         wider = state
         if state.is_kept:  # the plant has confirmed it: the next one may leave the MPC farther
@@ -357,9 +357,9 @@ class Commissioning:
         found = improve(self.model, twin, rounds=self.rounds, updates=self.updates, seed=seed)
         before = found.before
         if found.accepted or (before is not None and before.accepted and not state.is_kept):
-            return wider, "accepted", f"{said}{found.change_in_words}."
+            return wider, "accepted", f"{text}{found.change_in_words}."
         self._become(self._acting, state.max_correction)
-        return state, verdict, f"{said}{found.reason}"
+        return state, verdict, f"{text}{found.reason}"
 
     def _watch(self, twin: PlantTwin | None) -> None:
         """Take a twin for the one in force, and watch the plant by it."""

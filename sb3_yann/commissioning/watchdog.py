@@ -218,8 +218,8 @@ class Watchdog:
             with np.errstate(all="ignore"):
                 found = self._seen(theta, u, after)
             if found is not None:
-                kind, said = found
-                self.alarm = Alarm(kind, f"Step {self._steps}: {said}.")
+                kind, text = found
+                self.alarm = Alarm(kind, f"Step {self._steps}: {text}.")
         return self.alarm
 
     def _seen(self, theta: Array, u: Array, after: Array) -> tuple[str, str] | None:
@@ -269,8 +269,8 @@ class Watchdog:
         at_once = ratios[:1] if ratios[0].max() > 1.0 else ratios
         gain, i = np.unravel_index(int(np.argmax(at_once)), at_once.shape)
         name = labels_of(self.dynamics.problem.model)[0][int(i)]
-        said = f"{name} is off the twin's prediction by {self._charts[0, gain, i]:.3g}"
+        text = f"{name} is off the twin's prediction by {self._charts[0, gain, i]:.3g}"
         if CHART_GAINS[gain] < 1.0:
-            said += f" on an average of {1 / CHART_GAINS[gain]:.0f} samples"
+            text += f" on an average of {1 / CHART_GAINS[gain]:.0f} samples"
         kind = "outside the band" if CHART_GAINS[gain] == 1.0 else "drift"
-        return kind, f"{said}, {ratios[gain, i]:.3g} bands"
+        return kind, f"{text}, {ratios[gain, i]:.3g} bands"

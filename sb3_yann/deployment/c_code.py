@@ -434,9 +434,9 @@ def _add_variables(within: ET.Element, data: ControllerArrays) -> None:
         of, low, high = spans.get(name, ("", -np.inf, np.inf))
         pairs = zip(of.split(", "), labels.get(of, of).split(", "), strict=False)
         unit = next((label[len(own) + 2 : -1] for own, label in pairs if label != own), None)
-        said = {"unit": unit, "start": start_value}
-        said |= {"min": repr(float(low)) if np.isfinite(low) else None}
-        said |= {"max": repr(float(high)) if np.isfinite(high) else None}
+        attributes = {"unit": unit, "start": start_value}
+        attributes |= {"min": repr(float(low)) if np.isfinite(low) else None}
+        attributes |= {"max": repr(float(high)) if np.isfinite(high) else None}
         variable = ET.SubElement(
             within,
             "ScalarVariable",
@@ -447,4 +447,4 @@ def _add_variables(within: ET.Element, data: ControllerArrays) -> None:
             variability="discrete",
         )
         counts[kind] += 1
-        ET.SubElement(variable, kind, {key: each for key, each in said.items() if each})
+        ET.SubElement(variable, kind, {key: each for key, each in attributes.items() if each})

@@ -141,9 +141,9 @@ class Controller:
 
     def __repr__(self) -> str:
         """Name the entries, who acted last, and what it lacks."""
-        said = f"{self.name!r}, obs={[*self.obs_names]}, action={[*self.action_names]}"
+        arguments = f"{self.name!r}, obs={[*self.obs_names]}, action={[*self.action_names]}"
         lacks = f", NOTE: {self.note}" if self.note else ""
-        return f"Controller({said}, mode={self.mode!r}{lacks})"
+        return f"Controller({arguments}, mode={self.mode!r}{lacks})"
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Controller:

@@ -17,7 +17,7 @@ import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import Array, said_by
+from sb3_yann._validation import Array, message_of
 from sb3_yann.compare import (
     TOO_LITTLE,
     AcceptanceRule,
@@ -464,7 +464,7 @@ class Player:
                 raise KeyboardInterrupt from error
             self.episodes(self.mpc, seeds)  # an error under the MPC as well is the env's own
             raise Unplayable(
-                f"the simulator failed: {type(error).__name__}: {said_by(error)}"
+                f"the simulator failed: {type(error).__name__}: {message_of(error)}"
             ) from error
 
     def episodes(self, checkpoint: ActorCheckpoint, seeds: Sequence[int]) -> Trajectories:

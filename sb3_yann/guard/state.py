@@ -186,11 +186,11 @@ class Decision:
         costs = self.candidate_cost, self.accepted_cost, self.mpc_cost
         for cost, played in zip(costs, self.played, strict=True):
             change = relative_change(cost, self.mpc_cost)
-            said = [f"{100 * change:+.3g} %"] * (len(found) < 2 and math.isfinite(change))
+            details = [f"{100 * change:+.3g} %"] * (len(found) < 2 and math.isfinite(change))
             if 0 < played < self.played[-1]:
-                said.append(f"estimated from {played} of {self.played[-1]} starts")
+                details.append(f"estimated from {played} of {self.played[-1]} starts")
             number = f"{cost:.6g}" if math.isfinite(cost) else "not known"
-            found.append(f"{number} ({', '.join(said)})" if said else number)
+            found.append(f"{number} ({', '.join(details)})" if details else number)
         return found
 
 

@@ -155,11 +155,11 @@ class Improvement:
         """Why nothing was accepted; empty where something was."""
         if self.accepted:
             return ""
-        said = self.note or (self._last.reason if self._last else f"no gain in {self.where}")
-        if not said and self._last:
+        text = self.note or (self._last.reason if self._last else f"no gain in {self.where}")
+        if not text and self._last:
             change = change_in_percent(self._last.change)
-            said = f"{change} in {self.where} is too little, or not sure"
-        return f"Nothing better was found: {said}."
+            text = f"{change} in {self.where} is too little, or not sure"
+        return f"Nothing better was found: {text}."
 
     @property
     def _last(self) -> Check | None:
@@ -174,13 +174,13 @@ class Improvement:
         steps = f"{self.steps:,} of the simulator, {tried}" if self.steps else tried
         source = "twin" if self.where == "the twin" else "env"
         if not self.accepted:
-            said = f"{self.reason} The model is as it was."
+            text = f"{self.reason} The model is as it was."
             last = self._last
             refused = f"the last candidate, {self._change(last.change, last)}" if last else ""
             most = min((each.change for each in self.checks), default=0.0)
             if last and most < last.change:
                 refused += f"; of another one it was {change_in_percent(most)}"
-            return summary_lines(said, refused=refused, steps=steps, next=self._next())
+            return summary_lines(text, refused=refused, steps=steps, next=self._next())
         last = self._accepted
         rows = {"change": self.change_in_words}
         if last is not None:
@@ -191,15 +191,15 @@ class Improvement:
                 rows["violations"] += f"; that exceeds a hard bound from {last.mpc_exceeds} starts"
         more = f'report(result.model, "report.html", {source}={source}), then '
         more += "Commissioning(result.model, plant, shadow=True)"
-        said = "Accepted: a better policy."
+        text = "Accepted: a better policy."
         if self.model is not None:
-            said += of_estimates(self.model.policy.problem)
+            text += of_estimates(self.model.policy.problem)
         if self.rests_aside:
-            said += (
+            text += (
                 " The MPC rests beside its targets there, and the policy knows this one plant: "
                 "where yours changes, start from offset_free(mpc), which headroom plays."
             )
-        return summary_lines(said, **rows, steps=steps, next=more)
+        return summary_lines(text, **rows, steps=steps, next=more)
 
     @property
     def _accepted(self) -> Check | None:
@@ -596,10 +596,10 @@ class _Work:
         found = replace(check, logged=change, error=(high - low) / 2, interval=(low, high))
         if high < 0:
             return found
-        said = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
+        text = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
         little = max(-low, high) < RULE.least_gain
         leads_on = "too little to teach" if little else f"to settle it, {cure}"
-        return replace(found, accepted=False, reason=f"{said}: {leads_on}")
+        return replace(found, accepted=False, reason=f"{text}: {leads_on}")
 
     def with_simulator(
         self, env: Source | VecEnv, max_steps: int | None, seen: AffineObservation | None

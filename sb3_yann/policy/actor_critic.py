@@ -197,10 +197,10 @@ class YannActor(KeepsPrecision, SeesTheta, Actor):
         problem: LinearMPC = self.options["problem"]  # type: ignore[assignment]
         named = problem.model.state_names and keeps_entries(self.features_extractor)
         names = problem.labels() if named else ()
-        said = what_is_not_finite(lost.cpu().numpy(), names)
-        if said != self.named:  # once, for a sensor that stays so
-            warn(said, NonFiniteWarning)
-        self.named = said
+        message = what_is_not_finite(lost.cpu().numpy(), names)
+        if message != self.named:  # once, for a sensor that stays so
+            warn(message, NonFiniteWarning)
+        self.named = message
         return th.where(whole, actions, self.mu.law(theta).to(actions))
 
     def load_state_dict(

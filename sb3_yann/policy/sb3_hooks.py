@@ -81,9 +81,9 @@ class KeepsPrecision:
 
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> Any:
         for dtype in (th.float32, th.float64):
-            if (asked := fn(th.zeros(1, dtype=dtype)).dtype) != dtype:
+            if (wanted := fn(th.zeros(1, dtype=dtype)).dtype) != dtype:
                 raise TypeError(
-                    f"{type(self).__name__} cannot become {asked}: the law is computed in float64 "
+                    f"{type(self).__name__} cannot become {wanted}: the law is computed in float64 "
                     "and the networks in float32, to which the compiled loops and SB3's replay "
                     "buffer keep. Leave double(), float(), half() and to(dtype) out; to(device) "
                     "is fine."

@@ -142,7 +142,7 @@ def loops_part(subject: Subject) -> Part:
 
 def _exceeded(problem: LinearMPC, loops: Mapping[str, Trajectories]) -> Iterator[Finding]:
     """Yield by how much a limit is exceeded, whoever acts: the MPC is no measure of that."""
-    said = []
+    exceeding = []
     for who, played in loops.items():
         assert played.excess is not None
         largest = played.excess.largest
@@ -150,9 +150,9 @@ def _exceeded(problem: LinearMPC, loops: Mapping[str, Trajectories]) -> Iterator
         bad = int(np.sum((played.violations > 0) | (largest > EXCESS_ROOM)))
         words = BoundNames.of(problem).in_words(float(played.excess.worst[k]), float(largest[k]))
         if bad:
-            said.append(f"{who}, in {bad} of {len(largest)}{f': {words}' * bool(words)}")
-    if said:
-        yield Finding("look", f"Episodes exceed a limit with the {'; with the '.join(said)}.")
+            exceeding.append(f"{who}, in {bad} of {len(largest)}{f': {words}' * bool(words)}")
+    if exceeding:
+        yield Finding("look", f"Episodes exceed a limit with the {'; with the '.join(exceeding)}.")
 
 
 def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float, float]:

@@ -104,8 +104,8 @@ class Logged:
         """
         theta = self.row.shown(self.rows).copy()
         layout = self.problem.layout
-        asked = np.r_[layout.reference, layout.limits]
-        theta[:, asked] = theta[:, asked].mean(axis=0)
+        given = np.r_[layout.reference, layout.limits]
+        theta[:, given] = theta[:, given].mean(axis=0)
         known = np.delete(theta, layout.previous, axis=1)
         columns = np.column_stack([np.ones(len(theta)), known, law_of(self.problem)(theta)])
         left = self.inputs - columns @ np.linalg.lstsq(columns, self.inputs, rcond=None)[0]
@@ -364,8 +364,8 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
     as_it_is = left_by_model(np.eye(n), np.zeros(n), log.inputs)
     found = [(error, words) for error, words in found if error < as_it_is]
     least = min((error for error, _ in found), default=0.0)
-    if said := [words for error, words in found if CLEARLY_BETTER * error <= least]:
-        yield f"{'; or: '.join(said)}: is it in other units, or has it another zero? {CONFIRM}"
+    if readings := [words for error, words in found if CLEARLY_BETTER * error <= least]:
+        yield f"{'; or: '.join(readings)}: is it in other units, or has it another zero? {CONFIRM}"
 
 
 def _other_pace(log: Logged) -> Iterator[str]:
@@ -400,8 +400,8 @@ def _other_pace(log: Logged) -> Iterator[str]:
 
 def _against_plant(log: Logged, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where inputs that the law does not prove act otherwise than the model says."""
-    if said := _by_innovations(log):
-        yield said
+    if words := _by_innovations(log):
+        yield words
         return
     fit = _Effects.of(log, 0)
     B = log.problem.model.B

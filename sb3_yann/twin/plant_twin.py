@@ -228,9 +228,9 @@ class PlantTwin(LearntModel):
     def require_trust(self) -> None:
         """Raise UntrustedTwinError, with its reasons, unless the twin is trusted."""
         if not self.trusted:
-            said = " ".join([*self.trust.problems, *self.trust.advice])
-            said += " Until then the MPC stays: export(mpc, path) writes it."
-            raise UntrustedTwinError(f"The twin is not to be trusted: {said}")
+            message = " ".join([*self.trust.problems, *self.trust.advice])
+            message += " Until then the MPC stays: export(mpc, path) writes it."
+            raise UntrustedTwinError(f"The twin is not to be trusted: {message}")
 
     def report(self) -> str:
         """Return what the twin explains, what it does not know, and whether to trust it."""

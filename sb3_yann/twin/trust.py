@@ -158,14 +158,14 @@ def judge(
             step = f"Make a small step test on {name}, or log another set-point."
             found.append((f"{name} never moves: what it does is not in the log.", step))
         elif own < ALONE:
-            said = f"{name} follows the MPC ({100 * own:.2f} % of its variance is its own), so its "
-            found.append(("", f"{said}gain rests on the given B. A small step test would tell."))
+            text = f"{name} follows the MPC ({100 * own:.2f} % of its variance is its own), so its "
+            found.append(("", f"{text}gain rests on the given B. A small step test would tell."))
     worse = runs.errors[0][0] / max(standing[0], 1e-300) if several else 0.0
     units = "Compare units, operating point and sampling time of the log and the model."
     if worse > FOREIGN:
-        said = f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing "
-        said += f"moves' ({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
-        found.append((said, units))
+        text = f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing "
+        text += f"moves' ({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
+        found.append((text, units))
     if beyond[0] > OUTSIDE:
         rows = f"{100 * beyond[0]:.3g} % of the logged {beyond[1]}"
         found.append((f"{rows} lie beyond the problem's box of theta.", units))
@@ -226,9 +226,9 @@ def evidence(
 def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:
     """Return what a twin explains, what it does not know, and whether to trust it, as text."""
     steps = sum(map(len, episodes))
-    said = [f"The log: {len(episodes)} episode{'s' * (len(episodes) != 1)}, {steps} steps."]
+    lines = [f"The log: {len(episodes)} episode{'s' * (len(episodes) != 1)}, {steps} steps."]
     for pieces in filter(lambda each: len(each) > 1, records(problem, episodes)):
-        said.append(
+        lines.append(
             f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "
             f"other one is independent: {len(pieces[::2])} of {len(pieces)}."
         )
@@ -236,10 +236,10 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
     seen = np.concatenate([each.thetas[:, constant] for each in episodes])
     if still := [*np.array(problem.labels())[constant][np.ptp(seen, axis=0) == 0]]:
         one = f"The log shows one value alone of {', '.join(still)}"
-        said.append(f"{one}: elsewhere the MPC will act.")
-    said.append(f"Residual beside the linear model: {kind}.")
+        lines.append(f"{one}: elsewhere the MPC will act.")
+    lines.append(f"Residual beside the linear model: {kind}.")
     if len(trust.actual):
-        said.append(
+        lines.append(
             "Error of free runs over held-out episodes, in standard deviations of the states:"
         )
         rows = {
@@ -250,22 +250,22 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
         }
         for name, errors in rows.items():
             real = np.where(errors <= FLOAT32_ROUNDING, 0.0, errors)
-            said.append(f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in real))
-        said.append("Cost of held-out episodes (or pieces of them), predicted and actual:")
+            lines.append(f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in real))
+        lines.append("Cost of held-out episodes (or pieces of them), predicted and actual:")
         for predicted, actual in zip(trust.predicted[:10], trust.actual[:10], strict=True):
-            said.append(f"  {predicted:>10.4g} {actual:>10.4g}")
+            lines.append(f"  {predicted:>10.4g} {actual:>10.4g}")
         if (more := len(trust.actual) - 10) > 0:
-            said.append(f"  ... and {more} more")
-        said.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
-    told = "neither states nor the MPC at held set-points tell"
-    said.append(f"Inputs: how much they move, and what share of it {told}:")
+            lines.append(f"  ... and {more} more")
+        lines.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
+    unexplained = "neither states nor the MPC at held set-points tell"
+    lines.append(f"Inputs: how much they move, and what share of it {unexplained}:")
     inputs = labels_of(problem.model)[1]
     for name, own, moves in zip(inputs, trust.excitation, trust.moves, strict=True):
         rests = "rests on the given B" if own < ALONE else "is known from the log"
         half = f"{100 * moves:.3g} % of half the range"
-        said.append(f"  {name}: {half}, {100 * own:.2f} %: its gain {rests}")
-    said.append("Verdict: trusted." if trust.trusted else "Verdict: NOT trusted; the MPC stays.")
-    said += [f"  {each}" for each in trust.problems]
+        lines.append(f"  {name}: {half}, {100 * own:.2f} %: its gain {rests}")
+    lines.append("Verdict: trusted." if trust.trusted else "Verdict: NOT trusted; the MPC stays.")
+    lines += [f"  {each}" for each in trust.problems]
     if trust.advice:
-        said += ["What would help:", *(f"  {each}" for each in np.unique(trust.advice))]
-    return "\n".join(said)
+        lines += ["What would help:", *(f"  {each}" for each in np.unique(trust.advice))]
+    return "\n".join(lines)

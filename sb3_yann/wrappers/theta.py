@@ -254,9 +254,9 @@ class SetPoint(Appending):
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode, with another reference: a seed draws the same one again."""
-        if asked := {"set_point", "reference", "schedule"} & {*(kwargs.get("options") or ())}:
+        if ignored := {"set_point", "reference", "schedule"} & {*(kwargs.get("options") or ())}:
             raise ValueError(
-                f"options = {kwargs['options']!r} of reset: {asked} would be ignored. A reference "
+                f"options = {kwargs['options']!r} of reset: {ignored} has no effect. A reference "
                 "r is held by SetPoint(env, low, high, schedule=[r])."
             )
         observation, info = self.env.reset(**kwargs)

@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import DDPG
 
 import unit_samples as units
-from sb3_yann._validation import said_by
+from sb3_yann._validation import message_of
 from sb3_yann.env_pool import EnvPool
 from sb3_yann.evaluation import Trajectories, evaluate
 
@@ -99,7 +99,7 @@ def test_an_error_of_an_env_says_in_which_episode_and_step(version, monkeypatch)
     monkeypatch.setattr("sys.version_info", min(version, tuple(sys.version_info)))
     with pytest.raises(ArithmeticError, match="thirteen") as raised:
         evaluate(Tenth(), Countdown, [3, 15])
-    assert "in step 3 of the episode from the seed 15" in said_by(raised.value)
+    assert "in step 3 of the episode from the seed 15" in message_of(raised.value)
 
 
 def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> None:

@@ -251,8 +251,8 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Non
     width = program.theta_max / 2 - program.theta_min / 2
     box = np.where(np.isfinite(width), width, 0.0)
     bounded = np.isfinite(u_min) & np.isfinite(u_max)
-    asked = gains * box / half_widths(u_min, u_max)[:, None] * bounded[:, None]
-    most = asked.max(axis=1, initial=0.0)
+    demanded = gains * box / half_widths(u_min, u_max)[:, None] * bounded[:, None]
+    most = demanded.max(axis=1, initial=0.0)
     # A small part alone may be an input with next to no effect, whose bounds are as they should be.
     too_large = (0 < most) & (most < 1e-9) & (half_widths(u_min, u_max) > 1e9)
     for i in np.flatnonzero(too_large):
@@ -261,12 +261,12 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Non
             f"are bounds of which the MPC asks for more than {1e-9:g}, and it asks for "
             f"{most[i]:.0e} of these. Pass what the actuator can do, or inf for no bound."
         )
-    if np.any(asked > 1e8):
-        i = int(np.argmax(asked.max(axis=0)))
+    if np.any(demanded > 1e8):
+        i = int(np.argmax(demanded.max(axis=0)))
         raise ValueError(
             f"theta_min[{i}] = {program.theta_min[i]:g} and theta_max[{i}] = "
             f"{program.theta_max[i]:g} lie too far apart: in this box the MPC asks for inputs "
-            f"{asked.max():.0e} times their range, expected are at most {1e8:g}. Pass as "
+            f"{demanded.max():.0e} times their range, expected are at most {1e8:g}. Pass as "
             "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
             "bound, and use online()."
         )

@@ -252,18 +252,18 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
 
 def words_for(found: Sequence[Frozen], names: Sequence[str], values: Sequence[Array]) -> list[str]:
     """Return one sentence for each frozen state: which rows, what it reads, what to do."""
-    said = []
+    notes = []
     for state in dict.fromkeys(each.state for each in found):
         those = [each for each in found if each.state == state]
         longest = max(those, key=len)
         read = values[longest.episode][longest.first, state]
         more = f", and in {len(those) - 1} more places" if len(those) > 1 else ""
-        said.append(
+        notes.append(
             f"{names[state]} reads exactly {read:.6g} in rows {longest.first} to {longest.last} of "
             f"episode {longest.episode}{more}, while the plant moves: its sensor is frozen. Cut "
             "the episode there, and leave these rows out."
         )
-    return said
+    return notes
 
 
 def _unexplained(

@@ -470,7 +470,7 @@ def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, int, Ar
         square = np.einsum("p...,pq,q...->...", np.conj(slopes), inverse, slopes)
         return np.asarray(np.sqrt(np.abs(square)))
 
-    def told(moved: Innovations) -> Array:
+    def output_responses(moved: Innovations) -> Array:
         return np.asarray(moved.C @ responses(moved.A, moved.B, count))
 
     values, left, right = linalg.eig(model.A, left=True, right=True)
@@ -481,7 +481,8 @@ def errors_of(model: Innovations, chunks: Chunks) -> tuple[Array, Array, int, Ar
         count = count_integrators(
             model.A, lambda R: float(np.nan_to_num(deviation(np.einsum("ij,pji->p", R, dA))))
         )
-        errors = deviation(np.array([told(up) - told(down) for up, down in sides]) / 2e-3)
+        moves = [output_responses(up) - output_responses(down) for up, down in sides]
+        errors = deviation(np.array(moves) / 2e-3)
     of_poles = np.nan_to_num(of_poles, nan=np.inf)
     order = np.argsort(-np.abs(values), kind="stable")
     return values[order], of_poles[order], count, np.nan_to_num(errors, posinf=0.0)

@@ -167,7 +167,7 @@ class Search:
         tested: Sequence[Episode],
         delays: tuple[int, ...],
         tries: Any,
-        told: Structure | None = None,
+        earlier: Structure | None = None,
     ) -> None:
         self.tries = tries
         self.fitted = shifted(read, delays)
@@ -175,7 +175,7 @@ class Search:
         self.chunks = Chunks(self.fitted)
         self.delays = delays
         # Of delayed inputs, or stand-ins would answer too soon.
-        self.past = Past(stand_ins(self.fitted, told), self.chunks.rare)
+        self.past = Past(stand_ins(self.fitted, earlier), self.chunks.rare)
         self.largest = min(MAX_ORDER, self.past.limit)
         self.tried: list[Structure] = []
 
@@ -286,7 +286,7 @@ STAND_IN_RIDGE = 1e-3
 """Of the number of readings: filtered signals depend on each other."""
 
 
-def stand_ins(episodes: Sequence[Episode], told: Structure | None = None) -> list[Episode]:
+def stand_ins(episodes: Sequence[Episode], earlier: Structure | None = None) -> list[Episode]:
     """Return episodes whose slow outputs, NaN but now and then, have a value at each sample.
 
     That is what a model tells, or else a regression, and what it leaves at the readings, drawn
@@ -295,11 +295,11 @@ def stand_ins(episodes: Sequence[Episode], told: Structure | None = None) -> lis
     slow = ~np.isfinite(np.concatenate([each.states for each in episodes])).all(axis=0)
     if not slow.any():
         return list(episodes)
-    if told is None or not np.isfinite(told.criterion):
+    if earlier is None or not np.isfinite(earlier.criterion):
         guesses = _regressed(episodes, slow)
     else:
-        first = told.model.C @ told.start[0] + told.model.y_0
-        ahead = [predicted(told.model, each, told.start, 1) for each in episodes]
+        first = earlier.model.C @ earlier.start[0] + earlier.model.y_0
+        ahead = [predicted(earlier.model, each, earlier.start, 1) for each in episodes]
         guesses = [np.vstack([first, each]) for each in ahead]
     filled = []
     for each, guess in zip(episodes, guesses, strict=True):

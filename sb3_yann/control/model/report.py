@@ -205,14 +205,15 @@ def _gains(model: LinearSystem) -> list[str]:
             f"  What integrates moves on, by so much per {time}: it has no steady-state gain."
         )
     # The gains beside a pole that may be 1 say more, or nothing.
-    told = rows[(moves_on | np.all(gains.beside_errors < gains.errors, axis=1))[rows]]
-    if gains.integrators and told.size and np.abs(np.linalg.eigvals(model.A) - 1).min() > ON_CIRCLE:
+    clearer = rows[(moves_on | np.all(gains.beside_errors < gains.errors, axis=1))[rows]]
+    off_circle = np.abs(np.linalg.eigvals(model.A) - 1).min() > ON_CIRCLE
+    if gains.integrators and clearer.size and off_circle:
         lines.append(
             "  A pole that may be 1 may be a load that drifts, and is not measured: then gains are "
             "about:"
         )
         lines += effects(
-            gains.beside, NORMAL * gains.beside_errors, np.zeros_like(gains.degrees), told
+            gains.beside, NORMAL * gains.beside_errors, np.zeros_like(gains.degrees), clearer
         )
     if np.any(width):
         unsure = np.argwhere((np.abs(values) <= width) & (width > 0))

@@ -201,8 +201,8 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     exact = errors.to_input - gain @ errors.to_error
     own = own @ problem.layout.lift
     unit = problem.settled.theta_half / problem.u_half[:, None]
-    asked = max(1.0, float(np.abs(exact * unit).max()))
-    return float(np.nan_to_num(np.abs(own - exact) * unit, nan=np.inf).max()) / asked
+    largest = max(1.0, float(np.abs(exact * unit).max()))
+    return float(np.nan_to_num(np.abs(own - exact) * unit, nan=np.inf).max()) / largest
 
 
 def _held(

@@ -38,16 +38,16 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
     shown = _left_open(problem, (np.eye(n), np.zeros(n)), *steps)
     if not shown > WRONG:
         return ""
-    told = False
+    is_clear = False
     best = np.inf, "", ""  # a factor of units may explain more than the order that is told
     for reading, what, cure in _readings(problem):
         left = _left_open(problem, reading, *steps)
         # States in the wrong order drive the plant where no model holds: there it is by far better.
         reorders = not np.array_equal(reading[0], np.eye(n)) and np.isin(reading[0], (0, 1)).all()
-        told |= bool(left < RIGHT * (max(1.0, shown) if reorders else 1.0))
+        is_clear |= bool(left < RIGHT * (max(1.0, shown) if reorders else 1.0))
         best = min(best, (left, what, cure), key=lambda each: each[0])
     left, what, cure = best
-    return told * (
+    return is_clear * (
         f"The env seems to show {what}: so the model errs by {100 * left**0.5:.0f} % of "
         f"a step, and by {100 * shown**0.5:.0f} % as it is. {cure}"
     )

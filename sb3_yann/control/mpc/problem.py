@@ -215,11 +215,11 @@ class MPCProblem(ReadOnlyArrays):
         point, at which the law has a value. Laws and policies take what lies beyond as at its end.
         States and disturbances are what they are: they go on.
         """
-        asked = np.r_[self.layout.reference, self.layout.limits]
+        held = np.r_[self.layout.reference, self.layout.limits]
         found = np.full((2, self.n_theta), np.inf) * [[-1.0], [1.0]]
-        rest = self.theta_rest[asked]
-        found[0, asked] = np.minimum(self.deviations.theta_min[asked], rest)
-        found[1, asked] = np.maximum(self.deviations.theta_max[asked], rest)
+        rest = self.theta_rest[held]
+        found[0, held] = np.minimum(self.deviations.theta_min[held], rest)
+        found[1, held] = np.maximum(self.deviations.theta_max[held], rest)
         return found if np.any(np.isfinite(found)) else None
 
     @cached_property
