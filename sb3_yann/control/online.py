@@ -15,7 +15,7 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, check_array, check_choice, check_int, half_widths, warn
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.parametric_qp import MILD, ParametricQP, moderated, slack_costs
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, moderated, slack_costs
 from sb3_yann.control.law import INFEASIBLE_OPTIONS, PiecewiseAffine, PlantLaw, bounds_of
 
 if TYPE_CHECKING:
@@ -272,6 +272,7 @@ class OnlineLaw(PlantLaw):
 
 Law = PiecewiseAffine | OnlineLaw
 LAWS = ("auto", "explicit", "online")
+STEEP = 5e6  # times the inputs' own cost: a slack that costs more costs digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -435,9 +436,9 @@ def _in_units(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[Parame
 
 
 def steepness(program: ParametricQP, u_min: Array, u_max: Array) -> float:
-    """Return how many times half of what a dual method takes the slacks of a program cost."""
+    """Return how many times what costs no digits the slacks of a program cost."""
     ratio, _ = slack_costs(_in_units(program, u_min, u_max)[0])
-    return 2 * float(ratio.max()) / MILD
+    return float(ratio.max()) / STEEP
 
 
 def _require_positive_definite(H: Array) -> None:

@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import learning
-from experiments.learning import (
-    FROM_A_LOG,
-    HEADER,
-    IMPROVED,
-    PLANNED,
-    execute,
-    log_rows,
-    main,
-    rows,
-)
+from experiments.learning import FROM_A_LOG, HEADER, IMPROVED, PLANNED, execute, main, rows
 from experiments.measures import OBSERVER
 from experiments.pictures import _shares, save_in_short
 from experiments.plants import CASES
@@ -62,14 +53,6 @@ def test_a_row_holds_medians_ranges_and_what_was_lost() -> None:
         "largest move, variation": "1.50, 0.25",
         "seconds": "5",
     }
-
-
-def test_a_row_of_a_log_says_how_much_of_the_gap_is_closed() -> None:
-    five, two = log_rows(LOG_RUNS)
-    assert five == [
-        "five episodes", "1 of 1", "-2.50 (-2.50 to -2.50)", "50", "+5.00", "0", "7",
-    ]  # fmt: skip
-    assert two[1:4] == ["0 of 1", "+0.00 (+0.00 to +0.00)", "0"]
 
 
 def test_the_tables_are_quoted_between_their_marks(tmp_path) -> None:

@@ -20,7 +20,7 @@ Where such a bound is active, the law is so steep that its own rounding shows.
 DEPENDENT = 1e-9
 """Constraints whose part across those of an active set is smaller, relative to all, depend on it.
 """
-MILD = 1e7
+MILD = 1e8
 """Up to so many times the inputs' own cost a slack may cost for a dual method."""
 
 
@@ -155,18 +155,30 @@ def moderated(program: ParametricQP) -> ParametricQP:
     In a dual method a slack is what is left when large numbers cancel: its digits are those of
     float64 less those of the penalty. The linear part, which makes the penalty exact, and the
     quadratic one are `MILD` times the inputs' own cost at most, with slacks in units of the largest
-    that each may be.
+    that each may be. Several slacks are compared with each other as well, where not all bounds can
+    hold: each may cost so many times the next cheaper one, and both parts keep their ratio.
     """
     ratio, largest = slack_costs(program)
     if np.all(ratio <= MILD):
         return program
     inputs = len(program.c) - program.n_slacks
-    most = MILD * np.mean(np.diag(program.H)[:inputs])
+    unit = np.mean(np.diag(program.H)[:inputs])
     H = program.H.copy()
     c = program.c.copy()
     G = program.G.copy()
-    H[inputs:, inputs:] = np.diag(np.minimum(np.diag(H)[inputs:] * largest**2, most))
-    c[inputs:] = np.minimum(c[inputs:] * largest, most)
+    quadratic = np.diag(H)[inputs:] * largest**2 / unit
+    linear = c[inputs:] * largest / unit
+    if program.n_slacks == 1:
+        quadratic = np.minimum(quadratic, MILD)
+        linear = np.minimum(linear, MILD)
+    else:
+        order = np.argsort(linear)
+        steps = np.diff(np.log(linear[order]), prepend=0.0)
+        share = np.exp(np.cumsum(np.minimum(steps, np.log(MILD)))) / linear[order]
+        quadratic[order] *= share
+        linear[order] *= share
+    H[inputs:, inputs:] = unit * np.diag(quadratic)
+    c[inputs:] = unit * linear
     G[:, inputs:] *= largest
     length = row_norms(np.hstack([G, program.S]))
     S = program.S / length[:, None]

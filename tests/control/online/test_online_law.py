@@ -11,7 +11,7 @@ import pytest
 from benchmarks.online_problems import points, six_masses, three_masses, wide_plant, worst_condition
 from general_problems import PROBLEMS, solved
 from sample_problems import braking
-from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, SoftBounds
+from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, OutputBounds, SoftBounds
 from sb3_yann.control._kernels import online as _kernels
 from sb3_yann.control._kernels.online import SOLVED
 from sb3_yann.control.online import DualProgram, KnownPoints
@@ -232,8 +232,8 @@ def test_steep_penalties_of_states_in_small_units_are_solved(unit: float) -> Non
     assert explicit.in_domain(points).all() and law.in_domain(points).all()
     expected, found = online_answers(mpc, points)
     assert found.sum() > 40 and np.abs(law(points)[found] - expected).max() < 1e-9
-    np.testing.assert_allclose(explicit(points), law(points), rtol=0, atol=1e-9)
-    step = np.array([1e-4 * unit, 0.0])
+    np.testing.assert_allclose(explicit(points), law(points), rtol=0, atol=1e-8)
+    step = np.array([2e-3 * unit, 0.0])
     slope = (law(points + step) - law(points - step)) / (2 * step[0])
     gains = law.gain(points)[:, 0, 0] * (np.abs(law(points)[:, 0]) < 1)
     assert np.mean(np.abs(slope[:, 0] - gains) < 1e-6 / unit) > 0.95  # all but at a facet
@@ -244,4 +244,14 @@ def test_a_penalty_beyond_all_digits_of_float64_gives_the_law_of_one_that_is_wit
     points = np.random.default_rng(0).uniform(-1.4, 1.4, (200, 2)) * [1, 0.5]
     expected = cart(1e6).explicit()(1e6 * points)
     for solve in (LinearMPC.online, LinearMPC.explicit):
-        np.testing.assert_allclose(solve(cart(unit))(unit * points), expected, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(solve(cart(unit))(unit * points), expected, rtol=0, atol=1e-8)
+
+
+def test_steep_bounds_that_cannot_all_hold_give_way_by_their_sizes() -> None:
+    mpc = LinearMPC(
+        LinearModel(0.9 * np.eye(2), [[1], [-1]], dt=1), Q=np.eye(2), R=[[0.1]], horizon=1,
+        u_min=-5, u_max=5, x_min=-9, x_max=[1, 9], outputs=OutputBounds([[0, 1]], [-9], [1]),
+        soft=SoftBounds(x=[0.5, 0], y=[1], penalty=1e9),
+    )  # fmt: skip
+    for law in (mpc.online(), mpc.explicit()):  # least s + s^2 of s = 2 (1.7 + u) and 1.7 - u
+        assert law([3, 3]) == pytest.approx(-1.12, abs=1e-6)
