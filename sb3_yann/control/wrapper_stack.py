@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_yann._validation import warn
 from sb3_yann.control.observer import StateEstimator
+from sb3_yann.units import ActionUnits
 
 if TYPE_CHECKING:
     from sb3_yann.control.mpc.problem import MPCProblem
@@ -51,13 +52,27 @@ def require_theta_order(env: Any, problem: MPCProblem) -> None:
                 )
             if start < end and "reference" in parts:
                 _warn_of_wide(layer, problem, slice(start, end))
-            if isinstance(observer := vars(layer).get("observer"), StateEstimator):
+            observer = vars(layer).get("observer")
+            if isinstance(observer, StateEstimator):
                 observer.require_model(problem.model)
+            if observer is not None or "previous" in parts:
+                _require_plant_inputs(layer, problem)
             end = start
         elif "envs" not in vars(layer) and "venv" not in vars(layer):
             inner = vars(layer).get("env")
             if inner is None or inner.observation_space.shape != layer.observation_space.shape:
                 return
+
+
+def _require_plant_inputs(layer: Any, problem: MPCProblem) -> None:
+    """Raise where a wrapper that keeps inputs sees them normalized: in theta they are not."""
+    units = ActionUnits.of(problem, layer.inputs.low, layer.inputs.high)
+    if units is not None and units.kind == "normalized":
+        raise ValueError(
+            f"{type(layer).__name__} sees inputs from -1 to 1, and those of the MPC lie between "
+            f"{problem.u_min.tolist()} and {problem.u_max.tolist()}. Inside of it wrap the env in "
+            "gymnasium.wrappers.RescaleAction(env, mpc.u_min, mpc.u_max), which takes plant units."
+        )
 
 
 def _warn_of_wide(layer: Any, problem: MPCProblem, slots: slice) -> None:

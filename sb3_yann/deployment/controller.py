@@ -336,10 +336,9 @@ class Controller:
                 found = data["est_first"] @ [*np.where(np.isnan(y), rest, y), 1.0]
         if not np.isfinite(found).all():
             found = data["est_first"] @ [*rest, 1.0]
-        self._estimate = found
+        self._estimate = np.clip(found, *data["est_box"])
         self._loads = loads
-        low, high = data["est_box"]
-        shown = np.concatenate([self._good, np.clip(found, low, high), u])
+        shown = np.concatenate([self._good, self._estimate, u])
         return np.asarray(shown[data["source"]])
 
     def _mode(self, status: Status) -> str:

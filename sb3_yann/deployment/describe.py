@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -103,8 +104,11 @@ def estimator_arrays(
     seen: list[str],
     seen_rest: Array,
     units: ActionUnits,
+    order: NDArray[np.intp],
 ) -> dict[str, Any]:
     """Return the arrays of an estimator, and where each entry of what the policy sees comes from.
+
+    Entry i of that is entry ``order[i]`` of theta.
 
     A step of the filter is ``[A B E c] [x; u; d; 1]``, and a correction by ``gain (y - C x)``, both
     in plant units. Of what the policy sees, x and estimated disturbances come from the filter, the
@@ -112,6 +116,7 @@ def estimator_arrays(
     """
     model = problem.model
     layout = problem.layout
+    estimator = _beside_extra(estimator, problem)
     estimator.require_model(model)
     if estimator.n_estimated != len(model.estimated):
         raise ValueError(
@@ -129,11 +134,11 @@ def estimator_arrays(
     smallest = np.zeros((size, q))
     smallest[: model.n_states] = np.linalg.pinv(estimator.C)
 
-    entries = np.arange(len(seen))
-    in_d = np.arange(layout.disturbance.start, layout.disturbance.stop)
+    entries = np.argsort(order)
+    in_d = entries[layout.disturbance]
     from_filter = np.concatenate([entries[layout.state], in_d[len(in_d) - len(estimated) :]])
     previous = entries[layout.previous]
-    read = np.delete(entries, np.concatenate([from_filter, previous]))
+    read = np.delete(np.arange(len(seen)), np.concatenate([from_filter, previous]))
     n_read = q + len(read)
     source = np.empty(len(seen), np.int64)
     source[read] = q + np.arange(len(read))
@@ -141,7 +146,8 @@ def estimator_arrays(
     source[previous] = n_read + size + np.arange(len(previous))
     limits = np.full(model.n_states, np.inf)
     d_min, d_max = (getattr(problem.disturbances, side)[n_known:] for side in ("d_min", "d_max"))
-    names = [*labels_of_outputs(estimator.C, seen), *(seen[i] for i in read)]
+    states = [seen[i] for i in entries[layout.state]]
+    names = [*labels_of_outputs(estimator.C, states), *(seen[i] for i in read)]
     scale = 1 / units.scale
     return {
         "est_next": _affine(step, np.concatenate([x, driven]), x),
@@ -157,6 +163,24 @@ def estimator_arrays(
         "obs_rest": np.concatenate([y, seen_rest[read]]),
         "watched": np.arange(n_read) < q,
     }
+
+
+def _beside_extra(estimator: StateEstimator, problem: LinearMPC) -> StateEstimator:
+    """Return the same estimator with a policy's extra signals as loads that move nothing."""
+    model = problem.model
+    more = model.n_disturbances - estimator.model.n_disturbances
+    ignored = problem.extra[-more:] - problem.layout.disturbance.start
+    if not 0 < more <= len(problem.extra):
+        return estimator
+    if not np.array_equal(estimator.model.E, np.delete(model.E, ignored, axis=1)):
+        return estimator
+    estimator.require_model(model, ("A", "B", "x_ss", "u_ss"))
+    found = copy.copy(estimator)
+    vars(found).pop("resting", None)
+    found.model = model
+    found.E = np.zeros((len(found.A), len(model.measured)))
+    found.E[: model.n_states] = model.E[:, model.measured]
+    return found
 
 
 def _affine(matrix: Array, given_ss: Array, found_ss: Array) -> Array:
@@ -207,7 +231,11 @@ def describe(
 
     matrix, offset, scale, shift = _signal_maps(policy, law)
     watched = states
-    if isinstance(policy, StartsAsMPC) and not keeps_entries(policy.actor.features_extractor):
+    order = _order_of_theta(policy)
+    if order is not None:
+        labels = [labels[i] for i in order]
+        watched = states[order]
+    elif isinstance(policy, StartsAsMPC) and not keeps_entries(policy.actor.features_extractor):
         labels = [f"obs[{i}]" for i in range(matrix.shape[1])]
         shown = matrix != 0  # entries are watched that say what states are, and nothing else
         watched = shown[states].any(0) & ~shown[~states].any(0)
@@ -218,10 +246,10 @@ def describe(
         "obs_rest": seen_rest,
         "watched": watched,
     }
-    if own is not None and problem is not None:
+    if own is not None and problem is not None and order is not None:
         units = ActionUnits("plant", np.ones(law.n_inputs), problem.model.u_ss)
         units = policy.action_units if isinstance(policy, StartsAsMPC) else units
-        signals = estimator_arrays(problem, own, labels, seen_rest, units)
+        signals = estimator_arrays(problem, own, labels, seen_rest, units, order)
     limits = checks.arrays(len(signals["obs_rest"]))
     if problem is not None and problem.units.shifted:
         _warn_of_limits(limits, signals)
@@ -265,7 +293,7 @@ def _lacks(policy: Any, problem: LinearMPC | None, estimator: Estimator) -> str:
     """Return what the controller leaves to its caller; raise where an estimator has no place."""
     model = policy.model if problem is None else problem.model
     if isinstance(estimator, StateEstimator):
-        if problem is None or not _shows_theta(policy):
+        if problem is None or _order_of_theta(policy) is None:
             raise ValueError(
                 "A law alone, and a policy whose observation mixes entries of theta, do not say "
                 "where estimates belong. Pass the LinearMPC, or a model whose observation is theta."
@@ -286,7 +314,7 @@ def _lacks(policy: Any, problem: LinearMPC | None, estimator: Estimator) -> str:
 def _labels(policy: Any, problem: LinearMPC | None, model: Any) -> NDArray[np.str_]:
     """Return names of what is read and put out in plant units, and the same with units, (k, 2)."""
     found: list[tuple[str, str]] = []
-    if model is not None and _shows_theta(policy):
+    if model is not None and _order_of_theta(policy) is not None:
         states = labels_of(model)[0], with_units(model)[0]
         theta = problem and (problem.labels(), problem.labels(units=True))
         found += zip(*(theta or states), strict=True)
@@ -296,17 +324,20 @@ def _labels(policy: Any, problem: LinearMPC | None, model: Any) -> NDArray[np.st
     return np.array([each for each in found if each[0] != each[1]], str).reshape(-1, 2)
 
 
-def _shows_theta(policy: Any) -> bool:
-    """Return whether what is seen is theta, in its own units."""
+def _order_of_theta(policy: Any) -> NDArray[np.intp] | None:
+    """Return which entry of theta each that is seen is, None where these are not theta's own."""
     if not isinstance(policy, StartsAsMPC):
-        return True
-    extractor = policy.actor.features_extractor
+        return np.arange(policy.n_theta)
     n = policy.problem.n_theta
+    extractor = policy.actor.features_extractor
     if not isinstance(extractor, AffineFeatures):
-        return True
-    matrix = extractor.matrix.cpu().numpy()
+        return np.arange(n)
+    matrix = extractor.matrix.cpu().numpy()  # (n_obs, n_theta)
     offset = extractor.offset.cpu().numpy()
-    return np.array_equal(matrix, np.eye(n)) and np.allclose(offset, -policy.problem.theta_ss)
+    order = np.asarray(matrix.argmax(axis=1))
+    is_theta = np.array_equal(np.sort(order), np.arange(n))
+    is_theta &= np.array_equal(matrix, np.eye(n)[order])
+    return order if is_theta and np.allclose(offset, -policy.problem.theta_ss) else None
 
 
 def _with_sources(problem: LinearMPC) -> list[str]:

@@ -16,9 +16,9 @@ from sb3_yann._validation import Array, to_float, warn
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.env_pool import is_vec_env
 from sb3_yann.log import SECONDS, Log, as_matrices, require_one_state_more
-from sb3_yann.twin.row_layout import ROUNDED
 
 SHORTEST = 5  # steps that an episode has at least
+ROUNDED = 1e-6  # so near to its bound, relative to their distance, an estimate may lie beyond it
 EXPLAINED = 1e-3  # an estimate's moves follow the model's errors but for so much of their squares
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from sb3_yann._validation import Array, check_type
 from sb3_yann.control import DisturbanceObserver, LinearMPC, StateEstimator
 
-ROUNDED = 1e-6  # so near to its bound, relative to their distance, an estimate may lie beyond it
 SINGULAR = 1e10  # condition number from which on a matrix is not inverted
 
 
@@ -22,9 +21,9 @@ class RowLayout:
     """What a row of a twin holds: theta, and behind it what the law does not see.
 
     Without an observer a row is theta. With one the x and d of theta are *estimates*: behind theta
-    stand the plant's own state (n,) and the estimate of d (d,) before it is clipped to its bounds.
-    The plant does not know d. The observer steps its estimate from what it measures: ``z+ = (I - L
-    C) (A z + B u) + L C x+`` with ``z = [x_hat; d_hat]``.
+    stands the plant's own state (n,). The plant does not know d. The observer steps its estimate
+    from what it measures: ``z+ = (I - L C) (A z + B u) + L C x+`` with ``z = [x_hat; d_hat]``, and
+    clips d_hat to its bounds.
 
     Where the measurements do not tell the plant's state, a row is theta, and the estimate itself is
     what is learnt: ``x_hat+ = A x_hat + B u + E d_hat + residual(x_hat, d_hat, u)``. This residual
@@ -87,7 +86,7 @@ class RowLayout:
     @cached_property
     def size(self) -> int:
         """Number of entries of a row."""
-        return self.problem.n_theta if self.observer is None else self._raw.stop
+        return self.problem.n_theta if self.observer is None else self.state.stop
 
     @cached_property
     def state(self) -> slice:
@@ -106,11 +105,6 @@ class RowLayout:
         if self.estimator is None or not self.estimator.n_estimated:
             return parts.constant
         return slice(parts.constant.start, self._estimated.start)
-
-    @cached_property
-    def _raw(self) -> slice:
-        """The entries of the estimate of d before it is clipped."""
-        return slice(self.state.stop, self.state.stop + self.problem.layout.n_disturbances)
 
     @cached_property
     def measured(self) -> Array:
@@ -151,11 +145,10 @@ class RowLayout:
         z = np.zeros((len(blind), found.shape[1]))
         before = blind @ observer.A
         z[:, parts.state] = before[:, :n]
-        z[:, self._raw] = before[:, n:]
+        z[:, parts.disturbance] = before[:, n:]
         z[:, self.size :] = blind @ observer.B
         z += observer.gain @ observer.C @ found[self.state]
         found[parts.state] = z[:n]
-        found[self._raw] = z[n:]
         found[parts.disturbance] = z[n:]
         return found
 
@@ -172,7 +165,7 @@ class RowLayout:
         if self.observer is not None:
             moved = self.observer.gain @ self.observer.C
             found[parts.state] = moved[: parts.n_states]
-            found[self._raw] = found[parts.disturbance] = moved[parts.n_states :]
+            found[parts.disturbance] = moved[parts.n_states :]
         return found
 
     @property
@@ -189,17 +182,15 @@ class RowLayout:
         return rows[..., : self.problem.n_theta]
 
     def clip(self, rows: Array) -> Array:
-        """Clip the shown estimate of d to its bounds, in place; return which is inside of them."""
-        if self.observer is None:
-            part = self._estimated
-            own = self.problem.deviations
-            if part.start < part.stop:
-                rows[..., part] = np.clip(rows[..., part], own.theta_min[part], own.theta_max[part])
-            return np.zeros((*rows.shape[:-1], 0), dtype=bool)
-        (low, high) = self._d
-        raw = rows[..., self._raw]
-        rows[..., self.problem.layout.disturbance] = np.clip(raw, low, high)
-        return np.asarray((raw > low) & (raw < high))
+        """Clip the estimate of d to its bounds, in place; return which is inside of them."""
+        part = self._estimated if self.observer is None else self.problem.layout.disturbance
+        low = self.problem.deviations.theta_min[part]
+        high = self.problem.deviations.theta_max[part]
+        d = rows[..., part]
+        inside = (d > low) & (d < high)
+        if d.size:
+            rows[..., part] = np.clip(d, low, high)
+        return np.asarray(inside)
 
     def begin(self, thetas: Array) -> Array:
         """Return rows (..., size) of thetas (..., n_theta), or of rows: what is shown is so."""
@@ -208,11 +199,10 @@ class RowLayout:
         if self.observer is None:
             return shown.copy()
         x = shown[..., parts.state]
-        d = shown[..., parts.disturbance]
         if self.hidden and thetas.shape[-1] == self.size:  # what is not measured stays
             own = thetas[..., self.state]
             x = own + (x - own) @ self.measured.T
-        return np.concatenate([shown, x, d], axis=-1)
+        return np.concatenate([shown, x], axis=-1)
 
     def after(self, row: Array, u: Array, theta: Array) -> Array:
         """Return the row (size,) that shows theta (n_theta,) one step after another row.
@@ -224,16 +214,12 @@ class RowLayout:
         observer = self.observer
         parts = self.problem.layout
         n = self.problem.layout.n_states
-        z = observer.A @ np.concatenate([row[parts.state], row[self._raw]]) + observer.B @ u
+        z = observer.A @ np.concatenate([row[parts.state], row[parts.disturbance]])
+        z += observer.B @ u
         seen = np.linalg.pinv(observer.gain[:n]) @ (theta[parts.state] - z[:n])
-        d = z[n:] + observer.gain[n:] @ seen
-        shown = theta[parts.disturbance]
-        (low, high) = self._d
-        room = ROUNDED * (high - low)  # an observation rounds the bounds to float32
-        d = np.where((shown > low + room) & (shown < high - room), shown, d)
         shows = np.linalg.pinv(observer.C) @ seen + self.measured @ z[:n]
         x = shows + theta[parts.state] - self.measured @ theta[parts.state]
-        return np.concatenate([theta, x, d])
+        return np.concatenate([theta, x])
 
     def recovered(self, thetas: Array, actions: Array) -> tuple[Array, Array]:
         """Return the rows (T + 1, size) and inputs (T, m) of an episode of thetas.
@@ -291,12 +277,12 @@ class RowLayout:
         d = None if loads is None or not k else loads[:, :k] - model.d_ss[:k]
         estimator = copy.deepcopy(estimator)
         estimator.reset(y[0])
+        known = self._n_disturbances - estimator.n_estimated
+        low, high = (each[known:] for each in self._d)
         found = [estimator.estimate]
         for t in range(len(u)):
-            estimator.update(y[t + 1], u[t], None if d is None else d[t])
+            x_hat, d_hat = estimator.update(y[t + 1], u[t], None if d is None else d[t])
+            estimator.estimate = np.concatenate([x_hat, np.clip(d_hat, low, high)])
             found.append(estimator.estimate)
         x_hat, d_hat = np.split(np.array(found), [model.n_states], axis=1)
-        bounds = self.problem.disturbances
-        known = self._n_disturbances - estimator.n_estimated
-        d_hat = np.clip(d_hat + model.d_ss[k:], bounds.d_min[known:], bounds.d_max[known:])
-        return x_hat + model.x_ss, d_hat
+        return x_hat + model.x_ss, d_hat + model.d_ss[k:]

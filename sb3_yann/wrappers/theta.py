@@ -254,9 +254,9 @@ class SetPoint(Appending):
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode, with another reference: a seed draws the same one again."""
-        if ignored := {"set_point", "reference", "schedule"} & {*(kwargs.get("options") or ())}:
+        if keys := {"set_point", "reference", "schedule"} & {*(kwargs.get("options") or ())}:
             raise ValueError(
-                f"options = {kwargs['options']!r} of reset: {ignored} has no effect. A reference "
+                f"options = {kwargs['options']!r} of reset: {keys} would be ignored. A reference "
                 "r is held by SetPoint(env, low, high, schedule=[r])."
             )
         observation, info = self.env.reset(**kwargs)
@@ -436,7 +436,7 @@ class EstimateState(Appending):
     observer : StateEstimator
         Copied, so that each env has an estimate of its own.
     low, high : array_like, shape (d,), optional
-        ``d_min`` and ``d_max`` of the problem, to which the shown estimate is clipped. Those of its
+        ``d_min`` and ``d_max`` of the problem, to which the estimate is clipped. Those of its
         measured disturbances may be left out. There are no bounds by default.
 
     Examples
@@ -504,6 +504,8 @@ class EstimateState(Appending):
             self.load = self.measured.held[: observer.n_known] - self.inner.theta_ss[first:]
         x_hat, d_hat = np.split(self.outer.to_plant(np.concatenate(both)), [len(both[0])])
         shown = np.clip(d_hat, self.low, self.high)
+        # The state is estimated with the disturbance that the law knows, or both drive it off.
+        observer.estimate[len(x_hat) :] -= d_hat - shown
         self.clipped = np.where((shown != d_hat) & (u is not None), self.clipped + 1, 0)
         for i in np.flatnonzero(self.clipped == CLIPPED):
             warn(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from deployed import Compiled, disturbed, error, needs_compiler, policy_of, self_test, with_faults
 from sb3_yann import (
@@ -230,6 +231,18 @@ def test_a_closed_loop_is_that_of_python(form, kind, rates, extra, tmp_path) -> 
     assert met >= Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.LATE
     assert {mode for _, mode in said} == {0, 1, 2}
     assert sum(mode == 0 for _, mode in said) > 200  # a value of every seventh step is no fault
+
+
+def test_extra_signals_of_a_policy_are_beside_those_of_its_estimator(tmp_path) -> None:
+    mpc, observer = problem()
+    shown = spaces.Box(np.append(mpc.theta_min, 0), np.append(mpc.theta_max, 1), dtype=np.float64)
+    seen = disturbed(mpc, 0.05, networks="shared", extra=1, observation_space=shown)
+    loops = []
+    for given, estimator in ((seen, observer), (policy(extra=True), problem(extra=True)[1])):
+        export(given, tmp_path / "plant.npz", estimator=estimator)
+        controller = Controller.load(tmp_path / "plant.npz")
+        loops.append(loop(InPython(controller), noisy_steps(100), True))
+    np.testing.assert_allclose(loops[0][0], loops[1][0], atol=1e-6)
 
 
 @needs_compiler

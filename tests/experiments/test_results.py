@@ -16,7 +16,6 @@ from experiments import runner
 from experiments.__main__ import BEGIN, END, main
 from experiments.markdown import quote
 from experiments.measures import rows_of
-from experiments.published import paper_table
 from experiments.results import in_short, write_report
 from experiments.runner import Outcome, Run, RunsFailed, load_all, run_all
 from fresh_process import run_module
@@ -61,17 +60,6 @@ def pendulum(final=(1.0, 30.0), mpc=(1.0, 200.0), optimum=(0.9, 29.1)) -> dict[R
     for seed in range(10):
         outcomes[Run(name, "YANN-RL", seed, 50)] = learned(np.array(final), np.array(mpc))
     return outcomes
-
-
-def test_the_papers_table_takes_the_best_and_the_worst_beginning() -> None:
-    text = paper_table({**reactor(), **pendulum()}, 50)
-    assert text.splitlines()[2:] == [
-        "| CSTR | DDPG, best start | 400.00 | 300.00 | 800.24 | 664.39 |",
-        "| CSTR | DDPG, worst start | 409.00 | 300.00 | > 3e4 | 603.78 |",
-        "| CSTR | YANN-RL | 200.00 | 191.00 | 94.32 | 92.22 |",
-        "| pendulum, Q = I | YANN-RL | 100.50 | 15.50 | 270.99 | 26.08 |",
-    ]
-    assert paper_table(reactor(plant="CSTR, true model"), 50) == ""
 
 
 def test_the_report_is_whole(tmp_path) -> None:

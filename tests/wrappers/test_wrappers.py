@@ -143,8 +143,7 @@ def test_the_estimate_takes_the_place_of_the_measurement() -> None:
     np.testing.assert_allclose(shown, [*x_hat, 4, *np.clip(d_hat, -0.5, 0.5)], rtol=1e-6)
     for _ in range(20):
         shown = env.step(np.array([0.5]))[0]
-    assert shown[-1] == 0.5  # the estimate is shown inside the box of the problem
-    assert env.observer.d_hat[0] > 0.5
+    assert shown[-1] == 0.5 == env.observer.d_hat[0]  # as x_hat has it
 
 
 def test_an_input_that_moves_faster_than_its_bounds_is_a_violation() -> None:
@@ -153,6 +152,9 @@ def test_an_input_that_moves_faster_than_its_bounds_is_a_violation() -> None:
     env.reset(seed=0)
     reported = [env.step(np.float32([u]))[4].get("violation", False) for u in (0.7, 0.2, 1, -1)]
     assert reported == [False, False, True, True]
+    normalized = LinearPlant(servo(tracking=None, u_min=-1, u_max=1))
+    with pytest.raises(ValueError, match=r"PreviousInput sees inputs from -1 to 1, .*RescaleAction"):
+        StageCost(PreviousInput(normalized), mpc)
 
 
 def test_a_violation_may_cost_extra() -> None:

@@ -467,7 +467,8 @@ static void look(yann_state *state, const real good[N_OBS], int begins, int told
         if (input >= 0) {
             seen[j] = state->output[input] * input_scale[input] + input_shift[input];
         } else if (at >= 0) {
-            seen[j] = between(state->estimate[at], est_min[at], est_max[at]);
+            state->estimate[at] = between(state->estimate[at], est_min[at], est_max[at]);
+            seen[j] = state->estimate[at];
         } else {
             seen[j] = state->good[source[j]];
         }
