@@ -13,8 +13,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._progress import is_watched
-
 Integers = NDArray[np.int64]
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -72,9 +70,7 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
 
 @cache
 def _say(keep: bool) -> None:
-    """Say once, at a terminal or in a notebook, what takes the time."""
-    if not is_watched():
-        return
+    """Say once what takes the time."""
     how_often = (
         "once after an installation" if keep else "at each start, for its folder takes no file"
     )

@@ -37,7 +37,6 @@ def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(monkeypatch, caps
         raise RuntimeError("cannot cache function: no locator available")
 
     monkeypatch.setattr(Dispatcher, "enable_caching", no_folder)
-    monkeypatch.setattr("sb3_yann._numba.is_watched", lambda: True)
     _say.cache_clear()
     for _ in range(2):
         assert compiled("float64(float64)")(lambda x: x + 1.0)(1.0) == 2.0

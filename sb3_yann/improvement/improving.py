@@ -395,7 +395,8 @@ class _Progress:
     """Lines that say what is done, and about how long the rest takes."""
 
     def __init__(self, rounds: int) -> None:
-        self.rounds = rounds
+        self.rounds = rounds  # that are left at most
+        self.confirmations = 0  # the same
         self.write = Progress()
         self.simulator: Simulator | None = None
         self.ends: list[float] = []  # when the data were there, and when each round was over
@@ -405,10 +406,9 @@ class _Progress:
         left = 0.0
         if len(self.ends) > 1:
             each = (self.ends[-1] - self.ends[0]) / (len(self.ends) - 1)
-            over = self.rounds if pairs else len(self.ends) - 1
-            left = max(each * (self.rounds - over) - (time.monotonic() - self.ends[-1]), 0.0)
+            left = max(each * self.rounds - (time.monotonic() - self.ends[-1]), 0.0)
             if self.simulator:
-                left += self.simulator.seconds_of(2 * max(LOOKS[-1] - pairs, 0))
+                left += self.simulator.seconds_of(2 * (self.confirmations * LOOKS[-1] - pairs))
         self.write(text, left, detail)
 
     def detail(self, text: str) -> None:
@@ -419,10 +419,18 @@ class _Progress:
         """Count the steps of a simulator."""
         self.simulator = simulator
         self.write.steps = lambda: simulator.steps
+        self.rounds += TRIES - 1
+        self.confirmations = TRIES + 1
 
     def end_of_round(self) -> None:
         """Note the time, from which what is left follows."""
+        self.rounds -= bool(self.ends)
         self.ends.append(time.monotonic())
+
+    def confirm(self, attempt: int) -> None:
+        """Count what is left from an attempt to confirm on."""
+        self.rounds = max(TRIES - 1 - attempt, 0)
+        self.confirmations = TRIES + 1 - attempt
 
 
 class _Work:
@@ -724,6 +732,7 @@ class _Work:
     def _confirm(self, simulator: Simulator, model: LearntModel, best: float) -> bool:
         """Let the simulator decide; teach what is lost, at most three times, then retreat."""
         for attempt in range(TRIES + 1):
+            self.say.confirm(attempt)
             if attempt == TRIES:
                 self.scale(RETREATS[0], self.weights())
             share = RULE.significance / (TRIES + 1)  # all tries together err with no more
@@ -739,4 +748,5 @@ class _Work:
             if attempt < TRIES - 1:
                 model, teacher = self._taught(simulator, trial.lost, self.rounds + attempt)
                 imitate(self.layer, teacher, self.updates, self.say.detail)
+                self.say.end_of_round()
         return False

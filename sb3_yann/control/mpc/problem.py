@@ -538,9 +538,12 @@ def gain_at_rest(problem: MPCProblem, law: Law) -> Array:
     rest = problem.theta_rest
     unit = 2 * problem.u_half
     if not law.in_domain(rest) or np.any(np.abs(law(rest)) > 1e-9 * unit):
+        beyond = (problem.theta_min > 0) | (problem.theta_max < 0)
+        names = ", ".join(name for name, out in zip(problem.labels(), beyond, strict=True) if out)
         raise ValueError(
             "The law does not rest at the operating point: x_ss and u_ss must keep all bounds. "
-            "Choose an operating point inside the bounds, and boxes of parameters that hold 0."
+            "Choose an operating point inside the bounds, and inside the box of theta"
+            f"{f', whose range of {names} leaves it out' * bool(names)}."
         )
     gains = law.gain(rest)
     K = -gains @ errors.to_theta
