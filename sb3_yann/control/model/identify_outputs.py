@@ -241,7 +241,8 @@ def identify_outputs(
         follows = feedback(stand_ins(scaled))
         early = early_note(stand_ins(scaled), EARLY_LAGS)
     except ValueError as error:
-        raise ValueError(log.in_names(str(error).replace("x[", "y["))) from None
+        words = str(error).replace("x[", "y[").replace(", or pass ridge > 0", "")
+        raise ValueError(log.in_names(words)) from None
     if early:
         warn(early[0])
     share = check_range("held_out", held_out, 0, 0.5, "[]")
@@ -252,6 +253,8 @@ def identify_outputs(
         for x in shifted(read, found.delays)
     ]
     n = model.order
+    if wanted is not None and n < wanted:
+        warn(f"order = {order}, but the log tells no more than {n} states: these are taken.")
     step = regress(states, (n, m, d), None, TINY_RIDGE * sum(map(len, states)))
     both = np.hstack([model.A, model.B])
     step = replace(step, coefficients=both, reached=both @ step.center + model.c)
