@@ -128,13 +128,13 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
         found = plain
     error = _error(problem, found[0])
     if error > OFF or (plain is None and np.isnan(error)):
+        give = "Give" if problem.control_horizon is None else "Leave control_horizon out, or give"
         raise ValueError(
             f"{lqr.long_horizon(problem.model.A, problem.horizon)}, rounding hides the law: "
             f"without constraints it is off by {error:.1e} half-widths of the input range (nan: "
-            f"it is not unique), and may be by {OFF:g}. Give "
-            "states that grow a weight in Q, pass a shorter horizon, leave "
-            "the terminal cost to the Riccati equation, or bring states, inputs and weights to "
-            "similar magnitudes."
+            f"it is not unique), and may be by {OFF:g}. {give} states that grow a weight in Q, "
+            "pass a shorter horizon, leave the terminal cost to the Riccati equation, or bring "
+            "states, inputs and weights to similar magnitudes."
         )
     return found
 
