@@ -272,7 +272,7 @@ class OnlineLaw(PlantLaw):
 
 Law = PiecewiseAffine | OnlineLaw
 LAWS = ("auto", "explicit", "online")
-STEEP = 5e6  # times the inputs' own cost: a slack that costs more costs digits
+STEEP = 5e6  # times the inputs' own cost: what a slack costs at most by a default penalty
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,7 +436,7 @@ def _in_units(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[Parame
 
 
 def steepness(program: ParametricQP, u_min: Array, u_max: Array) -> float:
-    """Return how many times what costs no digits the slacks of a program cost."""
+    """Return how many times what a default penalty lets them the slacks of a program cost."""
     ratio, _ = slack_costs(_in_units(program, u_min, u_max)[0])
     return float(ratio.max()) / STEEP
 

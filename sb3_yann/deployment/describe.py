@@ -169,9 +169,9 @@ def _beside_extra(estimator: StateEstimator, problem: LinearMPC) -> StateEstimat
     """Return the same estimator with a policy's extra signals as loads that move nothing."""
     model = problem.model
     more = model.n_disturbances - estimator.model.n_disturbances
-    ignored = problem.extra[-more:] - problem.layout.disturbance.start
     if not 0 < more <= len(problem.extra):
         return estimator
+    ignored = problem.extra[-more:] - problem.layout.disturbance.start
     if not np.array_equal(estimator.model.E, np.delete(model.E, ignored, axis=1)):
         return estimator
     estimator.require_model(model, ("A", "B", "x_ss", "u_ss"))

@@ -278,7 +278,9 @@ class RowLayout:
         estimator = copy.deepcopy(estimator)
         estimator.reset(y[0])
         known = self._n_disturbances - estimator.n_estimated
-        low, high = (each[known:] for each in self._d)
+        bounds = self.problem.deviations.disturbances
+        low = bounds.d_min[known:]
+        high = bounds.d_max[known:]
         found = [estimator.estimate]
         for t in range(len(u)):
             x_hat, d_hat = estimator.update(y[t + 1], u[t], None if d is None else d[t])

@@ -1,5 +1,6 @@
 """A twin of a plant whose disturbance is estimated: the observer is a part of it."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -88,8 +89,7 @@ def test_the_log_tells_what_was_measured_and_estimated(begin) -> None:
         lost = begin + (begin > 0)  # what was measured amid an estimate is not known
         assert len(rows) == len(thetas) - lost and len(inputs) == len(rows) - 1
         np.testing.assert_array_equal(row.shown(rows), thetas[lost:])
-        beyond = np.abs(estimates) >= D_MAX
-        clipped += int(beyond[lost:, 2:].sum())
+        clipped += int((np.abs(estimates) >= D_MAX)[lost:, 2:].sum())
         np.testing.assert_allclose(rows[:, row.state], states[lost:], atol=1e-6)
     assert clipped > 5
 
@@ -242,6 +242,14 @@ LIMITS = {"theta_min": -4, "theta_max": 4, "u_min": -2, "u_max": 2}
 BASE = LinearMPC(
     MODEL, Q=np.diag([0, 1]), R=[[0.01]], horizon=4, tracking=Tracking([1], -1.5, 1.5), **LIMITS
 )
+
+
+def test_estimates_beside_a_load_that_is_foreseen_keep_their_own_bounds() -> None:
+    loads = {"disturbances": DisturbanceBounds(-1, 1, preview=2), "terminal": None, **LIMITS}
+    model = replace(MODEL, E=[[1], [0]], d_ss=[0])
+    row = RowLayout(*offset_free(replace(BASE, model=model, **loads)))
+    found = row.run(np.full((9, 1), 3.0), np.zeros((8, 1)), np.zeros((9, 1)))
+    assert found[1].max() == row.problem.disturbances.d_max[1]
 
 
 class Valve(Sampled):

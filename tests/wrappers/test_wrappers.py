@@ -152,9 +152,8 @@ def test_an_input_that_moves_faster_than_its_bounds_is_a_violation() -> None:
     env.reset(seed=0)
     reported = [env.step(np.float32([u]))[4].get("violation", False) for u in (0.7, 0.2, 1, -1)]
     assert reported == [False, False, True, True]
-    normalized = LinearPlant(servo(tracking=None, u_min=-1, u_max=1))
     with pytest.raises(ValueError, match=r"sees inputs from -1 to 1, .*RescaleAction"):
-        StageCost(PreviousInput(normalized), mpc)
+        StageCost(PreviousInput(LinearPlant(servo(tracking=None, u_min=-1, u_max=1))), mpc)
 
 
 def test_a_violation_may_cost_extra() -> None:
