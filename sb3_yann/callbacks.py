@@ -180,7 +180,8 @@ class SimulatedEpisodes(BaseCallback):
     When training begins, and after each training episode, the policy as it is plays episodes in
     envs of its own, with noise and step tests. Their steps join those of the training env in the
     replay buffer, and none of its episodes changes. A simulator shows without harm what lies beyond
-    other actions; the guard decides what is accepted.
+    other actions; the guard decides what is accepted. Every other episode begins where a candidate
+    has lost under the guard, by the seeds of these starts.
 
     Parameters
     ----------
@@ -274,8 +275,9 @@ class SimulatedEpisodes(BaseCallback):
         """Play episodes, and put their steps into the replay buffer."""
         first = self.seed + self.state.episodes
         count = max(self.per_episode, self.training_env.num_envs)  # a column of the buffer has one
-        seeds = range(first, first + count)
-        explore = [_Exploration(self, np.random.default_rng([self.seed, k])) for k in seeds]
+        drawn = [np.random.default_rng([self.seed, k]) for k in range(first, first + count)]
+        seeds = [self._start(first + i, rng) for i, rng in enumerate(drawn)]
+        explore = [_Exploration(self, rng) for rng in drawn]
         scaled: list[list[Array]] = [[] for _ in seeds]
         space: Any = self.model.action_space
 
@@ -293,6 +295,12 @@ class SimulatedEpisodes(BaseCallback):
             played = rollout(act, self._pool, seeds)
         self.state.episodes += len(seeds)
         self._add(played, scaled)
+
+    def _start(self, seed: int, rng: np.random.Generator) -> int:
+        """Return a new seed, or with even odds one of the starts that a guard has seen lost."""
+        state: Any = getattr(self.model, "guard_state", None)
+        lost = state.evidence.to_learn if state else ()
+        return int(rng.choice(lost)) if lost and rng.random() < 0.5 else seed
 
     def _add(self, played: Trajectories, scaled: Sequence[Sequence[Array]]) -> None:
         """Add the episodes to the buffer, one after the other in each of its columns."""

@@ -129,9 +129,10 @@ RULE = AcceptanceRule()  # by which policies from a twin, a simulator or a plant
 class Verdict(NamedTuple):
     """Whether a policy is no worse, and whether more starts would change that.
 
-    The reason is empty where it is accepted. ``breaks_limit``: it breaks a limit that the
-    policy before does not: then there is no patience. ``above_mpc``: its mean cost is above the
-    MPC's. ``is_sure``: its mean cost is surely lower, at the level that was asked for.
+    The reason is empty where it is accepted. ``breaks_limit``: it violates a limit of the env, ends
+    sooner or is not finite: then there is no patience. ``above_mpc``: its mean cost is above the
+    MPC's, or its excess over a bound. ``is_sure``: its mean cost is surely lower, at the level that
+    was asked for.
     ``is_hopeless``: more starts would hardly show a gain that counts.
     """
 
@@ -349,17 +350,18 @@ def no_worse(
     ``tail_errors``, standard errors of the worst starts' average, count as well.
     """
     names = range(len(mpc.costs)) if names is None else names
-    less = less_safe(policy.unsafe, accepted.unsafe, tolerance.excess_room)
-    breaks = bool(np.any(np.delete(less, INPUT_STEP, axis=1)))  # a large step breaks nothing
-    # Neither is exceeded: a tolerance over the accepted policy alone would add up.
+    # Neither is exceeded: a tolerance over the accepted policy alone would add up. Of a bound the
+    # MPC's excess is: a policy that happens to stay nearer to it does not tighten the limit.
     allowed = np.minimum(accepted.unsafe, mpc.unsafe)
+    allowed[:, LARGEST_EXCESS:MISSING] = mpc.unsafe[:, LARGEST_EXCESS:MISSING]
     less = less_safe(policy.unsafe, allowed, tolerance.excess_room)
+    breaks = bool(less[:, :INPUT_STEP].any())
     costs = policy.costs[n_hard:]
     of_mpc = mpc.costs[n_hard:]
     tolerance = replace(tolerance, saved=float(np.mean(of_mpc - costs)) if len(costs) else 0.0)
     excess = tolerance.excess(mpc.costs, policy.costs)
     before = of_mpc if accepted is mpc else accepted.costs[n_hard:]
-    above_mpc = is_above(costs, of_mpc)
+    above = is_above(costs, of_mpc)
     gain = Difference.of(relative_costs(costs - before, of_mpc))
     is_sure = gain.is_below_zero(level)
     hopeless = gain.is_hopeless(least_gain) and mean_change(costs - before, of_mpc) > -least_gain
@@ -387,10 +389,11 @@ def no_worse(
     elif is_above(costs, before) and before is not of_mpc:
         mean, other = format_distinct(costs.mean(), before.mean())
         reason = f"mean cost {mean} from {len(costs)} starts, accepted {other}"
-    elif above_mpc:  # or by as much as rounding in many acceptances adds up to
+    elif above:  # or by as much as rounding in many acceptances adds up to
         mean, other = format_distinct(costs.mean(), of_mpc.mean())
         reason = f"mean cost {mean} from {len(costs)} starts, MPC {other}"
-    return Verdict(reason, breaks, above_mpc, is_sure, hopeless)
+    above |= bool(less[:, LARGEST_EXCESS:].any())
+    return Verdict(reason, breaks, above, is_sure, hopeless)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """No action noise, ever; and the scalars that tensorboard shows."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -179,6 +180,15 @@ def test_what_is_stored_is_what_the_simulator_did() -> None:
             assert (buffer.dones[at, 0], buffer.timeouts[at, 0]) == (over, truncated)
             at += 1
     assert at == buffer.size() - 1 and 0 < sum(buffer.timeouts[:at, 0]) < 8
+
+
+def test_every_other_episode_begins_where_a_candidate_has_lost() -> None:
+    model = build(learning_rate=0.0)
+    model.guard_state = SimpleNamespace(evidence=SimpleNamespace(to_learn=(77, 78)))
+    learnt(model, 1, SimulatedEpisodes(Slide, per_episode=40))
+    begins = model.replay_buffer.observations[: 40 * STEPS : STEPS, 0, 0].tolist()
+    count = [begins.count(Slide().reset(seed=seed)[0][0]) for seed in (77, 78)]
+    assert min(count) > 3 and 10 < sum(count) < 30
 
 
 def test_a_run_that_is_cut_off_goes_on_where_it_was() -> None:

@@ -149,6 +149,16 @@ def test_whoever_is_less_safe_is_refused_whatever_it_costs(now, before, why) -> 
     assert verdict.breaks_limit == (bool(why) and "moves too far" not in why)
 
 
+def test_a_policy_nearer_to_a_bound_than_the_mpc_does_not_tighten_it() -> None:
+    mpc, inside, farther = (
+        Scores(np.array([cost]), columns(excess))
+        for cost, excess in ((3.0, [0.04] * 5), (2.0, []), (1.0, [0.06] * 5))
+    )
+    assert no_worse(mpc._replace(costs=np.ones(1)), inside, mpc, STRICT).accepted
+    verdict = no_worse(farther, inside, mpc, STRICT)
+    assert verdict.reason and verdict.above_mpc and not verdict.breaks_limit
+
+
 def test_with_a_cvar_the_worst_starts_count_on_average() -> None:
     mpc = np.full(100, 20.0)
     rule = Tolerance(margin=0.2, cvar_alpha=0.05, typical=20.0)

@@ -297,7 +297,8 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
             f"The env shows {shape} and takes {actions}; theta of the MPC has {problem.n_theta} "
             f"entries {problem.labels()}, and there are {problem.model.n_inputs} inputs. Wrap "
             "the env so that it shows theta: see PastInputs, EstimateState (of outputs) and "
-            "ObserveDisturbance in sb3_yann.wrappers."
+            "ObserveDisturbance in sb3_yann.wrappers; with_extra(mpc, low, high) has signals that "
+            "the model ignores."
         )
     require_theta_order(env, problem)
 

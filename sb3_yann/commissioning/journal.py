@@ -80,6 +80,11 @@ class Record:
                 file.flush()
                 os.fsync(file.fileno())
             self._size += len(line)
+        except OSError as error:
+            raise OSError(
+                f"{self.path} could not be written ({error}). What it holds is whole: make room, "
+                "and the same script goes on from there."
+            ) from error
         finally:
             self._seen = self.path.stat().st_size
 

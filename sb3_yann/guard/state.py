@@ -41,6 +41,7 @@ class Evidence:
     accepted policy has passed, and its scores there. Policies are confirmed on ``new`` starts until
     one loses there; the next one has the seed ``next_seed``. ``reference`` are the costs on all
     known starts but the hard ones of the last accepted policy that has played them, else the MPC's.
+    The last policy that was tried on known starts ``lost`` some, of these seeds.
     """
 
     accepted: ActorCheckpoint
@@ -53,6 +54,12 @@ class Evidence:
     confirmed: tuple[Starts, Scores] | None = None
     new: Starts | None = None
     reference: Array | None = None
+    lost: tuple[int, ...] = ()
+
+    @property
+    def to_learn(self) -> tuple[int, ...]:
+        """Seeds of starts that policies have lost: the hard ones, and those of the last one."""
+        return tuple(dict.fromkeys((*self.starts.seeds[: self.starts.n_hard], *self.lost)))
 
     def mean_cost(self, scores: Scores | None) -> float:
         """Return a policy's mean cost over all known starts but the hard ones; nan without scores.

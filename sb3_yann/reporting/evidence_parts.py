@@ -31,6 +31,7 @@ from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds
 from sb3_yann.control.mpc.misreading import misread_states
 from sb3_yann.evaluation import change_in_percent, plots
 from sb3_yann.guard import Decision
+from sb3_yann.guard.start import OTHER_REWARD
 from sb3_yann.guard.state import summary_of
 from sb3_yann.improvement.improving import fingerprint, of_estimates
 from sb3_yann.reporting.subject import (
@@ -69,7 +70,7 @@ def loops_part(subject: Subject) -> Part:
     policy = loops[OF_POLICY]
     averages = ("mean cost", np.mean), ("median cost", np.median), ("worst cost", np.max)
     values = [(name, float(of(mpc.costs)), float(of(policy.costs))) for name, of in averages]
-    shares = (_stage_costs(subject.problem, each) for each in (mpc, policy))
+    shares = [_stage_costs(subject.problem, each) for each in (mpc, policy)]
     parts = zip(("states", "inputs off their rest", "moves of inputs"), *shares, strict=True)
     values += [(f"mean stage cost of {name}", *both) for name, *both in parts if any(both)]
     rows = [[name, f"{old:.6g}", f"{new:.6g}", _change(old, new)] for name, old, new in values]
@@ -84,7 +85,13 @@ def loops_part(subject: Subject) -> Part:
     seeds = f"{first} to {subject.seeds[-1]}" if is_range else ", ".join(map(str, subject.seeds))
     cost = "the sum of the MPC's stage cost: the env gives no reward."
     if is_rewarded(loops):
-        cost = "minus the sum of the rewards."
+        cost = "minus the sum of the rewards"
+        own = sum(shares[0])
+        if abs(mpc.costs.mean() - own) > OTHER_REWARD * abs(own):
+            cost += (
+                f", which is not the MPC's stage cost: that is {own:.6g} on average with the MPC"
+            )
+        cost += "."
     how = (
         f"{count} episodes of {subject.env_name}, seeds {seeds}, each played by the MPC "
         "and by the policy from the same start, without any noise of actions. A cost is "

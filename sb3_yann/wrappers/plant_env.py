@@ -94,8 +94,9 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
             what = "The observation" if observation is None else "What the map makes of it"
             raise ValueError(
                 f"{what} has shape {shape}, but theta = [{', '.join(problem.labels())}] has "
-                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order, or "
-                "pass observation=AffineObservation(matrix, offset)."
+                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order; "
+                "pass observation=AffineObservation(matrix, offset); or take with_extra(mpc, low, "
+                "high), whose theta has signals that the model ignores."
             )
         if observation is None:
             require_theta_order(env, problem)

@@ -75,19 +75,3 @@ def test_the_polynomials_of_the_nmpc_end_where_the_plant_does(name):
     end = low[:n] + width[:n] * np.array(sample(s, v, inner)[0]).ravel()
     wanted = plant.advance(plant.x0, low[n:] + width[n:] * v)
     np.testing.assert_allclose(end, wanted, atol=2e-4 * width[:n].max())
-
-
-@needs_pcgym
-def test_a_rival_sees_its_own_scale():
-    case = pcgym.Case("cstr")
-    env = pcgym.scaled("cstr")
-    shown, _ = env.reset(seed=3)
-    theta, _ = case.env().reset(seed=3)
-
-    class Model:
-        def predict(self, seen, deterministic):
-            assert deterministic and np.allclose(seen, shown, atol=1e-6)
-            return np.array([0.5], np.float32), None
-
-    u = pcgym.Rival(Model(), case)(theta)
-    assert np.allclose(u, 295 + 0.75 * 7)

@@ -13,8 +13,7 @@ import torch
 
 import experiments
 from experiments import runner
-from experiments.__main__ import BEGIN, END, main
-from experiments.markdown import quote
+from experiments.__main__ import main
 from experiments.measures import rows_of
 from experiments.results import in_short, write_report
 from experiments.runner import Outcome, Run, RunsFailed, load_all, run_all
@@ -124,17 +123,6 @@ def test_the_command_reports_what_failed(catalog, tmp_path, capsys) -> None:
     assert "3 of 4 runs" in said
     assert (tmp_path / "docs/results.md").exists()
     assert main(["--report-only", "--results", "elsewhere.sqlite"]) == 0
-
-
-def test_the_readme_gets_the_short_table_between_its_marks(tmp_path) -> None:
-    readme = tmp_path / "README.md"
-    readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n", encoding="utf-8")
-    assert quote("| new |", readme, BEGIN, END)
-    assert readme.read_text(encoding="utf-8") == f"before\n{BEGIN}\n| new |\n\n{END}\nafter\n"
-    readme.write_text("nothing to replace", encoding="utf-8")
-    assert not quote("| new |", readme, BEGIN, END)
-    assert readme.read_text(encoding="utf-8") == "nothing to replace"
-    assert not quote("| new |", tmp_path / "missing.md", BEGIN, END)
 
 
 def row_of(outcomes, plant: str, episodes: int, learner: str):
