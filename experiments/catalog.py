@@ -235,7 +235,7 @@ CHANGES: dict[str, dict[str, Any]] = {
         "n_steps": 10,
         "gradient_steps": 4,
         "simulated": True,
-        "guard": {"patience": 10, "keep_if_worse": True},
+        "guard": {"patience": 10, "keep_if_worse": True, "rule": {"least_gain": 0.0}},
     },
 }
 """What is changed of YANN-RL, one thing at a time."""

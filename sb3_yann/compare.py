@@ -69,8 +69,9 @@ class AcceptanceRule:
         Probability that the final trial accepts a policy that is no better on average over all
         starts.
     least_gain : float, default 0.001
-        What the final trial must gain on average, as a fraction of the MPC's mean cost. What gains
-        less changes nothing. A strict rule, ``cvar_alpha=0``, takes any gain.
+        What the final trial must gain on average, as a fraction of the MPC's mean cost, and a
+        candidate over what was accepted before, else it changes nothing. 0 takes any gain, as a
+        strict rule does, ``cvar_alpha=0``; a guard then plays more.
     max_input_step : float, optional
         How far an input may move from one sample to the next, in multiples of the MPC's largest
         step on the known starts, at least 1. The default is no bound.

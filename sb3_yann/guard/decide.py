@@ -19,6 +19,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, message_of
 from sb3_yann.compare import (
+    TOO_LITTLE,
     AcceptanceRule,
     NewSeeds,
     PairedTrial,
@@ -97,16 +98,18 @@ def decide(
     reason = verdict.reason
     share = float(verdict.accepted)
     hopeless = verdict.breaks_limit or (verdict.above_mpc and not settings.keep_if_worse)
-    rejections = evidence.rejections + 1 if reason else 0
+    # What is as good as the accepted policy costs no patience.
+    rejections = evidence.rejections + (TOO_LITTLE not in reason) if reason else 0
     restored = bool(reason) and (rejections >= settings.patience or hopeless)
     # Candidates that follow each other are alike: parts of the first and of the last are tried.
-    if reason and not diverged and (restored or rejections == 1):
+    if reason and not diverged and TOO_LITTLE not in reason and (restored or rejections == 1):
         for part, its_share in _parts(before, candidate, tried.scores, tried.others, rule):
             found = _accept(after, part, play, settings)
             after = found.evidence
             if found.verdict.accepted:
                 share = its_share
-                break
+            if found.verdict.accepted or TOO_LITTLE in found.verdict.reason:
+                break  # a smaller part gains less
     after = replace(after, rejections=0 if restored else rejections)
     regions = _accepted_regions(before, candidate, after.accepted) if reason else []
     return after, _decision(after, tried.cost, tried.played, reason, restored, regions, share)
@@ -214,13 +217,15 @@ def try_on_known(
             evidence = evidence.known_up_to(count, play)
             level = level_of_look(settings.rule.significance, look)
             accepted = evidence.scores.at(slice(count))
-            verdict = trial.verdict(level, accepted)
+            verdict = trial.verdict(level, accepted, least_gain=settings.least_gain)
             if verdict.is_hopeless or (verdict.accepted and verdict.is_sure):
                 break
     except Unplayable as error:
         return evidence, None, Verdict(str(error), breaks_limit=True)
     lost = np.flatnonzero(known.lost(trial.scores))
     evidence = replace(evidence, lost=tuple(known.seeds[i] for i in lost))
+    if verdict.accepted and verdict.is_hopeless:
+        verdict = verdict._replace(reason=f"{TOO_LITTLE} over the accepted policy")
     return evidence, trial.scores, verdict
 
 
