@@ -180,8 +180,9 @@ class SimulatedEpisodes(BaseCallback):
     When training begins, and after each training episode, the policy as it is plays episodes in
     envs of its own, with noise and step tests. Their steps join those of the training env in the
     replay buffer, and none of its episodes changes. A simulator shows without harm what lies beyond
-    other actions; the guard decides what is accepted. Every other episode begins where a candidate
-    has lost under the guard, by the seeds of these starts.
+    other actions; the guard decides what is accepted. Half of the episodes, by chance, begin at its
+    hard starts or where the last policy that it tried has lost: at their seeds, which are the same
+    starts in the same simulator.
 
     Parameters
     ----------

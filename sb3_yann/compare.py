@@ -70,8 +70,8 @@ class AcceptanceRule:
         starts.
     least_gain : float, default 0.001
         What the final trial must gain on average, as a fraction of the MPC's mean cost, and a
-        candidate over what was accepted before, else it changes nothing. 0 takes any gain, as a
-        strict rule does, ``cvar_alpha=0``; a guard then plays more.
+        candidate over what was accepted before: one that surely gains less changes nothing. 0 takes
+        any gain, as a strict rule does, ``cvar_alpha=0``; a guard then plays more.
     max_input_step : float, optional
         How far an input may move from one sample to the next, in multiples of the MPC's largest
         step on the known starts, at least 1. The default is no bound.
@@ -130,11 +130,11 @@ RULE = AcceptanceRule()  # by which policies from a twin, a simulator or a plant
 class Verdict(NamedTuple):
     """Whether a policy is no worse, and whether more starts would change that.
 
-    The reason is empty where it is accepted. ``breaks_limit``: it violates a limit of the env, ends
-    sooner or is not finite: then there is no patience. ``above_mpc``: its mean cost is above the
-    MPC's, or its excess over a bound. ``is_sure``: its mean cost is surely lower, at the level that
-    was asked for.
-    ``is_hopeless``: more starts would hardly show a gain that counts.
+    The reason is empty where it is accepted. ``breaks_limit``: it violates a limit of the env, or
+    ends sooner, where the policy before does not, or is not finite: then there is no patience.
+    ``above_mpc``: its mean cost is above the MPC's, or its excess over a bound. ``is_sure``: its
+    mean cost is surely lower, at the level that was asked for. ``is_hopeless``: more starts would
+    hardly show a gain that counts.
     """
 
     reason: str = ""
@@ -351,12 +351,13 @@ def no_worse(
     ``tail_errors``, standard errors of the worst starts' average, count as well.
     """
     names = range(len(mpc.costs)) if names is None else names
+    less = less_safe(policy.unsafe, accepted.unsafe, tolerance.excess_room)
+    breaks = bool(less[:, :INPUT_STEP].any())
     # Neither is exceeded: a tolerance over the accepted policy alone would add up. Of a bound the
     # MPC's excess is: a policy that happens to stay nearer to it does not tighten the limit.
     allowed = np.minimum(accepted.unsafe, mpc.unsafe)
-    allowed[:, LARGEST_EXCESS:MISSING] = mpc.unsafe[:, LARGEST_EXCESS:MISSING]
+    allowed[:, LARGEST_EXCESS:ANY_BOUND] = mpc.unsafe[:, LARGEST_EXCESS:ANY_BOUND]
     less = less_safe(policy.unsafe, allowed, tolerance.excess_room)
-    breaks = bool(less[:, :INPUT_STEP].any())
     costs = policy.costs[n_hard:]
     of_mpc = mpc.costs[n_hard:]
     tolerance = replace(tolerance, saved=float(np.mean(of_mpc - costs)) if len(costs) else 0.0)

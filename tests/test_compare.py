@@ -150,11 +150,12 @@ def test_whoever_is_less_safe_is_refused_whatever_it_costs(now, before, why) -> 
 
 
 def test_a_policy_nearer_to_a_bound_than_the_mpc_does_not_tighten_it() -> None:
-    mpc, inside, farther = (
+    riding, inside, farther = (
         Scores(np.array([cost]), columns(excess))
         for cost, excess in ((3.0, [0.04] * 5), (2.0, []), (1.0, [0.06] * 5))
     )
-    assert no_worse(mpc._replace(costs=np.ones(1)), inside, mpc, STRICT).accepted
+    mpc = riding._replace(costs=np.full(1, 4.0))
+    assert no_worse(riding, inside._replace(costs=mpc.costs), mpc, STRICT).accepted
     verdict = no_worse(farther, inside, mpc, STRICT)
     assert verdict.reason and verdict.above_mpc and not verdict.breaks_limit
 

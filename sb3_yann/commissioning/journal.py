@@ -82,8 +82,9 @@ class Record:
             self._size += len(line)
         except OSError as error:
             raise OSError(
-                f"{self.path} could not be written ({error}). What it holds is whole: make room, "
-                "and the same script goes on from there."
+                error.errno,
+                f"{self.path} could not be written ({error.strerror}). What it holds is whole: "
+                "mend that, and the same script goes on from there.",
             ) from error
         finally:
             self._seen = self.path.stat().st_size

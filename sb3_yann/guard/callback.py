@@ -127,7 +127,8 @@ class ImprovementGuard(BaseCallback):
         Refusals in a row until the accepted policy is restored. Until then the candidate plays on.
     keep_if_worse : bool, default False
         Whether patience holds where the mean cost is above the MPC's, or a bound of its problem is
-        exceeded farther. After a violation that the env reports there is none in any case.
+        exceeded farther. After a violation that the env reports, as `StageCost` does each excess,
+        there is none in any case.
     rule : AcceptanceRule or mapping, optional
         When a candidate counts as no worse.
     step_size : StepSize or mapping, optional

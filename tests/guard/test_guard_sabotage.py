@@ -301,7 +301,7 @@ def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) 
     guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=4, n_final_starts=4, rule=rule)
     model.learn(24, callback=[NoActionNoise(), At([6], push), guard])
     log = evaluate(model, make, range(20, 24))
-    assert guard.decisions[0].verdict == "rejected"
+    assert guard.decisions[0].verdict == "rejected" and guard.decisions[0].restored
     named = "speed exceeds its bound by"
     if kind == "soft states":
         named = "more than with the MPC: speed exceeds its soft bound by"
