@@ -436,7 +436,7 @@ def _in_units(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[Parame
 
 
 def steepness(program: ParametricQP, u_min: Array, u_max: Array) -> float:
-    """Return how many times what a default penalty lets them the slacks of a program cost."""
+    """Return how many times as much as by a default penalty the slacks of a program cost."""
     ratio, _ = slack_costs(_in_units(program, u_min, u_max)[0])
     return float(ratio.max()) / STEEP
 

@@ -307,6 +307,8 @@ def test_where_an_env_gives_no_reward_the_stage_cost_counts() -> None:
     subject = subject_of(model, env=lambda: TransformReward(Slide(), lambda reward: 0.0))
     text = unescape(str(evidence_parts.loops_part(subject).content))
     assert "the sum of the MPC's stage cost: the env gives no reward" in text
+    text = unescape(str(evidence_parts.loops_part(subject_of(model, env=Slide)).content))
+    assert "the rewards, which is not the MPC's stage cost" in text
     cost = model.policy.problem.stage_cost
     for who, act in (("MPC", guard_samples.LAW), ("policy", model)):
         played = evaluate(act, Slide, subject.seeds)
