@@ -258,10 +258,16 @@ class Log:
         labels: list[str] = []
         columns: list[Array] = []
         for of, letter in (("state", "x"), ("input", "u"), ("disturbance", "d")):
-            part = np.concatenate([getattr(each, f"{of}s") for each in records])
-            labels += names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(part.shape[1])]
-            columns += [*part.T]
-        _warn_of_marks(labels, columns)
+            parts = [getattr(each, f"{of}s") for each in records]
+            whole = np.concatenate(parts)
+            own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(whole.shape[1])]
+            whole = _without_marks(own, whole)
+            cut = np.split(whole, np.cumsum([len(each) for each in parts])[:-1])
+            records = [
+                replace(each, **{f"{of}s": part}) for each, part in zip(records, cut, strict=True)
+            ]
+            labels += own
+            columns += [*whole.T]
         _warn_of_other_units(labels, columns, records[0].states.shape[1])
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
@@ -491,20 +497,24 @@ def _name_and_unit(header: str) -> tuple[str, str]:
     return (name.strip(), unit.strip()) if bracket and header.endswith("]") else (header, "")
 
 
-def _warn_of_marks(names: Sequence[str], columns: Sequence[Array]) -> None:
-    """Warn where a column holds what historians write for no reading, far from all else."""
-    for name, column in zip(names, columns, strict=True):
+def _without_marks(names: Sequence[str], values: Array) -> Array:
+    """Return values (N, k) with NaN for what historians write for no reading, far from all else."""
+    values = values.copy()
+    for name, column in zip(names, values.T, strict=True):
         marks = np.isin(np.trunc(column), NO_READING)
         rest = column[~marks & np.isfinite(column)]
         if not (marks.any() and len(rest)):
             continue
-        far = np.abs(column[marks] - np.median(rest)) > 10 * np.ptp(rest)
+        least = np.maximum(10 * np.ptp(rest), np.abs(column) / 2)
+        far = marks & (np.abs(column - np.median(rest)) > least)
         if far.any():
             warn(
-                f"{name} of the log is {column[marks][far][0]:g} in {np.count_nonzero(far)} rows, "
-                "far from all others. If that stands for no reading, leave these cells empty, or "
-                "NaN."
+                f"{name} of the log is {column[far][0]:g} in {np.count_nonzero(far)} rows, far "
+                "from all others: taken for no reading, the log is cut there. Leave such cells "
+                "empty, or NaN."
             )
+            column[far] = np.nan
+    return values
 
 
 UNITS = (

@@ -146,7 +146,9 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
 def test_a_mark_for_no_reading_is_named(write) -> None:
     given = {"states": ["T"], "inputs": ["valve"], "dt": 10, "episode": "run"}
     with pytest.warns(UserWarning, match="T of the log is -999.25 in 2 rows, far from all others"):
-        Log.from_csv(write(CSV.replace(",24,", ",-999.25,").replace(",27,", ",-999.25,")), **given)
+        marked = write(CSV.replace(",24,", ",-999.25,").replace(",27,", ",-999.25,"))
+        log = Log.from_csv(marked, **given)
+    assert log.lost_steps and min(each.states.min() for each in log.episodes) > 0  # no reading
     Log.from_csv(write(CSV.replace(",24,", ",999,").replace(",27,", ",900,")), **given)  # no mark
 
 

@@ -83,8 +83,8 @@ class Record:
         except OSError as error:
             raise OSError(
                 error.errno,
-                f"{self.path} could not be written ({error.strerror}). What it holds is whole: "
-                "mend that, and the same script goes on from there.",
+                f"{self.path} could not be written ({error.strerror or error}). What it holds is "
+                "whole: mend that, and the same script goes on from there.",
             ) from error
         finally:
             self._seen = self.path.stat().st_size

@@ -345,7 +345,9 @@ def _with_sources(problem: LinearMPC) -> list[str]:
     labels = [*problem.labels()]
     layout = problem.layout
     for i, name in enumerate(layout.names):
-        if layout.disturbance.start <= i < layout.disturbance.stop:
+        if i in problem.extra:
+            labels[i] += " (a signal that the law ignores)"
+        elif layout.disturbance.start <= i < layout.disturbance.stop:
             is_estimated = int(name[:-1].partition("[")[2]) in problem.model.estimated
             who = "observer" if is_estimated else "sensor or observer"
             labels[i] += f" ({'estimated by' if is_estimated else 'from'} the caller's {who})"

@@ -84,7 +84,7 @@ def test_dead_time_is_told_from_order() -> None:
     a = np.array([[0.9, 0.2], [-0.2, 0.9]])
     b = np.array([[0.0], [0.5]])
     c = np.array([[1.0, 0.5]])
-    u = steps(800, 1, 2)
+    u = steps(700, 1, 2)
     found = identify_outputs(played(u, a, b, c, 3, delay=5), u, dt=1)
     assert (found.order, found.delays, found.model.n_states) == (2, (5,), 7)
     prompt = identify_outputs(played(u, a, b, c, 3), u, dt=1)
@@ -236,14 +236,14 @@ def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
 
 
 def test_a_slow_output_hides_dead_time_only_if_it_answers_sooner() -> None:
-    u = steps(1200, 1, 2)
+    u = steps(700, 1, 2)
     b = np.array([[0.3], [0.0], [0.5]])
     y = played(u, A, b, C, 3, delay=5)
     y[np.arange(len(y)) % 10 > 0, 1] = np.nan
-    assert identify_outputs(y, u, dt=1).delays == (5,)
+    assert identify_outputs(y, u, dt=1, order=3).delays == (5,)
     y[::10, 1] = played(u, A, b, C, 4)[::10, 1]
-    assert identify_outputs(y, u, dt=1).delays == (0,)
-    alone = identify_outputs(y[:, 1:], u, dt=1)
+    assert identify_outputs(y, u, dt=1, order=3).delays == (0,)
+    alone = identify_outputs(y[:, 1:], u, dt=1, order=3)
     assert (alone.every, alone.delays) == ((10,), (0,)) and alone.long_fit > 80
 
 
