@@ -46,6 +46,7 @@ WEIGHTS = 0.1, 10.0  # factors of weights of the MPC, for laws that are tried in
 CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
 DIFFERENCE = 1e-4  # half-widths of theta over which slopes of a feedback are taken
+KEPT_SETS = 64  # of starts, whose members lie in one array
 PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new one
 
 
@@ -71,6 +72,8 @@ class TwinPlant:
         key = rows.tobytes()
         every = self.dynamics
         if key not in self._known:
+            if len(self._known) == KEPT_SETS:  # networks take memory
+                self._known.clear()
             chosen = tuple(every.members[self.members[row]] for row in rows)
             self._known[key] = Dynamics(every.problem, every.coordinates, chosen)
         return self._known[key]

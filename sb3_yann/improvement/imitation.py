@@ -16,13 +16,14 @@ from sb3_yann._validation import Array, Feedback, Mask
 from sb3_yann.compare import RULE, Scores, less_safe, no_worse, relative_costs
 from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation import change_in_percent
-from sb3_yann.improvement.simulator import Imagined, Scenarios, of_law, task_of
+from sb3_yann.improvement.simulator import Family, Imagined, Scenarios, of_law, task_of
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.plan import PAUSE, SETTLED, Planning, Plans, follow, slopes_of_inputs
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Controller, Rows
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.env import LearntModel
+from sb3_yann.twin.plant_twin import PlantTwin
 
 BATCH = 512  # rows in a step of Adam
 RATE = 1e-2  # of Adam at first; it falls to zero
@@ -40,6 +41,7 @@ DESCENT_ROWS = 48_000  # steps of episodes whose slopes each of these follows, a
 MOVE = 0.1  # of an action in the first of these, root mean square
 LONGER = 1.5  # times the last one's is the next, where the policy got better; else half of it
 SHORTEST_MOVE = 0.02  # so small a one ends the descent
+FINER = 4  # times as many steps, and as small ones, where a policy cannot know what plans do
 FARTHEST = 3.0  # moves of an action, in times their root mean square
 STEEPEST = 10.0  # slopes of an episode, in times the median's, at most
 NEARLY = 0.5
@@ -63,7 +65,7 @@ class Teacher:
     changes of references nor disturbances before they come. ``best`` (k,) is the least cost that a
     plan or the MPC had in each scenario. The first ``n_planned`` are planned, by default all; the
     others where a policy turns out to lack much. Policies promise what they save in the first
-    ``n_usual`` ones.
+    ``n_usual`` ones. In a :class:`Family` lost starts count ``caution`` times as much as usual.
     """
 
     def __init__(
@@ -72,8 +74,10 @@ class Teacher:
         seed: int,
         n_planned: int | None = None,
         n_usual: int | None = None,
+        caution: float = 1.0,
     ) -> None:
         self.scenarios = scenarios
+        self.caution = caution
         self.planned = slice(n_planned)
         self.usual = slice(n_usual)
         self.rng = np.random.default_rng([seed, 4])
@@ -105,15 +109,21 @@ class Teacher:
         more = costs[part][finite] - mpc
         return float(-relative_costs(more, mpc).mean()) if finite.any() else 0.0
 
-    def score(self, costs: Array) -> float:
+    def score(self, costs: Array, price: float = 0.0, room: Array | float = 0.0) -> float:
         """Return what costs (k,) are below the MPC's in all scenarios, by which fits are ranked.
 
-        A start counts as lost once at most: else one that falls would hide all the others.
+        A start counts as lost once at most: else one that falls would hide all the others. What it
+        costs more than the MPC and a ``room`` counts ``price`` times besides.
         """
         with np.errstate(invalid="ignore"):
-            more = relative_costs(costs - self.mpc.costs, self.mpc.costs)
-        more = np.nan_to_num(more, nan=0.0, posinf=1.0, neginf=-1.0)
-        return float(-np.minimum(more, 1.0).mean())
+            more, lost = (
+                np.minimum(np.nan_to_num(each, nan=0.0, posinf=1.0, neginf=-1.0), 1.0)
+                for each in (
+                    relative_costs(costs - self.mpc.costs - least, self.mpc.costs)
+                    for least in (0.0, room)
+                )
+            )
+        return float(-more.mean() - price * np.maximum(lost, 0.0).mean())
 
     def show(self, act: Feedback | None = None, played: Imagined | None = None) -> None:
         """Plan the scenarios; those that a policy ``played``, from where it had got to.
@@ -244,10 +254,12 @@ def imitate(
     promised = 0.0
     since = 0
     best = copy.deepcopy(layer.state_dict())
-    descends = teacher.scenarios.members is None
+    model = teacher.scenarios.model
+    descends = not isinstance(model, PlantTwin)
     mpc = teacher.mpc.costs
     better = np.any(mpc - teacher.best > SETTLED * np.abs(mpc))
-    for fit in range(FITS if better or not descends else 0):
+    imitates = not descends or (better and not isinstance(model, Family))
+    for fit in range(FITS if imitates else 0):
         teacher.teach(layer, updates)
         played = teacher.play(layer)
         score = teacher.score(played.costs)
@@ -285,7 +297,8 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     what is expected at theta: plans know no set-point before it comes, a policy learns what usually
     follows. Starts that cost more than they may have a price, which rises while the rule of
     acceptance objects: a method of multipliers. The layer ends with what that rule lets through,
-    and of that with what costs the least.
+    and of that with what costs the least. In a :class:`Family` a policy cannot serve each start as
+    its own plan does: the price stays, and counts in what costs the least.
     """
     scenarios = teacher.scenarios
     mpc = teacher.mpc.costs
@@ -293,30 +306,35 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     if not len(known):
         return 0.0
     room = NEARLY * RULE.tolerance(mpc[known]).allowed(mpc)
-    price = PRICE
-    size = MOVE
+    is_family = isinstance(scenarios.model, Family)
+    price = PRICE * (teacher.caution if is_family else 1.0)
+    finer = FINER if is_family else 1
+    size = MOVE / finer
+    weight = 0.0
+    last = teacher.mpc
     most = (False, -np.inf)
-    score = -np.inf
     what = "the policy descends in the model: steps, at most"
-    for k in bar(what, range(DESCENTS + 1), timed=True):
+    for k in bar(what, range(finer * DESCENTS + 1), timed=True):
         played = teacher.play(layer)
-        passes = not teacher.objection(played, NEARLY)  # new starts lose more
-        rank = passes, teacher.score(played.costs)
+        passes = is_family or not teacher.objection(played, NEARLY)  # new starts lose more
+        rank = passes, teacher.score(played.costs, price * is_family, room)
         if rank > most:
             most = rank
             saved = teacher.saved(played.costs, teacher.usual)
             best = copy.deepcopy(layer.state_dict())
-        slow = passes and 0 < rank[1] - score < NEAR / 2 * score and teacher.is_near(played.costs)
-        if rank[1] > score:
-            score = rank[1]
+        score = teacher.score(played.costs, weight, room)
+        gained = score - teacher.score(last.costs, weight, room) if k else np.inf
+        slow = passes and 0 < gained < NEAR / 2 * score and teacher.is_near(played.costs)
+        if gained > 0:
             objects = not passes
             present = copy.deepcopy(layer.state_dict())
             last = played
             size *= LONGER if k else 1.0
+            weight = price * bool(is_family and np.any(last.costs > mpc + room))
         else:
             layer.load_state_dict(present)
             size /= 2
-        if k == DESCENTS or size < SHORTEST_MOVE or slow:
+        if k == finer * DESCENTS or size < SHORTEST_MOVE / finer or slow:
             break
         if objects:
             price *= 2

@@ -41,6 +41,7 @@ from sb3_yann.improvement.confirmation import (
 from sb3_yann.improvement.imitation import Teacher, controller_of, imitate, policy_of, refit_critic
 from sb3_yann.improvement.simulator import (
     Excited,
+    Family,
     OutOfStepsError,
     Scenarios,
     Simulator,
@@ -65,6 +66,7 @@ from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.units import FLOAT32_ROUNDING
 
 LEAST = 2e-4  # what a policy must gain in a twin, relative to the MPC's mean cost
+CAUTION = 8.0  # times as much as before count lost starts after each refusal on new ones
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
 PROMISED = 0.95  # share of a gain in the model that the simulator must show from the same starts
 LITTLE_MORE = 0.02  # share of a gain by which another round must raise it
@@ -655,14 +657,25 @@ class _Work:
         aside = simulator.rests_aside
         return Improvement(checks, change, accepted, before, *where, note=note, rests_aside=aside)
 
+    def _model(self, simulator: Simulator, number: int) -> LearntModel:
+        """Return a model of all episodes so far; the first family is fitted to more of them."""
+        seed = self.seed + number
+        given = self.problem, simulator.episodes, simulator.row.estimator, seed
+        model = Family.of(model_of(*given), seed)
+        left = simulator.affordable() - most_episodes(self.rounds)
+        if number or left <= 0 or not isinstance(model, Family):
+            return model
+        more = min(2 * simulator.usual, left)
+        simulator.excite(more)
+        self.say(f"a constant that no reading shows: {more} more episodes with random inputs")
+        return Family.of(model_of(*given), seed)
+
     def _taught(
         self, simulator: Simulator, lost: list[Any], number: int
     ) -> tuple[LearntModel, Teacher]:
         """Return a model of all episodes so far, and plans in it: of what was lost first."""
         self.say(f"a model of {len(simulator.episodes)} episodes, and {self.n_starts} plans in it")
-        model = model_of(
-            self.problem, simulator.episodes, simulator.row.estimator, self.seed + number
-        )
+        model = self._model(simulator, number)
         self.confine_to(model)
         order = self.rng.permutation(len(simulator.episodes))
         # Twice each: as it began, and elsewhere with the same references.
@@ -672,7 +685,9 @@ class _Work:
         others = [simulator.episodes[i] for i in drawn]
         midway = len(others) // 2
         scenarios = Scenarios.like(model, chosen + others, self.rng, midway)
-        teacher = Teacher(scenarios, self.seed + number, len(chosen), len(scenarios) - midway)
+        caution = CAUTION ** max(0, number + 1 - self.rounds)
+        sizes = len(chosen), len(scenarios) - midway
+        teacher = Teacher(scenarios, self.seed + number, *sizes, caution)
         teacher.show(self.act() if number else None)
         return model, teacher
 

@@ -35,7 +35,7 @@ from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of, play
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import SHORTEST, Episode, observer_of
 from sb3_yann.twin.row_layout import RowLayout
-from sb3_yann.twin.selection import fit_ensemble
+from sb3_yann.twin.selection import fit_ensemble, fit_family
 from sb3_yann.wrappers.theta import SetPoint, below
 
 FIRST = 3_000_000  # seed of the first episode: far from those that people try first
@@ -361,6 +361,7 @@ class Excited:
 
 MEMBERS = 2  # networks of a model of a simulator, which repeats its steps
 NOISE = 0.01  # standard deviations of the states: what errs less in most steps has no noise
+EXPLAINED = 0.03  # share of the errors' squares that hidden constants leave, at most
 LACKING = 0.5  # share of the errors of neighboring steps that is not alike: more is noise
 DOUBT = 10.0  # mean costs of a step for members that differ by a standard deviation of a state
 
@@ -387,13 +388,48 @@ def model_of(
     return LearntModel(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
 
 
+class Family(LearntModel):
+    """A model whose members differ by a constant that no reading shows, such as a feed's strength.
+
+    There is one for each seed of its episodes.
+    """
+
+    @classmethod
+    def of(cls, model: LearntModel, seed: int) -> LearntModel:
+        """Return a family of a model's episodes if it explains them clearly better, else the model.
+
+        Loads that last are no reason: what was missed of an episode comes again in each scenario.
+        """
+        if lacks(model) != (True, False):
+            return model
+        coordinates = model.dynamics.coordinates
+        episodes = model.episodes
+        members = tuple(fit_family(coordinates, episodes, seed))
+        found = cls(model.problem, episodes, Dynamics(model.problem, coordinates, members))
+        before = [missed_of(model, each) for each in episodes]
+        left = sum(np.sum(((each - each.mean(axis=0)) / coordinates.units) ** 2) for each in before)
+        now = sum(np.sum((missed_of(found, each) / coordinates.units) ** 2) for each in episodes)
+        return found if now <= EXPLAINED * left else model
+
+    def member_of(self, episode: Episode) -> int:
+        """Return the number of the member that predicts an episode best."""
+        errors = _missed(self.dynamics, episode) / self.dynamics.coordinates.units
+        return int(np.argmin(np.mean(errors**2, axis=(1, 2))))
+
+
 def missed_of(model: LearntModel, episode: Episode) -> Array:
     """Return what a model misses of the states after each step of an episode, (T, n)."""
-    dynamics = model.dynamics
+    missed = _missed(model.dynamics, episode)
+    if isinstance(model, Family):
+        return np.asarray(missed[model.member_of(episode)])
+    return np.asarray(missed.mean(axis=0))
+
+
+def _missed(dynamics: Dynamics, episode: Episode) -> Array:
+    """Return what each member misses of the states after each step, (members, T, n)."""
     part = dynamics.row.state
-    rows = episode.thetas[:-1]
     after = episode.thetas[1:, part]
-    predicted = TwinPlant(dynamics).advance(rows, episode.actions, np.arange(len(rows)))[:, part]
+    predicted = dynamics.step(episode.thetas[None, :-1], episode.actions[None])[..., part]
     return np.asarray(after - dynamics.coordinates.nearest(predicted, after))
 
 
@@ -539,13 +575,16 @@ class Scenarios:
             e.thetas[np.minimum(t + np.arange(steps), len(e)), row.given]
             for e, t in zip(episodes, first, strict=True)
         ]
+        members = None
+        if isinstance(model, Family):
+            members = np.array([model.member_of(each) for each in episodes])
         missed = None
         if row.estimator is not None:
             of_each = {id(e): missed_of(model, e) for e in episodes}
             missed = np.zeros((steps, len(episodes), n))
             for i, (e, t) in enumerate(zip(episodes, first, strict=True)):
                 missed[: len(e) - t, i] = of_each[id(e)][t:]
-        return cls(model, None, row.begin(thetas), np.stack(given, axis=1), missed)
+        return cls(model, members, row.begin(thetas), np.stack(given, axis=1), missed)
 
     @cached_property
     def plant(self) -> TwinPlant:

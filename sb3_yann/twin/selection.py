@@ -33,6 +33,10 @@ HIDDEN = 48  # units in each of two hidden layers
 CURVATURES = 50  # pairs that L-BFGS remembers
 WINDOWS = 32  # windows of a log in a step of Adam
 FIT_RATE = 1e-3  # of Adam at first; it falls to zero
+UPDATES = 3000  # of a fit, see `fit_ensemble`
+FAMILY_UPDATES = 1000  # iterations of the fit of a family
+CONSTANTS = 2  # numbers that a fit of a family takes to differ from seed to seed
+UNSEEN = 0.1  # size of the hidden constants that a fit begins with, in standard deviations
 
 RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
 
@@ -43,7 +47,7 @@ def fit_ensemble(
     seed: int,
     *,
     ahead: int = 1,
-    updates: int = 3000,
+    updates: int = UPDATES,
 ) -> list[Residual]:
     """Return one network for each log, all fitted at once.
 
@@ -71,11 +75,30 @@ def fit_ensemble(
     return networks.residuals()
 
 
+def fit_family(coordinates: Coordinates, log: Sequence[Episode], seed: int) -> list[Residual]:
+    """Return a network for each seed of a log; they differ by constants that no reading shows.
+
+    One network takes these beside all else. Both are fitted at once, from small random
+    numbers (P. Bojanowski et al., *Optimizing the latent space of generative networks*, ICML 2018).
+    """
+    names = [e.seed if e.seed is not None else -1 - i for i, e in enumerate(log)]
+    number = np.unique(names, return_inverse=True)[1]
+    of_row = np.repeat(number, [*map(len, log)])
+    parts = zip(*(coordinates.regression(each) for each in log), strict=True)
+    pairs = [[np.concatenate(part) for part in parts]]
+    generator = th.Generator().manual_seed(seed)
+    least = FLOAT32_ROUNDING * coordinates.units
+    networks = _Networks(pairs, None, least, generator, th.float64, of_row)
+    networks.fit_steps(pairs, FAMILY_UPDATES)
+    return networks.residuals()
+
+
 class _Networks:
     """The networks while they are fitted, in standardized coordinates.
 
     Each member is fitted to a pair z (rows, k), y (rows, n), or to the differences of rows that are
-    ``alike`` (pairs, 2); what is smaller in y than ``least`` (n,) is rounding.
+    ``alike`` (pairs, 2); what is smaller in y than ``least`` (n,) is rounding. ``of_row`` (rows,)
+    says which hidden constant acts in a row: a single network then makes a member for each.
     """
 
     def __init__(
@@ -85,8 +108,10 @@ class _Networks:
         least: Array,
         generator: th.Generator,
         dtype: th.dtype,
+        of_row: NDArray[np.intp] | None = None,
     ) -> None:
         self.alike = alike
+        self.of_row = of_row
         self.generator = generator
         self.dtype = dtype
         count = len(pairs)
@@ -107,11 +132,16 @@ class _Networks:
         def zeros(rows: int, columns: int) -> th.Tensor:
             return th.zeros((count, rows, columns), dtype=dtype)
 
-        self.weights = [drawn(k, HIDDEN), zeros(1, HIDDEN), drawn(HIDDEN, HIDDEN)]
+        more = CONSTANTS * (of_row is not None)
+        self.weights = [drawn(k + more, HIDDEN), zeros(1, HIDDEN), drawn(HIDDEN, HIDDEN)]
         mean = self.tensor([y.mean(0, keepdims=True) for _, y in pairs])
         self.weights += [zeros(1, HIDDEN), zeros(HIDDEN, n), mean / self.unit]
         # Scaled as all else: a step of Adam is small beside what it changes, whatever its unit.
-        self.weights.append(self.tensor(linear) * self.width.mT / self.unit)
+        own = self.tensor(linear) * self.width.mT / self.unit
+        self.weights.append(th.cat([own, zeros(more, n)], dim=1))
+        if of_row is not None:
+            size = 1, int(of_row.max()) + 1, CONSTANTS
+            self.weights.append(UNSEEN * th.randn(size, generator=generator, dtype=dtype))
         for each in self.weights:
             each.requires_grad_()
 
@@ -150,7 +180,8 @@ class _Networks:
 
         def loss(flat: Array) -> tuple[float, Array]:
             vector_to_parameters(self.tensor(flat), weights)
-            errors = _network(weights, rows) - wanted
+            constants = [] if self.of_row is None else [weights[7][self.of_row]]
+            errors = _network(weights[:7], th.cat([rows, *constants], dim=1)) - wanted
             if self.alike is not None:
                 errors = errors[self.alike[:, 0]] - errors[self.alike[:, 1]]
             value = (errors**2).mean()
@@ -217,7 +248,15 @@ class _Networks:
     def residuals(self) -> list[Residual]:
         """Return them in scaled coordinates, one by one."""
         with th.no_grad():
-            W1, b1, W2, b2, W3, b3, L = self.weights
+            W1, b1, W2, b2, W3, b3, L = self.weights[:7]
+            if self.of_row is not None:  # constants move the biases of each member
+                constants = self.weights[7].swapaxes(0, 1)  # (members, 1, .)
+                k = W1.shape[1] - CONSTANTS
+                b1 = b1 + constants @ W1[:, k:]
+                b3 = b3 + constants @ L[:, k:]
+                W1, W2, b2, W3, L = (
+                    each.expand(len(b1), -1, -1) for each in (W1[:, :k], W2, b2, W3, L[:, :k])
+                )
             first = W1 / self.width.mT
             L = L * self.unit / self.width.mT
             b1 = b1 - self.center @ first

@@ -143,16 +143,6 @@ def test_a_row_by_hand() -> None:
     assert (row.unsafe_training, row.unsafe_tests) == (3, 0)
 
 
-def test_a_long_run_is_read_at_its_checkpoint() -> None:
-    run = Run("CSTR", "YANN-RL", 0, 200)
-    outcomes = {**reactor(seeds=0), run: learned(OPTIMUM, episodes=200, excess=400.0)}
-    short = row_of(outcomes, "CSTR", 50, "YANN-RL")
-    assert short.median == 190 and short.excess == pytest.approx(100)
-    long = row_of(outcomes, "CSTR", 200, "YANN-RL")
-    assert long.median == 200 and long.excess == pytest.approx(400)
-    assert "YANN-RL" not in {row.learner for row in rows_of(outcomes, "CSTR", 75)}
-
-
 def test_the_short_table_has_a_row_for_each_plant_that_was_learnt() -> None:
     more = {Run("CSTR", "YANN-RL, a simulator explored", 0, 50): learned([91.0, 290.0])}
     _, _, *rows, empty, legend = in_short({**reactor(), **more, **pendulum()}).splitlines()
@@ -243,17 +233,6 @@ def test_a_failing_run_is_reported_and_the_others_are_kept(results, capfd) -> No
 
     assert list(run_all(RUNS, counts, results, jobs=1, progress=False)) == RUNS
     assert done == [RUNS[1]]
-
-
-def test_an_interruption_leaves_what_is_finished(results) -> None:
-    def interrupted(run: Run) -> Outcome:
-        if run.seed == 1:
-            raise KeyboardInterrupt
-        return outcome(run)
-
-    with pytest.raises(KeyboardInterrupt):
-        run_all(RUNS, interrupted, results, jobs=1, progress=False)
-    assert [*load_all(RUNS, results)] == [RUNS[2]]
 
 
 def test_outcomes_of_other_settings_are_not_used(results, monkeypatch) -> None:

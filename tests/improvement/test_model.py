@@ -18,9 +18,11 @@ from sb3_yann.improvement.improving import _Progress, _Work
 from sb3_yann.improvement.simulator import (
     Disagreement,
     Excited,
+    Family,
     Scenarios,
     Simulator,
     lacks,
+    missed_of,
     model_of,
     of_law,
     one_step_error,
@@ -28,6 +30,7 @@ from sb3_yann.improvement.simulator import (
 )
 from sb3_yann.plan import TwinPlant, slopes_of_inputs
 from sb3_yann.rollout import Trajectories
+from sb3_yann.twin import selection
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import Episode
@@ -321,6 +324,38 @@ def test_what_a_model_lacks_is_told_from_noise(noise, bend, wanted) -> None:
     none = Residual.zero(len(box.scale), mpc.model.n_states)
     found = LearntModel(mpc, tuple(episodes), Dynamics(mpc, box, (none, none)))
     assert lacks(found) == wanted
+
+
+@pytest.mark.parametrize(
+    ("gain", "load", "noise"), [(0.5, 0.0, 0.0), (0.5, 0.1, 0.003), (0.0, 0.0, 0.1)]
+)
+def test_a_gain_that_differs_by_episode_makes_a_family_noise_does_not(
+    monkeypatch, gain, load, noise
+) -> None:
+    monkeypatch.setattr(module, "fit_ensemble", partial(fit_ensemble, updates=500))
+    monkeypatch.setattr(selection, "FAMILY_UPDATES", 200)
+    mpc = problem()
+    rng = np.random.default_rng(0)
+    gains = 1 + gain * rng.uniform(-1, 1, 12)
+    episodes = []
+    for number, times in enumerate([*gains, *gains]):  # two of each seed
+        rows = [rng.uniform(-1, 1, mpc.n_theta)]
+        u = rng.uniform(-1, 1, (40, 1))
+        for each in u:
+            after = mpc.deviations.predict(rows[-1], times * each) + load * np.sin(number % 12)
+            rows.append(after + noise * rng.standard_normal(after.shape))
+        episodes.append(Episode(np.array(rows), u, number % 12))
+    plain = model_of(mpc, episodes, None, 0)
+    found = Family.of(plain, 0)
+    if not gain:
+        assert found is plain
+        return
+    left, before = (sum(np.sum(missed_of(m, e) ** 2) for e in episodes) for m in (found, plain))
+    assert isinstance(found, Family) and left < 0.1 * before
+    like = Scenarios.like(found, episodes[:12])
+    acting = [found.dynamics.members[i] for i in like.members]
+    effects = [each.jacobian(np.zeros((1, 3)))[0, 1, -1] for each in acting]
+    assert np.corrcoef(effects, gains)[0, 1] > 0.95
 
 
 def bounded() -> PlantTwin:
