@@ -209,7 +209,8 @@ class Log:
         Parameters
         ----------
         states : array_like, shape (T + 1, n), or a sequence of such
-            Before every input, and after the last one.
+            Before every input, and after the last one. What stands for no reading, such as -9999
+            far from all others, is a gap.
         inputs, disturbances : array_like, shapes (T, m) and (T, d), or sequences of such
             The inputs as they were executed, and what was measured with them.
         dt : float
@@ -257,7 +258,8 @@ class Log:
         dt = check_positive("dt", dt)
         labels: list[str] = []
         columns: list[Array] = []
-        for of, letter in (("state", "x"), ("input", "u"), ("disturbance", "d")):
+        kinds = ("state", "x"), ("input", "u"), ("disturbance", "d"), ("reference", "r")
+        for of, letter in kinds:
             parts = [getattr(each, f"{of}s") for each in records]
             whole = np.concatenate(parts)
             own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(whole.shape[1])]
@@ -266,8 +268,9 @@ class Log:
             records = [
                 replace(each, **{f"{of}s": part}) for each, part in zip(records, cut, strict=True)
             ]
-            labels += own
-            columns += [*whole.T]
+            if of != "reference":
+                labels += own
+                columns += [*whole.T]
         _warn_of_other_units(labels, columns, records[0].states.shape[1])
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
@@ -507,11 +510,11 @@ def _without_marks(names: Sequence[str], values: Array) -> Array:
             continue
         least = np.maximum(10 * np.ptp(rest), np.abs(column) / 2)
         far = marks & (np.abs(column - np.median(rest)) > least)
+        far &= (column < 0) | (np.ptp(rest) > 0)  # else a switch may have these two values
         if far.any():
             warn(
                 f"{name} of the log is {column[far][0]:g} in {np.count_nonzero(far)} rows, far "
-                "from all others: taken for no reading, the log is cut there. Leave such cells "
-                "empty, or NaN."
+                "from all others: taken for no reading. Leave such cells empty, or NaN."
             )
             column[far] = np.nan
     return values

@@ -46,7 +46,7 @@ WEIGHTS = 0.1, 10.0  # factors of weights of the MPC, for laws that are tried in
 CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
 DIFFERENCE = 1e-4  # half-widths of theta over which slopes of a feedback are taken
-KEPT_SETS = 64  # of starts, whose members lie in one array
+KEPT_SETS = 16  # of starts, whose members lie in one array
 PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new one
 
 

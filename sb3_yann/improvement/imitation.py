@@ -246,9 +246,9 @@ def imitate(
     plans or the MPC: from their starts, and from where it had got to (S. Ross, G. Gordon and D.
     Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
     learning*, AISTATS 2011). Starts that it loses count more in the next fit. Then it descends the
-    costs of a simulator's model, see :func:`refine`: at once where no plan beats the MPC. The
-    layer ends with what cost the least. Return what it saves in the model: see
-    :meth:`Teacher.saved`.
+    costs of a simulator's model, see :func:`refine`: at once where no plan beats the MPC, or where
+    plans know what no reading shows, in a :class:`Family`. The layer ends with what cost the least.
+    Return what it saves in the model: see :meth:`Teacher.saved`.
     """
     most = -np.inf
     promised = 0.0
@@ -297,8 +297,9 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     what is expected at theta: plans know no set-point before it comes, a policy learns what usually
     follows. Starts that cost more than they may have a price, which rises while the rule of
     acceptance objects: a method of multipliers. The layer ends with what that rule lets through,
-    and of that with what costs the least. In a :class:`Family` a policy cannot serve each start as
-    its own plan does: the price stays, and counts in what costs the least.
+    and of that with what costs the least. In a :class:`Family`, where a policy cannot serve each
+    start as its own plan does, it ends with what costs the least, the price included, whatever the
+    rule says; the price stays, and steps are finer.
     """
     scenarios = teacher.scenarios
     mpc = teacher.mpc.costs
@@ -322,8 +323,8 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
             most = rank
             saved = teacher.saved(played.costs, teacher.usual)
             best = copy.deepcopy(layer.state_dict())
-        score = teacher.score(played.costs, weight, room)
-        gained = score - teacher.score(last.costs, weight, room) if k else np.inf
+        score = teacher.score(last.costs, weight, room) if k else -np.inf
+        gained = teacher.score(played.costs, weight, room) - score
         slow = passes and 0 < gained < NEAR / 2 * score and teacher.is_near(played.costs)
         if gained > 0:
             objects = not passes

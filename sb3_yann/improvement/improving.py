@@ -460,6 +460,7 @@ class _Work:
         self.rng = np.random.default_rng([seed, 1])
         self.checks: list[Check] = []
         self.hard: Scenarios | None = None  # what the last check in a twin has lost
+        self.is_family = False  # the first model of a simulator
         self.estimator: StateEstimator | None = None  # what the policy's estimates come from
         self.has_learnt = not self.layer.network.is_zero()
 
@@ -658,17 +659,28 @@ class _Work:
         return Improvement(checks, change, accepted, before, *where, note=note, rests_aside=aside)
 
     def _model(self, simulator: Simulator, number: int) -> LearntModel:
-        """Return a model of all episodes so far; the first family is fitted to more of them."""
+        """Return a model of all episodes so far.
+
+        The first one says whether it is a family; then it is fitted to more episodes, from starts
+        whose constants are others.
+        """
         seed = self.seed + number
-        given = self.problem, simulator.episodes, simulator.row.estimator, seed
-        model = Family.of(model_of(*given), seed)
-        left = simulator.affordable() - most_episodes(self.rounds)
-        if number or left <= 0 or not isinstance(model, Family):
+
+        def fitted() -> LearntModel:
+            found = model_of(self.problem, simulator.episodes, simulator.row.estimator, seed)
+            return found if number and not self.is_family else Family.of(found, seed)
+
+        model = fitted()
+        if number:
             return model
-        more = min(2 * simulator.usual, left)
-        simulator.excite(more)
+        self.is_family = isinstance(model, Family)
+        more = min(2 * simulator.usual, (simulator.affordable() - most_episodes(self.rounds)) // 2)
+        enough = more >= simulator.usual // 2 and not simulator.row.is_estimate
+        if not (enough and self.is_family):
+            return model
         self.say(f"a constant that no reading shows: {more} more episodes with random inputs")
-        return Family.of(model_of(*given), seed)
+        simulator.excite(more)
+        return fitted()
 
     def _taught(
         self, simulator: Simulator, lost: list[Any], number: int

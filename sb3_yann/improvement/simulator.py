@@ -413,23 +413,26 @@ class Family(LearntModel):
 
     def member_of(self, episode: Episode) -> int:
         """Return the number of the member that predicts an episode best."""
-        errors = _missed(self.dynamics, episode) / self.dynamics.coordinates.units
+        dynamics = self.dynamics
+        part = dynamics.row.state
+        after = episode.thetas[1:, part]
+        predicted = dynamics.step(episode.thetas[None, :-1], episode.actions[None])[..., part]
+        errors = (
+            after - dynamics.coordinates.nearest(predicted, after)
+        ) / dynamics.coordinates.units
         return int(np.argmin(np.mean(errors**2, axis=(1, 2))))
 
 
 def missed_of(model: LearntModel, episode: Episode) -> Array:
     """Return what a model misses of the states after each step of an episode, (T, n)."""
-    missed = _missed(model.dynamics, episode)
+    dynamics = model.dynamics
     if isinstance(model, Family):
-        return np.asarray(missed[model.member_of(episode)])
-    return np.asarray(missed.mean(axis=0))
-
-
-def _missed(dynamics: Dynamics, episode: Episode) -> Array:
-    """Return what each member misses of the states after each step, (members, T, n)."""
+        acting = dynamics.members[model.member_of(episode)]
+        dynamics = Dynamics(model.problem, dynamics.coordinates, (acting,))
     part = dynamics.row.state
+    rows = episode.thetas[:-1]
     after = episode.thetas[1:, part]
-    predicted = dynamics.step(episode.thetas[None, :-1], episode.actions[None])[..., part]
+    predicted = TwinPlant(dynamics).advance(rows, episode.actions, np.arange(len(rows)))[:, part]
     return np.asarray(after - dynamics.coordinates.nearest(predicted, after))
 
 
@@ -577,7 +580,9 @@ class Scenarios:
         ]
         members = None
         if isinstance(model, Family):
-            members = np.array([model.member_of(each) for each in episodes])
+            once = {id(each): each for each in episodes}
+            number = {key: model.member_of(each) for key, each in once.items()}
+            members = np.array([number[id(each)] for each in episodes])
         missed = None
         if row.estimator is not None:
             of_each = {id(e): missed_of(model, e) for e in episodes}
