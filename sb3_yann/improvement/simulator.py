@@ -389,16 +389,17 @@ def model_of(
 
 
 class Family(LearntModel):
-    """A model whose members differ by a constant that no reading shows, such as a feed's strength.
+    """A model whose members differ by constants that no reading shows, such as a feed's strength.
 
-    There is one for each seed of its episodes.
+    There is one member for each seed of its episodes.
     """
 
     @classmethod
     def of(cls, model: LearntModel, seed: int) -> LearntModel:
         """Return a family of a model's episodes if it explains them clearly better, else the model.
 
-        Loads that last are no reason: what was missed of an episode comes again in each scenario.
+        Behind an estimator a load that lasts is no reason: what was missed of an episode comes
+        again in each scenario.
         """
         if lacks(model) != (True, False):
             return model
@@ -417,9 +418,8 @@ class Family(LearntModel):
         part = dynamics.row.state
         after = episode.thetas[1:, part]
         predicted = dynamics.step(episode.thetas[None, :-1], episode.actions[None])[..., part]
-        errors = (
-            after - dynamics.coordinates.nearest(predicted, after)
-        ) / dynamics.coordinates.units
+        missed = after - dynamics.coordinates.nearest(predicted, after)
+        errors = missed / dynamics.coordinates.units
         return int(np.argmin(np.mean(errors**2, axis=(1, 2))))
 
 

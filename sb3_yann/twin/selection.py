@@ -33,7 +33,6 @@ HIDDEN = 48  # units in each of two hidden layers
 CURVATURES = 50  # pairs that L-BFGS remembers
 WINDOWS = 32  # windows of a log in a step of Adam
 FIT_RATE = 1e-3  # of Adam at first; it falls to zero
-UPDATES = 3000  # of a fit, see `fit_ensemble`
 FAMILY_UPDATES = 1000  # iterations of the fit of a family
 CONSTANTS = 2  # numbers that a fit of a family takes to differ from seed to seed
 UNSEEN = 0.1  # size of the hidden constants that a fit begins with, in standard deviations
@@ -47,7 +46,7 @@ def fit_ensemble(
     seed: int,
     *,
     ahead: int = 1,
-    updates: int = UPDATES,
+    updates: int = 3000,
 ) -> list[Residual]:
     """Return one network for each log, all fitted at once.
 
@@ -98,7 +97,7 @@ class _Networks:
 
     Each member is fitted to a pair z (rows, k), y (rows, n), or to the differences of rows that are
     ``alike`` (pairs, 2); what is smaller in y than ``least`` (n,) is rounding. ``of_row`` (rows,)
-    says which hidden constant acts in a row: a single network then makes a member for each.
+    says which hidden constants act in a row: a single network then makes a member for each.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ def test_dead_time_is_told_from_order() -> None:
     a = np.array([[0.9, 0.2], [-0.2, 0.9]])
     b = np.array([[0.0], [0.5]])
     c = np.array([[1.0, 0.5]])
-    u = steps(700, 1, 2)
+    u = steps(800, 1, 2)
     found = identify_outputs(played(u, a, b, c, 3, delay=5), u, dt=1)
     assert (found.order, found.delays, found.model.n_states) == (2, (5,), 7)
     prompt = identify_outputs(played(u, a, b, c, 3), u, dt=1)
