@@ -272,6 +272,7 @@ class Log:
                 labels += own
                 columns += [*whole.T]
         _warn_of_other_units(labels, columns, records[0].states.shape[1])
+        _warn_of_repeats(labels, columns[: records[0].states.shape[1]])
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
@@ -333,8 +334,9 @@ class Log:
             should, or one that is longer than the header. An episode ends where a reading is
             missing, but for states that are read now and then, as a laboratory's: these stay NaN.
         """
-        for name, given in (("states", states), ("inputs", inputs)):
-            if isinstance(given, str) or not given:
+        more = {"disturbances": disturbances, "references": references}
+        for name, given in {"states": states, "inputs": inputs, **more}.items():
+            if isinstance(given, str) or not (given or name in more):
                 raise ValueError(f"{name} = {given!r} must be a list of column names.")
         try:
             text = Path(path).read_text(encoding)
@@ -372,8 +374,9 @@ class Log:
         unread = [each for each in header if each not in wanted]
         if unread and episode is None and time is None:
             warn(
-                f"All {len(table):,} rows of {path} are read as one episode without a gap. If one "
-                f"of its other columns, {unread}, tells where one ends, pass time= or episode=."
+                f"All {len(table):,} rows of {path} are read as one record, cut only where a "
+                f"reading is missing. If one of its other columns, {unread}, tells where an "
+                "episode ends, pass time= or episode=."
             )
         n = len(states)
         m = len(inputs)
@@ -528,6 +531,7 @@ UNITS = (
 """Units that are mistaken for each other: factors, and what is added."""
 JUMP = 5.0  # times any other step of a column that a change of its unit is, at least
 LEAST_READ = 10  # readings on either side of it
+REGULAR = 0.9  # share of a column's changes that are as many rows apart, where it repeats readings
 
 
 def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int) -> None:
@@ -554,6 +558,19 @@ def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int
                     f"From row {rows[k + 1]} of the log on, {name} reads {reads}: has its unit "
                     "changed? Bring the whole column to one unit."
                 )
+
+
+def _warn_of_repeats(labels: Sequence[str], columns: Sequence[Array]) -> None:
+    """Warn of states that change once in so many rows, always the same number of them."""
+    for name, column in zip(labels, columns, strict=False):
+        changes = np.flatnonzero(np.diff(column[np.isfinite(column)]))
+        apart = np.diff(changes)
+        every = int(np.median(apart)) if len(apart) >= LEAST_READ else 1
+        if every > 1 and np.mean(apart % every == 0) > REGULAR:
+            warn(
+                f"{name} changes in every {every}th row only. If a historian repeats a reading, as "
+                "a laboratory's, leave the repeats empty (NaN): models and estimators then know it."
+            )
 
 
 def _number(path: object, row: int, content: dict[str, str], name: str, decimal: str) -> float:

@@ -137,7 +137,7 @@ def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(write) -> None:
     for wrong, match in ((given, "pass encoding="), (given | {"encoding": "latin-1"}, "decimal=")):
         with pytest.raises(ValueError, match=match):
             Log.from_csv(path, **wrong)
-    with pytest.warns(UserWarning, match=r"All 10 rows .* one episode .*\['run', 't', 'T', 'load'"):
+    with pytest.warns(UserWarning, match=r"All 10 rows .* one record.*\['run', 't', 'T', 'load'"):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10)
     with pytest.raises(ValueError, match=r"begins anew in each episode, name .* episode="):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, time="t")
@@ -214,8 +214,7 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(write) ->
     with pytest.raises(ValueError, match=r"quality every 10 samples.*identify_outputs"):
         identify(log)
     box = {"u_min": -1, "u_max": 1, "theta_min": -9, "theta_max": 9}
-    tracking = Tracking([0], -1, 1)
-    mpc = LinearMPC(plant, Q=np.eye(2), R=[[1]], horizon=2, tracking=tracking, **box)
+    mpc = LinearMPC(plant, Q=np.eye(2), R=[[1]], horizon=2, tracking=Tracking([0], -1, 1), **box)
     with pytest.raises(ValueError, match=r"quality every 10 samples.*PlantTwin.fit\(mpc, log, obs"):
         PlantTwin.fit(mpc, log)
     observer = StateEstimator(mpc.model, [0, 1], every=[1, 10])
@@ -223,7 +222,9 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(write) ->
     assert len(PlantTwin.fit(mpc, log, **given).episodes) == 2
 
 
-def test_gaps_do_not_change_how_often_a_state_is_read() -> None:
+def test_gaps_do_not_change_how_often_a_state_is_read_and_repeats_are_named() -> None:
+    with pytest.warns(UserWarning, match=r"x\[0\] changes in every 20th row only"):
+        Log.from_arrays(np.sin([*np.divmod(range(401), 20)]).T, np.ones((400, 1)), 1)
     x = np.zeros((201, 2))
     x[np.arange(201) % 20 > 0, 1] = np.nan
     x[[40, 50, 80, 120]] = np.nan
@@ -249,6 +250,7 @@ TWO = "level,valve\n"
         ("h [cm]\tvalve\n1\t2\n", ["h"], r"pass delimiter='\\t'.$"),
         ("", ["h"], r"it has \[\]. It is empty."),
         (CSV, "level", "list of column names"),
+        (CSV, ["level"], r"disturbances = 'level' must be a list of column names"),
         (CSV.replace("1.1", "high"), ["level"], "row 3: level is 'high', expected a number"),
         (TWO, ["level"], "no rows below its"),
         (f"{TWO}1,2\n", ["level"], "no two rows"),
@@ -260,7 +262,8 @@ TWO = "level,valve\n"
 )
 def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> None:
     with pytest.raises(ValueError, match=said):
-        Log.from_csv(write(text), states=states, inputs=["valve"], dt=10)
+        loads = "level" if said[0] == "d" else ()
+        Log.from_csv(write(text), states, ["valve"], 10, disturbances=loads)
     with pytest.raises(ValueError, match=r"no column 'level'; .* pass delimiter=','.$"):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, delimiter=";")
 

@@ -216,7 +216,8 @@ class PlantLaw(ReadOnlyArrays):
             arrays["theta_ss"] = self.theta_ss
             own = {"rate": self.rate, "moving": self.moving, "clamped": self.clamped}
             arrays |= {name: value for name, value in own.items() if value is not None}
-            model = {name: value for name, value in vars(self.model).items() if value is not None}
+            every = vars(self.model).items()  # gains are evidence, and no array
+            model = {k: each for k, each in every if each is not None and k != "gains"}
             arrays |= {f"model_{name}": value for name, value in model.items()}
         return arrays
 

@@ -65,7 +65,6 @@ from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.units import FLOAT32_ROUNDING
 
-LEAST = 2e-4  # what a policy must gain in a twin, relative to the MPC's mean cost
 CAUTION = 8.0  # times as much as before count lost starts after each refusal on new ones
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
 PROMISED = 0.95  # share of a gain in the model that the simulator must show from the same starts
@@ -516,7 +515,7 @@ class _Work:
 
         def passes(share: float) -> bool:
             found = self._check_in(trial, share)
-            return found.accepted and found.logged <= -LEAST and found.change < best
+            return found.accepted and found.logged <= -RULE.least_gain and found.change < best
 
         def improvement(accepted: bool, note: str = "") -> Improvement:
             if accepted:

@@ -17,6 +17,7 @@ from scipy import stats
 
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback
+from sb3_yann.compare import RULE
 from sb3_yann.control.mpc.bound_excess import costs_of
 from sb3_yann.twin.dynamics import Dynamics, law_of, play
 from sb3_yann.twin.env import Starts
@@ -124,7 +125,7 @@ class _Replays:
         return np.asarray(np.clip(new, own.theta_min[part], own.theta_max[part]))
 
     def costs(self, act: Feedback, starts: Array, given: Array | None = None) -> Array:
-        """Return what episodes like each logged one cost with a policy on average, (members, N).
+        """Return what episodes like each logged one cost with a policy, (members, N, some).
 
         Those that go on as episode i does begin at ``starts[i]`` (some, size). What is ``given``,
         (T, N * some, p), is as logged by default.
@@ -157,7 +158,7 @@ class _Replays:
             rows, inputs = play(inputs_at, step, begins, steps, m, (row.given, given))
             found, _ = costs_of(problem, row.shown(rows), inputs, alive[:, None])
         found = np.where(np.isfinite(found), found, np.inf)
-        return np.asarray(found.reshape(self.members, count, some).mean(axis=2))
+        return np.asarray(found.reshape(self.members, count, some))
 
     def _regressors(self, t: int, rows: Array, inputs: Array, missed: Array) -> Array:
         past = [inputs[t - lag] if t >= lag else 0 * inputs[0] for lag in range(1, MEMORY + 1)]
@@ -237,9 +238,11 @@ def forecast(
             if surely_worse(replays.left - (own if remembers else plain).left):
                 continue
             says = REMEMBERED if remembers else judge.says
-            for scenario in (logged, new):
-                mpc, policy = (replays.costs(each, *scenario) for each in (law, act))
-                found.append((*_changed(mpc, policy, independent), says))
+            played = [[replays.costs(each, *runs) for each in (law, act)] for runs in (logged, new)]
+            runs = [each.reshape(len(each), -1) for each in played[1]]
+            for mpc, policy in played:
+                mean = mpc.mean(axis=2), policy.mean(axis=2)
+                found.append((*_changed(*mean, independent, runs), says))
     low = [each[1] for each in found]
     high = [each[2] for each in found]
     change = (found[0][0] + found[1][0]) / 2
@@ -259,33 +262,40 @@ def surely_worse(behind: Array) -> NDArray[np.bool_]:
     return np.asarray((known.mean(axis=-1) > REFUTED * error) | each)
 
 
-def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float, float]:
-    """Return a change relative to the MPC, and the ends of its interval."""
+def _changed(
+    mpc: Array, policy: Array, independent: int, runs: Sequence[Array] | None = None
+) -> tuple[float, float, float]:
+    """Return a change relative to the MPC, and the ends of its interval; costs are (members, N).
+
+    ``runs``, (members, .) of MPC and policy, are from new starts.
+    """
+    if independent >= EACH or runs is None:
+        runs = mpc, policy
     with np.errstate(all="ignore"):
-        changes = policy - mpc
-        size = np.abs(mpc)
-        ratios = changes.mean(axis=1) / size.mean(axis=1)  # (members,)
-    if not np.isfinite(ratios).all() or independent < 2:
+        ratios = (policy - mpc).mean(axis=1) / np.abs(mpc).mean(axis=1)  # (members,)
+        changes = runs[1] - runs[0]
+        size = np.abs(runs[0])
+        about = (changes.mean(axis=1) / size.mean(axis=1)).mean()
+    if not np.isfinite([*ratios, about]).all() or independent < 2:
         return 0.0, -np.inf, np.inf
-    # Of a ratio of means only what is not in proportion varies (Cochran, *Sampling*, chapter 6).
-    apart = (changes - ratios[:, None] * size) / size.mean(axis=1, keepdims=True)
-    of_episodes = np.sqrt(apart.mean(axis=0).var(ddof=1) / independent)
-    of_fits = np.sqrt((len(ratios) - 1) * ratios.var())
-    likely = [stats.t.ppf(ONE_SIDED, max(k - 1, 1)) for k in (independent, len(ratios))]
     mean = float(ratios.mean())
-    up = down = float(likely[0] * of_episodes)
-    if independent >= EACH:
-        # Most of a gain or a loss may lie in few episodes: weights at random (Rubin, Ann. Stat. 9,
-        # 1981), as far out as brings normal changes to what Student's t says of them.
-        count = changes.shape[1]
-        rng = np.random.default_rng(0)
-        weights = rng.dirichlet(np.full(count, independent / count), DRAWS)
-        cost = np.maximum(weights @ size.mean(axis=0), 1e-300)
-        drawn = weights @ changes.mean(axis=0) / cost - mean
-        out = stats.norm.cdf(likely[0] * np.sqrt((1 + 1 / independent) / (1 - 1 / count)))
-        down, up = np.abs(np.quantile(drawn, (1 - out, out)))
-    fits = float(likely[1] * of_fits)
-    return mean, mean - float(np.hypot(down, fits)), mean + float(np.hypot(up, fits))
+    likely = [stats.t.ppf(ONE_SIDED, k - 1) for k in (independent, max(len(ratios), 2))]
+    room = 0.0
+    if independent < EACH:  # few do not tell how much starts vary, runs from new ones do
+        likely[0] = stats.norm.ppf(ONE_SIDED)
+        room = RULE.least_gain * bool(changes.any())  # fits to so few err alike
+    count = changes.shape[1]
+    # Most of a gain or a loss may lie in few starts: weights at random (Rubin, Ann. Stat. 9,
+    # 1981), as far out as brings normal changes to what is likely of them.
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet(np.full(count, independent / count), DRAWS)
+    cost = np.maximum(weights @ size.mean(axis=0), 1e-300)
+    drawn = weights @ changes.mean(axis=0) / cost - about
+    out = stats.norm.cdf(likely[0] * np.sqrt((1 + 1 / independent) / (1 - 1 / count)))
+    down, up = np.abs(np.quantile(drawn, (1 - out, out)))
+    fits = likely[1] * np.sqrt((len(ratios) - 1) * ratios.var())
+    down, up = (float(np.hypot(each, fits)) + room for each in (down, up))
+    return mean, mean - down, mean + up
 
 
 def _cure(

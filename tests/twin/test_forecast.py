@@ -12,7 +12,6 @@ from stable_baselines3 import DDPG
 from sample_plants import Sampled
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann.evaluation import evaluate
-from sb3_yann.twin import plant_twin
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.forecast import REMEMBERED, Forecast, _changed, _cure, _Replays
 from sb3_yann.twin.trust import costs_of
@@ -63,7 +62,7 @@ def twin(plant: Lagging, episodes: int = 6) -> PlantTwin:
 def test_a_replay_with_the_mpc_costs_what_was_logged(remembers: bool) -> None:
     found = twin(Lagging(0.4, 0.5))
     first = np.stack([each.thetas[:1] for each in found.episodes])
-    costs = _Replays(found.judges[0], found.episodes, remembers).costs(law_of(MPC), first)
+    costs = _Replays(found.judges[0], found.episodes, remembers).costs(law_of(MPC), first)[..., 0]
     logged = [costs_of(MPC, each) for each in found.episodes]
     np.testing.assert_allclose(costs, np.tile(logged, (5, 1)), rtol=1e-9)
 
@@ -109,6 +108,11 @@ def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> No
     for more, sure in (([-0.3, -0.03, 0, 0, 1e-3], True), ([-0.3, 0.03, 0.1, 0.1, 1e-3], False)):
         mean, low, high = _changed(np.ones((5, 5)), 1 + np.array([more] * 5), 5)
         assert (high < 0) == sure and min(more) < low < mean < high < max(more)
+    for dearer, sure in ((1, True), (12, False)):  # of two, new starts tell how much they vary
+        more = np.r_[np.full(dearer, 0.3), np.linspace(-0.3, -0.1, 60 - dearer)]
+        runs = np.ones((2, 60)), 1 + np.array([more, more])
+        mean, _, high = _changed(np.ones((2, 2)), np.full((2, 2), 0.8), 2, runs)
+        assert np.isclose(mean, -0.2) and (high < 0) == sure
 
 
 def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
@@ -171,10 +175,9 @@ class Motor(Sampled):
     steps = 100
 
     def __init__(self, mpc: LinearMPC) -> None:
-        low = np.float32(mpc.theta_min)
-        high = np.float32(mpc.theta_max)
         self.mpc = mpc
-        self.observation_space = ProblemBox(low, high, problem=mpc)
+        box = np.float32([mpc.theta_min, mpc.theta_max])
+        self.observation_space = ProblemBox(*box, problem=mpc)
 
     def cost(self, u):
         return self.mpc.stage_cost(self.x, u)
@@ -194,10 +197,7 @@ class Motor(Sampled):
 
 
 @pytest.mark.nightly
-def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_networks(
-    monkeypatch,
-) -> None:
-    monkeypatch.setattr(plant_twin, "LONG_LOG", 100)
+def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_networks() -> None:
     mpc = motor()
     make = partial(Motor, mpc)
     logged = evaluate(mpc.law(), make, range(100, 130)).pairs

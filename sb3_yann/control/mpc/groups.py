@@ -276,7 +276,8 @@ class SoftBounds(ReadOnlyArrays):
         soft = any(np.any(unit) for unit in (*units, mixed))
         if self.penalty and not soft:
             raise ValueError(
-                f"SoftBounds.penalty = {self.penalty!r}, but nothing is soft: pass x or y, or "
+                f"SoftBounds.penalty = {self.penalty!r}, but nothing is soft: x and y hold the "
+                "violation that counts as one unit, 0 where a bound is hard. Or pass "
                 "MixedBounds(soft=...)."
             )
         found = SoftBounds(*units, self.penalty or None)

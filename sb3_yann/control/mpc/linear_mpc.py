@@ -426,8 +426,8 @@ class LinearMPC(MPCProblem):
                 ends = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in far)
                 raise ValueError(
                     f"The law needs a bounded box of theta, not {ends}. Pass finite theta_min and "
-                    "theta_max (or x_min and x_max), and where theta holds them, r_min and r_max, "
-                    "d_min and d_max, u_min and u_max."
+                    "theta_max (or x_min and x_max), u_min and u_max, and where theta holds them, "
+                    "r_min and r_max of Tracking, disturbances=DisturbanceBounds(d_min, d_max)."
                 )
             load_kernels()
             limits = self.deviations.u_min, self.deviations.u_max

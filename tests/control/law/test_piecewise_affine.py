@@ -18,6 +18,7 @@ from sample_problems import solved, strips
 from sb3_yann import LinearModel, LinearMPC, RateLimits, Tracking
 from sb3_yann._archive import read_arrays, write_arrays
 from sb3_yann.control import DisturbanceBounds, OnlineLaw, PiecewiseAffine
+from sb3_yann.control.gains import Gains
 from sb3_yann.control.law_plot import COLORS, REST, area, slices
 from sb3_yann_envs import problems
 
@@ -187,9 +188,9 @@ KINDS: dict[str, Any] = {"explicit": PiecewiseAffine, "online": OnlineLaw}
 def reactor() -> LinearMPC:
     model = LinearModel(
         [[0.9, 0.1], [0.0, 0.8]], [[0.0], [0.5]], dt=0.1, x_ss=[2, 350], u_ss=[40],
-        E=[[0.1], [0.0]], d_ss=[7],
+        E=[[0.1], [0.0]], d_ss=[7], disturbance_names=["feed"],
         state_names=["conversion", "temperature"], input_names=["coolant"],
-        units={"temperature": "K"}, disturbance_names=["feed"],
+        units={"temperature": "K"}, gains=Gains.of(0.8 * np.eye(2), np.ones((2, 1))),
     )  # fmt: skip
     return LinearMPC(
         model, Q=np.eye(2), R=[[0.1]], horizon=3,
@@ -211,6 +212,8 @@ def test_a_file_holds_operating_point_sampling_time_names_and_units(saved: Any) 
     model = reactor().model
     read = kind.load(path)
     assert read == law and read.model == model
+    copied = pickle.loads(pickle.dumps(law))
+    assert copied.model == model and not copied.theta_ss.flags.writeable
     for name in ("dt", "state_names", "input_names", "disturbance_names", "units"):
         assert getattr(read.model, name) == getattr(model, name)
     assert read.theta_ss.tolist() == [2, 350, 350, 7, 40]
@@ -248,11 +251,6 @@ def test_a_damaged_plant_is_a_value_error(saved: Any, damage: dict[str, Any]) ->
     write_arrays(path, {**read_arrays(path), **damage})
     with pytest.raises(ValueError, match=r"law\.npz does not hold"):
         kind.load(path)
-
-
-def test_a_pickle_keeps_the_plant(saved: Any) -> None:
-    copy = pickle.loads(pickle.dumps(saved[0]))
-    assert copy.model == reactor().model and not copy.theta_ss.flags.writeable
 
 
 def polygons(axes) -> dict[int, np.ndarray]:
