@@ -277,7 +277,11 @@ class Log:
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
         if not kept:
-            raise ValueError("The log has no two samples in a row with all that is to be read.")
+            never = [a for a, z in zip(labels, columns, strict=True) if not np.isfinite(z).any()]
+            which = f": {', '.join(never)} is never read" if never else ""
+            raise ValueError(
+                f"The log has no two samples in a row with all that is to be read{which}."
+            )
         return cls(tuple(episodes), dt, lost_steps=sum(map(len, records)) - kept, **names)
 
     @classmethod
