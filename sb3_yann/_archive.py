@@ -69,6 +69,8 @@ def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
         raise ValueError(
             f"{fspath(path)} would hold {size} bytes, more than {MAX_SIZE} are not read."
         )
+    if objects := [name for name, each in arrays.items() if np.asarray(each).dtype.hasobject]:
+        raise TypeError(f"{objects} are no arrays of numbers, truth values or text.")
     with atomic_write(path) as part, part.open("wb") as file:
         np.savez(file, **{**arrays, DIGEST: digest_of(arrays)})
 
