@@ -163,9 +163,9 @@ class PastInputs(Appending):
         off = np.abs(given - self.initial) > FLOAT32_ROUNDING * np.maximum(np.abs(given), 1)
         if np.any(late & off):
             raise ValueError(
-                f"initial = {given.tolist()} (in a PlantEnv the model's u_ss) is not between the "
-                f"env's {bounds.low.tolist()} and {bounds.high.tolist()}. Give the inputs in their "
-                "order and units."
+                f"initial = {given.tolist()} is not between the env's {bounds.low.tolist()} and "
+                f"{bounds.high.tolist()}. Give the inputs in their order and units; those of a "
+                "PlantEnv are u_ss of its model."
             )
         self.past: list[Array] = []
 
