@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 DIGEST = "digest"
+KINDS = "biufU"  # of arrays: numbers, truth values and text
 MAX_SIZE = 2**32
 """Bytes of a file. What is larger is refused: a reader holds all of it in memory."""
 
@@ -62,15 +63,15 @@ def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
     """Write arrays and their digest as a whole: a reader never sees half of a file.
 
     OSError if it cannot be written, and what was there before stays; ValueError if it would be
-    larger than what is read.
+    larger than what is read, TypeError if an array is one of objects.
     """
     size = sum(np.asarray(each).nbytes for each in arrays.values())
     if size > 0.99 * MAX_SIZE:
         raise ValueError(
             f"{fspath(path)} would hold {size} bytes, more than {MAX_SIZE} are not read."
         )
-    if objects := [name for name, each in arrays.items() if np.asarray(each).dtype.hasobject]:
-        raise TypeError(f"{objects} are no arrays of numbers, truth values or text.")
+    if wrong := [k for k, each in arrays.items() if np.asarray(each).dtype.kind not in KINDS]:
+        raise TypeError(f"{fspath(path)}: {wrong} hold no numbers, truth values or text.")
     with atomic_write(path) as part, part.open("wb") as file:
         np.savez(file, **{**arrays, DIGEST: digest_of(arrays)})
 
@@ -128,7 +129,7 @@ def _array(name: str, content: bytes) -> Any:
     formats: Any = np.lib.format
     formats.read_magic(file)
     shape, by_columns, kind = formats.read_array_header_1_0(file)
-    if kind.kind not in "biufU":
+    if kind.kind not in KINDS:
         raise ValueError(f"{name} is no array of numbers, truth values or text")
     if len(content) - file.tell() != math.prod(shape) * kind.itemsize or not kind.itemsize:
         raise ValueError(f"{name} is not as large as its header says")

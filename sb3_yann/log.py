@@ -258,12 +258,14 @@ class Log:
         dt = check_positive("dt", dt)
         labels: list[str] = []
         columns: list[Array] = []
+        empty: list[str] = []
         kinds = ("state", "x"), ("input", "u"), ("disturbance", "d"), ("reference", "r")
         for of, letter in kinds:
             parts = [getattr(each, f"{of}s") for each in records]
             whole = np.concatenate(parts)
             own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(whole.shape[1])]
             whole = _without_marks(own, whole)
+            empty += [a for a, z in zip(own, whole.T, strict=True) if not np.isfinite(z).any()]
             cut = np.split(whole, np.cumsum([len(each) for each in parts])[:-1])
             records = [
                 replace(each, **{f"{of}s": part}) for each, part in zip(records, cut, strict=True)
@@ -272,13 +274,12 @@ class Log:
                 labels += own
                 columns += [*whole.T]
         _warn_of_other_units(labels, columns, records[0].states.shape[1])
-        _warn_of_repeats(labels, columns[: records[0].states.shape[1]])
+        _warn_of_repeats(labels[: records[0].states.shape[1]], records)
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
         if not kept:
-            never = [a for a, z in zip(labels, columns, strict=True) if not np.isfinite(z).any()]
-            which = f": {', '.join(never)} is never read" if never else ""
+            which = f"; never read: {', '.join(empty)}" if empty else ""
             raise ValueError(
                 f"The log has no two samples in a row with all that is to be read{which}."
             )
@@ -340,7 +341,7 @@ class Log:
         """
         more = {"disturbances": disturbances, "references": references}
         for name, given in {"states": states, "inputs": inputs, **more}.items():
-            if isinstance(given, str) or not (given or name in more):
+            if isinstance(given, str) or not (name in more or given):
                 raise ValueError(f"{name} = {given!r} must be a list of column names.")
         try:
             text = Path(path).read_text(encoding)
@@ -564,17 +565,46 @@ def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int
                 )
 
 
-def _warn_of_repeats(labels: Sequence[str], columns: Sequence[Array]) -> None:
-    """Warn of states that change once in so many rows, always the same number of them."""
-    for name, column in zip(labels, columns, strict=False):
-        changes = np.flatnonzero(np.diff(column[np.isfinite(column)]))
-        apart = np.diff(changes)
-        every = int(np.median(apart)) if len(apart) >= LEAST_READ else 1
-        if every > 1 and np.mean(apart % every == 0) > REGULAR:
+def _warn_of_repeats(labels: Sequence[str], records: Sequence[Episode]) -> None:
+    """Warn of states that change once in so many rows, always as many; not as an input does."""
+    driven = {
+        _period([z[:, i] for z in parts])
+        for parts in zip(*((e.inputs, e.disturbances, e.references) for e in records), strict=True)
+        for i in range(parts[0].shape[1])
+    }
+    for i, name in enumerate(labels):
+        every = _period([each.states[:, i] for each in records])
+        if every > 1 and every not in driven:
             warn(
-                f"{name} changes in every {every}th row only. If a historian repeats a reading, as "
-                "a laboratory's, leave the repeats empty (NaN): models and estimators then know it."
+                f"{name} changes only once in {every} rows. If a historian repeats a reading, as a "
+                "laboratory's, leave the repeats empty (NaN): models and estimators then know it."
             )
+
+
+def _period(parts: Sequence[Array]) -> int:
+    """Return in how many rows the parts of a column change once; 1 where that is not regular.
+
+    A counter's and a switch's changes are all of one size, or of two: they are no readings.
+    """
+    count = 0
+    apart: list[int] = []
+    sizes: list[float] = []
+    for z in parts:
+        rows = np.flatnonzero(np.isfinite(z))
+        steps = np.diff(z[rows])
+        count += len(steps)
+        apart += [*np.diff(rows[1:][steps != 0])]
+        sizes += [*np.abs(steps[steps != 0])]
+    repeats = 2 * len(sizes) < count
+    if (
+        not repeats
+        or len(apart) < LEAST_READ
+        or len(np.unique(np.round(sizes / np.max(sizes), 6))) < 3
+    ):
+        return 1
+    found, counts = np.unique(apart, return_counts=True)
+    every = int(found[np.argmax(counts)])  # some readings are equal, and change nothing
+    return every if np.mean(np.array(apart) % every == 0) > REGULAR else 1
 
 
 def _number(path: object, row: int, content: dict[str, str], name: str, decimal: str) -> float:

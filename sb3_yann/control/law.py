@@ -196,7 +196,7 @@ class PlantLaw(ReadOnlyArrays):
     def save(self, path: str | PathLike[str]) -> None:
         """Write the law to ``path`` as an ``.npz`` file of plain arrays.
 
-        Its plant goes along.
+        Its plant goes along, but for the standard errors of its gains.
         """
         write_arrays(path, self._arrays())
 
@@ -216,7 +216,7 @@ class PlantLaw(ReadOnlyArrays):
             arrays["theta_ss"] = self.theta_ss
             own = {"rate": self.rate, "moving": self.moving, "clamped": self.clamped}
             arrays |= {name: value for name, value in own.items() if value is not None}
-            every = vars(self.model).items()  # gains are evidence, and no array
+            every = vars(self.model).items()  # gains are no array
             model = {k: each for k, each in every if each is not None and k != "gains"}
             arrays |= {f"model_{name}": value for name, value in model.items()}
         return arrays

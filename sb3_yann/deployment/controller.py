@@ -70,7 +70,7 @@ class Controller:
     """What runs in production: ``controller(obs)`` is the action, with a fallback at every step.
 
     With an estimator obs are the measured outputs y, then references and what else theta holds and
-    nothing estimates: ``controller([*y, *r])``.
+    nothing estimates: ``controller([*y, *r, *d])``.
 
     A faulty reading is replaced by the last good one, and the MPC's law acts alone. An estimator
     goes on without a faulty output. After ``hold``

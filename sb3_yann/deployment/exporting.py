@@ -95,7 +95,7 @@ def export(
     estimator : StateEstimator or "caller", optional
         What estimates states and disturbances from measured outputs. It becomes part of the
         controller, which then takes the outputs y, references r, measured disturbances, and puts
-        out the input: ``controller([*y, *r])``. "caller" leaves it to your code, and every file
+        out the input: ``controller([*y, *r, *d])``. "caller" leaves it to your code, and every file
         says so. A problem with estimated states or disturbances is refused without.
 
     Returns

@@ -26,7 +26,7 @@ from sb3_yann.twin.log import Episode, more_of, records
 ONE_SIDED = 0.95  # probability that a change is not above an interval's end, or not below
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
 TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
-EACH = 5  # episodes, at least, all of which speak against a judge
+EACH = 5  # episodes, at least, that show by themselves how much they vary
 MEMORY = 2  # earlier samples that a memory knows
 REMEMBERED = (
     "errors that follow earlier inputs and errors, as in this log, perhaps because of a lag or a "
@@ -35,7 +35,7 @@ REMEMBERED = (
 LESS = 0.02  # share of the errors of one step that it must explain on held-out episodes
 MEMORY_RIDGE = 1e-3  # of its standardized regressors
 MIN_RUNS = 100  # from new starts, at least
-DRAWS = 10_000  # of the episodes' weights: fifty lie beyond the farthest end, at .5 %
+DRAWS = 10_000  # of the weights of episodes or starts: fifty lie beyond the farthest end, at .5 %
 STEPS_PER_WEIGHT = 4  # steps of a log for each coefficient, at least
 
 
@@ -43,7 +43,8 @@ STEPS_PER_WEIGHT = 4  # steps of a log for each coefficient, at least
 class Judge:
     """A twin that a log may refute, fitted without each fold of the episodes.
 
-    Member k has not seen fold k: every episode whose number is k modulo the members. ``says`` is
+    Member k has not seen fold k: every episode whose number is k modulo the members, of fewer than
+    five a part of each. ``says`` is
     what sets it apart. It is ``refuted`` where it predicts held-out episodes surely worse than the
     twin; dynamics that both lack may feign that: with a memory it counts.
     """
@@ -215,10 +216,10 @@ def forecast(
 
     It is the union of the judges' intervals, of runs from the log's own starts, and of others from
     the box of all starts at new set-points and loads, which no policy was fitted to. Of each, the
-    standard error is that over the episodes, with that of a fit without each fold of them (the
-    jackknife). Where its errors follow earlier inputs and errors, the judge is asked again with a
-    memory of them. The first judge is the twin's own; ``loosest`` is the input that follows the MPC
-    most closely.
+    standard error is that over the episodes, of fewer than five independent ones over runs from new
+    starts, with that of a fit without each fold of them (the jackknife). Where its errors follow
+    earlier inputs and errors, the judge is asked again with a memory of them. The first judge is
+    the twin's own; ``loosest`` is the input that follows the MPC most closely.
     """
     independent = sum(len(each[::2]) for each in records(judges[0].dynamics.problem, episodes))
     count = len(episodes)
@@ -238,11 +239,11 @@ def forecast(
             if surely_worse(replays.left - (own if remembers else plain).left):
                 continue
             says = REMEMBERED if remembers else judge.says
-            played = [[replays.costs(each, *runs) for each in (law, act)] for runs in (logged, new)]
+            played = [[replays.costs(each, *of) for each in (law, act)] for of in (logged, new)]
             runs = [each.reshape(len(each), -1) for each in played[1]]
             for mpc, policy in played:
-                mean = mpc.mean(axis=2), policy.mean(axis=2)
-                found.append((*_changed(*mean, independent, runs), says))
+                means = mpc.mean(axis=2), policy.mean(axis=2)
+                found.append((*_changed(*means, independent, runs), says))
     low = [each[1] for each in found]
     high = [each[2] for each in found]
     change = (found[0][0] + found[1][0]) / 2
@@ -263,13 +264,14 @@ def surely_worse(behind: Array) -> NDArray[np.bool_]:
 
 
 def _changed(
-    mpc: Array, policy: Array, independent: int, runs: Sequence[Array] | None = None
+    mpc: Array, policy: Array, independent: int, runs: Sequence[Array]
 ) -> tuple[float, float, float]:
     """Return a change relative to the MPC, and the ends of its interval; costs are (members, N).
 
-    ``runs``, (members, .) of MPC and policy, are from new starts.
+    ``runs``, (members, .) of MPC and policy, are from new starts: of few episodes they tell how
+    much starts vary. Fits to so few err alike, which is why the interval has room then.
     """
-    if independent >= EACH or runs is None:
+    if independent >= EACH:
         runs = mpc, policy
     with np.errstate(all="ignore"):
         ratios = (policy - mpc).mean(axis=1) / np.abs(mpc).mean(axis=1)  # (members,)
@@ -281,9 +283,9 @@ def _changed(
     mean = float(ratios.mean())
     likely = [stats.t.ppf(ONE_SIDED, k - 1) for k in (independent, max(len(ratios), 2))]
     room = 0.0
-    if independent < EACH:  # few do not tell how much starts vary, runs from new ones do
+    if independent < EACH:
         likely[0] = stats.norm.ppf(ONE_SIDED)
-        room = RULE.least_gain * bool(changes.any())  # fits to so few err alike
+        room = RULE.least_gain * bool(np.any(policy != mpc) or changes.any())
     count = changes.shape[1]
     # Most of a gain or a loss may lie in few starts: weights at random (Rubin, Ann. Stat. 9,
     # 1981), as far out as brings normal changes to what is likely of them.
@@ -308,11 +310,11 @@ def _cure(
     more: Callable[[int], str],
 ) -> str:
     """Return what would settle a change whose interval contains zero."""
+    if not np.isfinite(high - low):
+        return "log more episodes"
     if middle >= 0 or says == REMEMBERED:
         kind = " for longer than the actuator takes" if says == REMEMBERED else ""
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
-    if not np.isfinite(high - low):
-        return "log more episodes"
     needed = independent * min(((high - middle) / middle) ** 2, 100.0)
-    return f"log about {more(int(np.ceil(needed)) - independent + 1)} more"
+    return f"log about {more(max(int(np.ceil(needed)), EACH) - independent + 1)} more"

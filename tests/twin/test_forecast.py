@@ -106,13 +106,15 @@ def test_new_set_points_lie_between_those_of_the_log(levels: tuple[float, float]
 
 def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> None:
     for more, sure in (([-0.3, -0.03, 0, 0, 1e-3], True), ([-0.3, 0.03, 0.1, 0.1, 1e-3], False)):
-        mean, low, high = _changed(np.ones((5, 5)), 1 + np.array([more] * 5), 5)
+        mean, low, high = _changed(np.ones((5, 5)), 1 + np.array([more] * 5), 5, [])
         assert (high < 0) == sure and min(more) < low < mean < high < max(more)
     for dearer, sure in ((1, True), (12, False)):  # of two, new starts tell how much they vary
         more = np.r_[np.full(dearer, 0.3), np.linspace(-0.3, -0.1, 60 - dearer)]
         runs = np.ones((2, 60)), 1 + np.array([more, more])
         mean, _, high = _changed(np.ones((2, 2)), np.full((2, 2), 0.8), 2, runs)
         assert np.isclose(mean, -0.2) and (high < 0) == sure
+    narrow = _changed(np.ones((2, 2)), np.full((2, 2), 0.98), 2, [np.ones((2, 9))] * 2)
+    assert narrow == pytest.approx((-0.02, -0.021, -0.019))  # fits to two episodes err alike
 
 
 def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:

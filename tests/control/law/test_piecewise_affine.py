@@ -210,13 +210,11 @@ def saved(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Any, Path, An
 def test_a_file_holds_operating_point_sampling_time_names_and_units(saved: Any) -> None:
     law, path, kind = saved
     model = reactor().model
-    read = kind.load(path)
-    assert read == law and read.model == model
-    copied = pickle.loads(pickle.dumps(law))
-    assert copied.model == model and not copied.theta_ss.flags.writeable
-    for name in ("dt", "state_names", "input_names", "disturbance_names", "units"):
-        assert getattr(read.model, name) == getattr(model, name)
-    assert read.theta_ss.tolist() == [2, 350, 350, 7, 40]
+    for read in (kind.load(path), pickle.loads(pickle.dumps(law))):
+        assert read == law and read.model == model and not read.theta_ss.flags.writeable
+        for name in ("dt", "state_names", "input_names", "disturbance_names", "units"):
+            assert getattr(read.model, name) == getattr(model, name)
+        assert read.theta_ss.tolist() == [2, 350, 350, 7, 40]
 
 
 def test_the_plant_takes_what_the_law_says_of_what_it_shows(saved: Any) -> None:
