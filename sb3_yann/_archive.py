@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 DIGEST = "digest"
-KINDS = "biufU"  # of arrays: numbers, truth values and text
+STORED_KINDS = "biufU"  # of arrays: numbers, truth values and text
 MAX_SIZE = 2**32
 """Bytes of a file. What is larger is refused: a reader holds all of it in memory."""
 
@@ -70,7 +70,9 @@ def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
         raise ValueError(
             f"{fspath(path)} would hold {size} bytes, more than {MAX_SIZE} are not read."
         )
-    if wrong := [k for k, each in arrays.items() if np.asarray(each).dtype.kind not in KINDS]:
+    if wrong := [
+        k for k, each in arrays.items() if np.asarray(each).dtype.kind not in STORED_KINDS
+    ]:
         raise TypeError(f"{fspath(path)}: {wrong} hold no numbers, truth values or text.")
     with atomic_write(path) as part, part.open("wb") as file:
         np.savez(file, **{**arrays, DIGEST: digest_of(arrays)})
@@ -129,7 +131,7 @@ def _array(name: str, content: bytes) -> Any:
     formats: Any = np.lib.format
     formats.read_magic(file)
     shape, by_columns, kind = formats.read_array_header_1_0(file)
-    if kind.kind not in KINDS:
+    if kind.kind not in STORED_KINDS:
         raise ValueError(f"{name} is no array of numbers, truth values or text")
     if len(content) - file.tell() != math.prod(shape) * kind.itemsize or not kind.itemsize:
         raise ValueError(f"{name} is not as large as its header says")

@@ -595,12 +595,9 @@ def _period(parts: Sequence[Array]) -> int:
         count += len(steps)
         apart += [*np.diff(rows[1:][steps != 0])]
         sizes += [*np.abs(steps[steps != 0])]
-    repeats = 2 * len(sizes) < count
-    if (
-        not repeats
-        or len(apart) < LEAST_READ
-        or len(np.unique(np.round(sizes / np.max(sizes), 6))) < 3
-    ):
+    if len(apart) < LEAST_READ or 2 * len(sizes) >= count:  # it changes in most rows
+        return 1
+    if len(np.unique(np.round(sizes / np.max(sizes), 6))) < 3:
         return 1
     found, counts = np.unique(apart, return_counts=True)
     every = int(found[np.argmax(counts)])  # some readings are equal, and change nothing

@@ -44,9 +44,9 @@ class Judge:
     """A twin that a log may refute, fitted without each fold of the episodes.
 
     Member k has not seen fold k: every episode whose number is k modulo the members, of fewer than
-    five a part of each. ``says`` is
-    what sets it apart. It is ``refuted`` where it predicts held-out episodes surely worse than the
-    twin; dynamics that both lack may feign that: with a memory it counts.
+    five a part of each. ``says`` is what sets it apart. It is ``refuted`` where it predicts
+    held-out episodes surely worse than the twin; dynamics that both lack may feign that: with a
+    memory it counts.
     """
 
     dynamics: Dynamics
