@@ -10,6 +10,9 @@ PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
 # python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
+# Where this is set, as in many containers, each process compiles torch's sources anew: 12 s.
+export PYTHONDONTWRITEBYTECODE :=
+
 CODE := sb3_yann envs benchmarks experiments examples tests noxfile.py docs/conf.py docs/pictures.py
 
 .DEFAULT_GOAL := help
