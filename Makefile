@@ -22,7 +22,7 @@ help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(STAMP)  ## run two examples, examples/cstr.py and examples/from_a_log.py
-	@$(PY) examples/cstr.py --episodes 20
+	@$(PY) examples/cstr.py --episodes 16
 	@$(PY) examples/from_a_log.py
 
 paper: $(STAMP)  ## run the paper's experiments, hours (make paper ARGS="--quick" for minutes)

@@ -204,7 +204,7 @@ def test_a_laboratory_value_now_and_then_is_kept_for_models_of_outputs(write) ->
     log = Log.from_csv(write("T,quality,valve", *rows), ["T", "quality"], ["valve"], dt=1)
     assert [len(each) for each in log.episodes] == [699, 499]
     assert (log.every, log.lost_steps) == ((1, 10), 2)
-    found = identify_outputs(log)
+    found = identify_outputs(log, order=2, delay=0)
     assert "Read now and then: quality every 10 samples" in found.report()
     guess = found.predict(x, u[:, None], ahead=20)
     assert np.std((guess - x[20:])[40:], axis=0).max() < 0.05  # x moves by .7 and .5

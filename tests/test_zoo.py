@@ -157,6 +157,7 @@ def test_training_continues_from_a_saved_model(run) -> None:
     assert run.model(2)._n_updates > before._n_updates
 
 
+@pytest.mark.nightly
 def test_enjoy_replays_the_trained_model(run) -> None:
     steps = str(EPISODE[run.env_id])
     run.zoo("enjoy", "--exp-id", "1", "--no-render", "-n", steps, "--reward-log", "rewards")

@@ -186,7 +186,7 @@ def test_one_dear_start_that_gains_does_not_hide_that_all_others_lose() -> None:
     assert not found.accepted and "not sure" in found.reason
 
 
-@pytest.mark.parametrize("spread", [0.02, 0.3])
+@pytest.mark.parametrize("spread", [pytest.param(0.02, marks=pytest.mark.nightly), 0.3])
 def test_of_a_thousand_policies_that_are_no_better_at_most_a_twentieth_is_accepted(spread) -> None:
     accepted = 0
     least = LOOKS[-1]

@@ -285,10 +285,10 @@ def test_a_simulator_may_fail_where_the_mpc_does_not_go() -> None:
         raises = False
 
     healthy, vanished = (
-        headroom(heater(), make(bend=0.1, steps=30), n_starts=3) for make in (Heater, Vanishing)
+        headroom(heater(), make(bend=0.1, steps=20), n_starts=2) for make in (Heater, Vanishing)
     )
     with pytest.warns(NonFiniteWarning, match=r"raised RuntimeError\('beyond .* counts as lost"):
-        failed = headroom(heater(), Fragile(bend=0.1, steps=30), n_starts=3)
+        failed = headroom(heater(), Fragile(bend=0.1, steps=20), n_starts=2)
     assert Fragile.failed and Vanishing.failed
     for found in (failed, vanished):
         np.testing.assert_allclose(found.best_costs, healthy.best_costs, rtol=2e-3)

@@ -45,7 +45,7 @@ def test_workers_take_no_step_more_than_is_left() -> None:
 
 @pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
 def test_a_vec_env_is_a_simulator(kind) -> None:
-    envs = kind([Spring] * 3)
+    envs = kind([Spring] * 2)
     problem = model_of().policy.problem
     alone = Simulator(problem, Spring, 0)
     shared = Simulator(problem, envs, 0)

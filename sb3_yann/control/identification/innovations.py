@@ -28,8 +28,10 @@ LAGS = (1, 2, 4, 6, 9, 13, 19, 28)
 """Lags of the ARX models that are tried."""
 CHUNK = 2000
 """Longest stretch of samples whose first state is estimated on its own."""
-CHANCES = CHANCE, SURE_CHANCE = 0.001, 1e-6
-"""Significance levels of the effects of inputs."""
+CHANCE = 0.001
+"""Significance level of the effects of inputs."""
+CHANCES = (CHANCE, 1e-6)
+"""The levels that are tried."""
 FLOOR = 1e-14
 """Variance, of scaled outputs, below which all is rounding."""
 TINY_RIDGE = 1e-9

@@ -72,9 +72,14 @@ def test_data_without_noise_give_the_matrices_back() -> None:
 @pytest.mark.slow
 def test_steady_gains_have_errors_and_one_that_may_be_zero_is_named() -> None:
     G = np.linalg.solve(np.eye(2) - A, B)
-    draws = [identify(*record(i, process=0.02)[:2], dt=1, held_out=0).model for i in range(200)]
-    off = [np.linalg.solve(np.eye(2) - each.A, each.B) - G for each in draws]
-    share = np.mean(np.abs(off) <= 1.96 * np.array([each.gains.errors for each in draws]), axis=0)
+    none = np.zeros((400, 0))
+    logs = [[Episode(*record(i, process=0.02)[:2], none)] for i in range(200)]
+    gains = [gains_of(regress(log, (2, 1, 0), None, 0.0), 2, 1) for log in logs]
+    found = identify(*record(0, process=0.02)[:2], dt=1, held_out=0).model
+    np.testing.assert_allclose(found.gains.errors, gains[0].errors)
+    np.testing.assert_allclose(np.linalg.solve(np.eye(2) - found.A, found.B), gains[0].values)
+    inside = [np.abs(each.values - G) <= 1.96 * each.errors for each in gains]
+    share = np.mean(inside, axis=0)
     assert np.all(np.abs(share - 0.95) < 0.062), share
     known = Gains.of(A, B, 0, [np.array([[5.0], [0.1]])] * 4)
     told = LinearModel(A, B, dt=1, gains=known).report()
