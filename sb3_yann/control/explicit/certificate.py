@@ -257,9 +257,10 @@ class Certificate:
     def _fail(self, what: str, theta: Array) -> NoReturn:
         place = theta * self.half + self.center
         raise ExplicitSolutionError(
-            f"The explicit solution failed its check: {what}, at theta = {place.tolist()}. The "
-            f"problem is likely to be badly conditioned: shorten the horizon, or bring states and "
-            "weights to similar magnitudes."
+            f"The explicit solution failed its check: {what}, at theta = {place.tolist()} from the "
+            "operating point. The problem is likely to be badly conditioned: shorten the horizon, "
+            "bring states and weights to similar magnitudes, or use online(), which needs no "
+            "regions."
         )
 
 

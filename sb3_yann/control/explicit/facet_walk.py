@@ -34,6 +34,8 @@ from sb3_yann.control.polyhedra import (
 
 THINNEST = 1e-9
 """Regions that hold no ball of this radius, in half-widths of the box, are left out."""
+APART = 1e-8
+"""How far constraints are moved out, where one of several active sets is to be told."""
 OUTER = -1
 """Stands for the constraint of a facet with nothing feasible beyond."""
 SHARED = -2
@@ -245,7 +247,10 @@ class Conditions:
         self.kept = moving[np.flatnonzero(alive[: len(moving)])]
 
     def active_at(self, theta: Array) -> int | None:
-        """Return DAQP's working set at theta, None if infeasible."""
+        """Return DAQP's working set at theta, None if infeasible.
+
+        With constraints moved apart: of several sets with one law it is that which has a region.
+        """
         if np.any(self.outer_A @ theta > self.outer_b + 1e-11):
             return None
         rows = len(self.kept)
@@ -255,7 +260,7 @@ class Conditions:
         import daqp
 
         n = len(theta)
-        upper = (self.D[:, :n] @ theta + self.D[:, n]) * self.units
+        upper = (self.D[:, :n] @ theta + self.D[:, n] + APART * self.apart) * self.units
         lower = np.full(rows, -1e30)
         sense = np.zeros(rows, dtype=np.intc)
         _, _, status, info = daqp.solve(*self.least_distance, upper, lower, sense, primal_tol=1e-11)

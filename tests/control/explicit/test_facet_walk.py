@@ -157,9 +157,6 @@ def test_balls_corners_and_facets_are_those_of_linear_programs(seed: int) -> Non
         assert rest.min() == pytest.approx(width, rel=1e-5)
 
 
-# ---- An explicit solution that is wrong never leaves `explicit()`: the error names a theta ----
-
-
 Regions = list[Any]
 THIN = "a final state held to 1e-4"
 DROPS = {"pendulum": 7, THIN: 15}
@@ -232,6 +229,22 @@ def test_a_region_that_reaches_a_hair_too_far_is_trimmed(
         (same,) = np.flatnonzero(off < 1e-12)
         assert law.neighbors[same] == right.neighbors[k]
     np.testing.assert_array_equal(law.A[own:], right.A[known:])
+
+
+@pytest.mark.parametrize("change", [0.25, 0.4, 0.5])
+@pytest.mark.parametrize(("pole", "low"), [(0.8, 0), (-0.5, 0), (1.0, -1)])
+def test_rates_that_divide_the_range_leave_no_gap(pole: float, low: float, change: float) -> None:
+    """Rates and bounds are tight together, and several constraints share a facet."""
+    plant = LinearModel([[pole]], [[0.5]], dt=1)
+    own = {"u_min": low, "u_max": 1, "x_min": -3, "x_max": 3}
+    for horizon, weight in ((4, 0.0), (4, 0.05), (5, 0.0)):
+        rate = RateLimits(-change, change, R_du=[[weight]])
+        mpc = LinearMPC(plant, Q=[[1]], R=[[0.01]], horizon=horizon, rate=rate, **own)
+        theta = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (200, 2))
+        law = mpc.explicit()
+        inside = law.in_domain(theta)
+        assert inside.sum() > 100
+        np.testing.assert_allclose(law(theta[inside]), mpc.online()(theta[inside]), atol=1e-8)
 
 
 def test_a_region_that_is_there_twice_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

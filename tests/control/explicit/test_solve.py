@@ -142,9 +142,6 @@ def test_random_state_settings_of_numpy_and_the_folder_are_untouched(
     assert list(tmp_path.iterdir()) == []
 
 
-# ---- Problems of the suite, and final states that are held ----
-
-
 # One of each kind, what once failed first.
 FEW = [
     *(
