@@ -87,7 +87,7 @@ class Headroom:
         Of :func:`offset_free`, where its default is less than the disturbances of this plant.
     lost : float, optional
         By how much plans cost more than the MPC when they were first played, relative to it, where
-        the model of the env's episodes is poor.
+        the model of the env's episodes is poor, or that is half a percent.
     observer_played, reidentified_played : ndarray, shape (starts,), optional
         What the MPC with an observer and the re-identified one cost when they were played, losses
         included; None where they were not.
@@ -410,11 +410,8 @@ class _Search:
         self.say(f"{len(self.seeds)} episodes of the MPC")
 
     def observe(self) -> None:
-        """Play the same MPC with an observer, unless it has one or knows disturbances to come."""
+        """Play the same MPC with an observer, unless it has one."""
         mpc = self.mpc
-        if mpc.disturbances.preview:
-            self.why["observer"] = "theta of the MPC holds disturbances to come"
-            return
         thetas, inputs, following = self.base.steps()
         beyond = np.abs(following - mpc.deviations.predict(thetas, inputs)).max(axis=0)
         unit = mpc.theta_half[mpc.layout.state]
@@ -531,7 +528,9 @@ class _Search:
         if verdict == [*ADVICE][1]:  # where it loses from some starts, others may bring less
             if not offset > SURE * dataclasses.replace(whole, best_costs=observer).standard_error:
                 verdict = UNKNOWN
-        lost = -gain(base, self.played.get("plan", base)) if self.poor else 0.0
+        lost = -gain(base, self.played.get("plan", base))
+        if not self.poor and lost < LITTLE:  # noise is that as well
+            lost = 0.0
         unplanned = int(np.count_nonzero(~self.planned))
         if (lost > 0 or unplanned) and verdict_of(*parts) == "keep the MPC":
             verdict = UNKNOWN
@@ -575,13 +574,14 @@ class Observing:
         self.observer = observer
         self.observers: list[DisturbanceObserver] = []
         self.u: Array = np.zeros((0, 0))
-        self.loads: Array = np.zeros((0, 0))  # the measured disturbances that acted with u
+        self.loads: Array = np.zeros((0, 0))  # disturbances, measured or to come, as u acted
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
         layout = self.problem.layout
         bounds = self.other.deviations.disturbances
         x = theta[:, layout.state]
+        k = layout.n_disturbances  # of this sample; behind them stands the preview
         measured = theta[:, layout.disturbance]
         if t == 0:
             self.observers = [copy.copy(self.observer) for _ in x]
@@ -590,12 +590,11 @@ class Observing:
             found = [each.reset(y) for each, y in zip(self.observers, x, strict=True)]
         else:
             found = [
-                self.observers[i].update(y, self.u[i], self.loads[i] if measured.size else None)
+                self.observers[i].update(y, self.u[i], self.loads[i, :k] if k else None)
                 for i, y in zip(rows, x, strict=True)
             ]
         self.loads[rows] = measured
         x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
-        k = measured.shape[1]
         d = np.hstack([measured, np.clip(d_hat, bounds.d_min[k:], bounds.d_max[k:])])
         rest = theta[:, layout.limits], theta[:, layout.previous]
         parts = x_hat, theta[:, layout.reference], d, *rest

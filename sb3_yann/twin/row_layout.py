@@ -81,7 +81,7 @@ class RowLayout:
         part = self.problem.layout.disturbance
         if self.estimator is None or self.observer is not None:
             return slice(part.stop, part.stop)
-        return slice(part.start + self._n_disturbances - self.estimator.n_estimated, part.stop)
+        return slice(part.stop - self.estimator.n_estimated, part.stop)
 
     @cached_property
     def size(self) -> int:
@@ -122,7 +122,8 @@ class RowLayout:
     def inputs(self) -> Any:
         """Where in ``[row, u]`` stands what the plant's next state depends on, (k,)."""
         number = np.arange(self.size + self.problem.model.n_inputs)
-        d = number[self.problem.layout.disturbance] if self.observer is None else number[:0]
+        parts = self.problem.layout
+        d = parts.now[parts.n_references :] if self.observer is None else number[:0]
         return np.concatenate([number[self.state], d, number[self.size :]])
 
     @cached_property

@@ -46,9 +46,8 @@ def heater(**changes) -> LinearMPC:
     """One state that follows a set-point, its input within bounds."""
     design = {"Q": [[1.0]], "R": [[0.1]], "horizon": 3, "u_min": -2, "u_max": 2}
     tracking = Tracking([0], -1, 1)
-    box = {"theta_min": -5, "theta_max": 5}
-    model = LinearModel([[0.8]], [[0.5]], dt=1.0)
-    return LinearMPC(model, **{**design, "tracking": tracking, **box, **changes})
+    box = {"theta_min": -5, "theta_max": 5, "model": LinearModel([[0.8]], [[0.5]], dt=1.0)}
+    return LinearMPC(**{**design, "tracking": tracking, **box, **changes})
 
 
 class Heater(Sampled):
@@ -438,3 +437,28 @@ def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:
     env = ObserveDisturbance(Heater(load=0.1), observer, -0.25, 0.25)
     found = headroom(mpc, env, n_starts=3)
     assert found.offset == 0 and np.array_equal(found.observer_costs, found.mpc_costs)
+
+
+class Foreseen(Heater):
+    """A load that is known two samples ahead moves it, and its input less than its model says."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (5,), np.float32)
+    starts = (-0.3, 0.3)
+
+    def __init__(self) -> None:
+        super().__init__()
+        model = LinearModel([[0.8]], [[0.5]], dt=1.0, E=[[1.0]])
+        loads = DisturbanceBounds(-0.3, 0.3, preview=2)
+        self.mpc = heater(model=model, disturbances=loads)
+
+    def moved(self, u):
+        x, r, *loads = self.x
+        after = 0.8 * x + 0.4 * u[0] + loads[0] + 0.2
+        return np.array([after, r, *loads[1:], self.np_random.uniform(-0.3, 0.3)])
+
+
+def test_what_is_foreseen_moves_the_plant_only_when_it_is_there() -> None:
+    found = headroom(Foreseen().mpc, Foreseen, n_starts=3, max_steps=NO_PLANS)
+    assert found.offset > 0.1 and "observer" not in found.why
+    told = found.reidentified.model
+    np.testing.assert_allclose([told.A[0, 0], told.B[0, 0], told.E[0, 0]], [0.8, 0.4, 1], atol=0.01)

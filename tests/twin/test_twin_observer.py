@@ -248,6 +248,8 @@ def test_estimates_beside_a_load_that_is_foreseen_keep_their_own_bounds() -> Non
     loads = {"disturbances": DisturbanceBounds(-1, 1, preview=2), "terminal": None, **LIMITS}
     model = replace(MODEL, E=[[1], [0]], d_ss=[0])
     row = RowLayout(*offset_free(replace(BASE, model=model, **loads)))
+    assert row.inputs.tolist() == [0, 1, 3, 6, 7]  # of [x, r, d, d ahead, d estimated, u]
+    assert np.flatnonzero(row.spread.any(axis=1)).tolist() == [0, 1, 6]
     found = row.run(np.full((9, 1), 3.0), np.zeros((8, 1)), np.zeros((9, 1)))
     assert found[1].max() == row.problem.disturbances.d_max[1]
 
