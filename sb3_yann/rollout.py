@@ -58,6 +58,8 @@ class Trajectories:
         The same; NaN at a violation, or an end, which may have changed the reward.
     excess : BoundExcess, optional
         By how much each episode exceeds the bounds of the problem, where one was given.
+    penalty : ndarray, shape (episodes,)
+        Sum of ``info["penalty"]``, what soft bounds cost: it is in no reward.
 
     Examples
     --------
@@ -77,6 +79,7 @@ class Trajectories:
     rewards: tuple[Array, ...] = ()
     own_rewards: tuple[Array, ...] = ()
     excess: BoundExcess | None = None
+    penalty: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def lengths(self) -> NDArray[np.int64]:
@@ -258,6 +261,7 @@ class _Step(NamedTuple):
     succeeded: NDArray[np.bool_]
     changed: NDArray[np.bool_]
     """Whether a violation may have changed the reward."""
+    penalty: Array
 
 
 @dataclass
@@ -292,8 +296,8 @@ class _Envs:
         violated = bool(info.get("violation", False))
         success = bool(info.get("is_success", False))
         ends = bool(terminated), bool(truncated)
-        changed = may_change_reward(info)
-        return np.array(observation), as_reward(reward), *ends, violated, success, changed
+        told = violated, success, may_change_reward(info), as_reward(info.get("penalty", 0.0))
+        return np.array(observation), as_reward(reward), *ends, *told
 
     def _asked(self, i: int, call: Callable[..., Any], *given: Any, **named: Any) -> Any:
         """Call an env; an error says in which episode, and where in it."""
@@ -334,7 +338,8 @@ class _Copies:
         success = np.array(info.get("is_success", none), dtype=bool)
         earned = np.array(rewards, dtype=np.float64)
         ends = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
-        return _Step(np.array(observations), earned, *ends, violated, success, violated)
+        paid = np.array(info.get("penalty", np.zeros(len(rows))))
+        return _Step(np.array(observations), earned, *ends, violated, success, violated, paid)
 
 
 def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
@@ -361,7 +366,7 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
         shown = step.observations[live]
         rows = rows[live]
     passed.close()
-    _, rewards, terminated, truncated, violated, succeeded, changed = map(
+    _, rewards, terminated, truncated, violated, succeeded, changed, penalty = map(
         np.array, zip(*steps, strict=True)
     )
     last = np.argmax(terminated | truncated, axis=0)
@@ -383,6 +388,7 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
         succeeded=succeeded[at_end],
         rewards=parts(rewards),
         own_rewards=parts(own),
+        penalty=np.sum(np.where(taken, penalty, 0.0), axis=0),
     )
 
 

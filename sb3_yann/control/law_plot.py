@@ -57,6 +57,15 @@ def legend_beside(axes: Axes) -> None:
         axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0, frameon=False)
 
 
+def require_regions(law: Any) -> None:
+    """Raise ValueError where a law is solved online."""
+    if not hasattr(law, "starts"):
+        raise ValueError(
+            f"{law!r} is solved online and has no regions. Take LinearMPC.explicit(), or draw its "
+            "input by sb3_yann.evaluation.plots.plot_surface."
+        )
+
+
 def plot_law(
     law: Any,
     axes: Axes | None = None,
@@ -104,11 +113,7 @@ def plot_law(
     >>> len(axes.patches), axes.get_xlabel()
     (7, 'angle (rad)')
     """
-    if not hasattr(law, "starts"):
-        raise ValueError(
-            f"{law!r} is solved online and has no regions. Take LinearMPC.explicit(), or draw its "
-            "input by sb3_yann.evaluation.plots.plot_surface."
-        )
+    require_regions(law)
     if law.n_theta == 1:
         return _draw_line(law, axes, labels)
     across, up = _entries(entries, law)

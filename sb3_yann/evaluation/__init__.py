@@ -38,11 +38,14 @@ def comparison_table(title: str, before: Trajectories, after: Trajectories) -> s
             lines.append(f"  {number:<13}{old:>12,.2f}{new:>12,.2f}{new - old:>+12,.2f}")
     violations = f"{after.violations.sum()} steps, {before.violations.sum()} with the MPC"
     old, new = (each.observations[0].shape[-1] for each in (before, after))
+    paid = [float(np.sum(each.penalty)) / counts[0] for each in (after, before)]
+    soft = f"{paid[0]:.5g} instead of {paid[1]:.5g} an episode, which is in no cost above"
     other = f"observations have {old} and {new} entries: rewards may be of different costs"
     return summary_lines(
         "\n".join(lines),
         **paired_rows(after.costs, before.costs),
         violations=violations,
+        soft_bounds=soft * any(paid),
         note=other * (old != new),
     )
 

@@ -22,6 +22,7 @@ from sb3_yann.control.law_plot import (
     legend_beside,
     new_figure,
     plot_law,
+    require_regions,
 )
 from sb3_yann.control.linear_system import labels_of, with_units
 from sb3_yann.control.mpc.report import ActiveConstraints
@@ -113,7 +114,7 @@ def plot_regions(
     chosen = [_entry_of(problem, each) for each in entries]
     name = ActiveConstraints(problem) if by == "constraint" else None
     labels = problem.labels(units=True)
-    return plot_law(problem.explicit(), axes, entries=chosen, at=at, labels=labels, name=name)
+    return plot_law(problem.law(), axes, entries=chosen, at=at, labels=labels, name=name)
 
 
 # ---- Surfaces ----
@@ -263,7 +264,8 @@ def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figur
     >>> len(use_figure(mpc, mpc.explicit(), played).axes)
     2
     """
-    law = problem.explicit()
+    law: Any = problem.law()
+    require_regions(law)
     theta = np.concatenate([each[:-1] for each in episodes.observations])
     theta = problem.units.to_deviations(theta[np.isfinite(theta).all(axis=1)])
     apart = np.abs(inputs_of(problem, policy, theta) - law(theta)) / problem.u_half

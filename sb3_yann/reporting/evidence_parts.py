@@ -71,7 +71,8 @@ def loops_part(subject: Subject) -> Part:
     averages = ("mean cost", np.mean), ("median cost", np.median), ("worst cost", np.max)
     values = [(name, float(of(mpc.costs)), float(of(policy.costs))) for name, of in averages]
     shares = [_stage_costs(subject.problem, each) for each in (mpc, policy)]
-    parts = zip(("states", "inputs off their rest", "moves of inputs"), *shares, strict=True)
+    names = "states", "inputs off their rest", "moves of inputs", "prices"
+    parts = zip(names, *shares, strict=True)
     values += [(f"mean stage cost of {name}", *both) for name, *both in parts if any(both)]
     rows = [[name, f"{old:.6g}", f"{new:.6g}", _change(old, new)] for name, old, new in values]
     for name, before, after in (
@@ -162,21 +163,27 @@ def _exceeded(problem: LinearMPC, loops: Mapping[str, Trajectories]) -> Iterator
         yield Finding("look", f"Episodes exceed a limit with the {'; with the '.join(exceeding)}.")
 
 
-def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float, float]:
-    """Return what an episode costs at rest at u_s of theta, with inputs off u_s, and moving."""
+def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float, float, float]:
+    """Return what an episode costs at rest at u_s of theta, off it, by moving, and by prices."""
     theta, u, _ = loops.steps()  # in deviations
-    stage_cost = problem.deviations.stage_cost
+    own = problem.deviations
+    slopes = np.split(own.stage_slope, [problem.n_theta])
+
+    def quadratic(theta: Array, u: Array) -> float:
+        priced = theta @ slopes[0] + u @ slopes[1] + own.price.constant
+        return float((own.stage_cost(theta, u) - priced).sum()) / len(loops.costs)
 
     def steady(held: Array) -> float:
         still = theta.copy()
         if problem.layout.n_previous:
             still[..., problem.layout.previous] = held
-        return float(stage_cost(still, held).sum()) / len(loops.costs)
+        return quadratic(still, held)
 
     at_rest = steady(theta @ problem.error_system.to_input.T)
     off_rest = steady(u)
-    whole = float(stage_cost(theta, u).sum()) / len(loops.costs)
-    return at_rest, off_rest - at_rest, whole - off_rest
+    whole = quadratic(theta, u)
+    prices = float(own.stage_cost(theta, u).sum()) / len(loops.costs) - whole
+    return at_rest, off_rest - at_rest, whole - off_rest, prices
 
 
 def _change(old: float, new: float) -> str:

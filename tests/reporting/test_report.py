@@ -28,6 +28,7 @@ from sample_plants import LinearPlant
 from sb3_yann import (
     AffineObservation,
     Headroom,
+    LinearCost,
     LinearModel,
     LinearMPC,
     NoActionNoise,
@@ -366,12 +367,14 @@ def check_that_costs_add_up(page: str) -> None:
 
 
 def test_what_moves_cost_is_no_cost_of_states() -> None:
-    mpc = servo(tracking=None, rate=RateLimits(R_du=[[2.0]]))
+    price = LinearCost(x=[0.3, 0], u=0.2, constant=1)
+    mpc = servo(tracking=None, rate=RateLimits(R_du=[[2.0]]), price=price)
     env = TimeLimit(PreviousInput(LinearPlant(servo(tracking=None))), 5)
     loops = evaluate(lambda theta: 0.5 - theta[-1:], env, range(2))
     theta, u, _ = loops.steps()
     x, before = np.split(theta, [2], axis=1)
-    wanted = np.sum((x @ mpc.Q) * x), np.sum(mpc.R * u**2), np.sum(2 * (u - before) ** 2)
+    paid = np.sum(0.3 * x[:, 0] + 0.2 * u[:, 0] + 1)
+    wanted = np.sum((x @ mpc.Q) * x), np.sum(mpc.R * u**2), np.sum(2 * (u - before) ** 2), paid
     assert evidence_parts._stage_costs(mpc, loops) == pytest.approx(np.array(wanted) / 2)
 
 
