@@ -63,7 +63,8 @@ class Check:
     change : float
         Mean cost against the MPC's, over all starts and members: -0.02 is 2 % less.
     worst : float
-        The largest increase of one start on one member, in mean costs of the MPC.
+        The largest increase of one start on one member, in mean costs of the MPC; of what passes,
+        also from new starts, and in every model of a forecast.
     safe : bool
         Whether no start violates more than with the MPC.
     logged, error : float

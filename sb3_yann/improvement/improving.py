@@ -588,7 +588,8 @@ class _Work:
             if not confirmed.accepted:
                 found = replace(confirmed, reason=f"on new starts, {confirmed.reason}")
             else:
-                found = self._forecast(trial.twin, found)
+                worst = max(found.worst, confirmed.worst)
+                found = self._forecast(trial.twin, replace(found, worst=worst))
         how = f"{share:.0%} of the correction, {trial.n_known} starts like the log's in each member"
         self.note(found, how, found.verdict)
         return found
@@ -602,10 +603,13 @@ class _Work:
     def _forecast(self, twin: PlantTwin, check: Check) -> Check:
         """Return a check with what the layer changes on the plant; it must surely gain."""
         self.say.write(f"its change on the plant, by {len(twin.judges)} models of the log")
-        change, low, high, cure = twin.forecast(self.act())
+        change, low, high, cure, worst, objection = twin.forecast(self.act())
         found = replace(check, logged=change, error=(high - low) / 2, interval=(low, high))
-        if high < 0:
+        found = replace(found, worst=max(check.worst, worst))
+        if high < 0 and not objection:
             return found
+        if high < 0:
+            return replace(found, accepted=False, reason=f"from new starts, {objection}")
         text = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
         little = max(-low, high) < RULE.least_gain
         leads_on = "too little to teach" if little else f"to settle it, {cure}"

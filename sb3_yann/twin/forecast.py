@@ -7,7 +7,7 @@ adds what it had missed there: loads and noise are those of the log, and the pol
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -62,6 +62,10 @@ class Forecast(NamedTuple):
     high: float
     cure: str
     """What would make the interval narrower."""
+    worst: float = 0.0
+    """The largest increase of a start, in mean costs of the MPC: also from new set-points."""
+    objection: str = ""
+    """What the acceptance rule says against it, from new starts in the twin; empty for nothing."""
 
 
 class _Replays:
@@ -219,7 +223,8 @@ def forecast(
     standard error is that over the episodes, of fewer than five independent ones over runs from new
     starts, with that of a fit without each fold of them (the jackknife). Where its errors follow
     earlier inputs and errors, the judge is asked again with a memory of them. The first judge is
-    the twin's own; ``loosest`` is the input that follows the MPC most closely.
+    the twin's own: there new starts must keep the rule for the worst ones, too. ``loosest`` is the
+    input that follows the MPC most closely.
     """
     independent = sum(len(each[::2]) for each in records(judges[0].dynamics.problem, episodes))
     count = len(episodes)
@@ -230,6 +235,8 @@ def forecast(
     logged = np.stack([each.thetas[:1] for each in episodes]), None
     new = drawn.reshape(count, some, -1), plain.new_given(some, rng)
     found: list[tuple[float, float, float, str]] = []
+    lost: list[float] = []
+    objections: list[str] = []
     for judge in bar("forecasts by models of the log", judges, timed=True):
         law = law_of(judge.dynamics.problem)
         for remembers in (False, True):
@@ -241,15 +248,24 @@ def forecast(
             says = REMEMBERED if remembers else judge.says
             played = [[replays.costs(each, *of) for each in (law, act)] for of in (logged, new)]
             runs = [each.reshape(len(each), -1) for each in played[1]]
+            objections.append(_objection(*runs))
             for mpc, policy in played:
                 means = mpc.mean(axis=2), policy.mean(axis=2)
                 found.append((*_changed(*means, independent, runs), says))
+                lost.append(float((policy - mpc).max() / np.abs(mpc).mean()))
     low = [each[1] for each in found]
     high = [each[2] for each in found]
     change = (found[0][0] + found[1][0]) / 2
-    worst = found[int(np.argmax(high))]
+    widest = found[int(np.argmax(high))]
     more = partial(more_of, judges[0].dynamics.problem, episodes)
-    return Forecast(change, min(low), max(high), _cure(*worst, independent, loosest, more))
+    cure = _cure(*widest, independent, loosest, more)
+    return Forecast(change, min(low), max(high), cure, max(lost), objections[0])
+
+
+def _objection(mpc: Array, policy: Array) -> str:
+    """Return what the acceptance rule says of the worst starts of all members, by their costs."""
+    tolerance = replace(RULE.tolerance(mpc), saved=float(np.mean(mpc - policy)))
+    return tolerance.objection(tolerance.excess(mpc, policy).ravel())
 
 
 def surely_worse(behind: Array) -> NDArray[np.bool_]:

@@ -175,7 +175,8 @@ def judge(
             (
                 f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
                 f"mean; {100 * COST_ERROR:.0f} % are the most.",
-                f"Log {more(max(3, n_episodes))} more, or lessen the sensors' noise.",
+                f"Log {more(max(3, n_episodes))} more. If that is no help, the sensors are too "
+                "noisy, or what moves the plant is not in the log: a load, a state, a lag.",
             )
         )
     problems, advice = ([each[i] for each in found if each[i]] for i in range(2))

@@ -439,6 +439,11 @@ def test_in_plant_units_it_finds_the_same(source) -> None:
 
 
 def test_a_log_that_holds_nothing_worth_having_asks_for_no_more_of_it(monkeypatch) -> None:
+    lost = Forecast(-0.1, -0.2, -0.05, "", 0.3, "the worst 5 % of the starts cost too much")
+    monkeypatch.setattr(PlantTwin, "forecast", lambda *_: lost)
+    found = improve(problem(), twin_of(), **FEW)
+    assert not found.accepted and found.checks[-1].worst >= 0.3
+    assert found.checks[-1].reason == f"from new starts, {lost.objection}"
     narrow = Forecast(0.0, -1e-4, 2e-4, "log about 5 episodes more")
     monkeypatch.setattr(PlantTwin, "forecast", lambda *_: narrow)
     found = improve(problem(), twin_of(), **FEW)
