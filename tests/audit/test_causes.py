@@ -273,9 +273,6 @@ def test_other_policies_have_no_problem_to_compare_with() -> None:
         DDPG("MlpPolicy", "Pendulum-v1").learn(8, callback=CostAudit())
 
 
-# ---- A reward that is not the stage cost is reported where that cost counts, and no other ----
-
-
 PLANT = LinearModel([[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0)
 
 

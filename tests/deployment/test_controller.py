@@ -436,9 +436,6 @@ def test_a_policy_that_nothing_has_confirmed_says_so_in_its_files(tmp_path) -> N
     assert note() == ""
 
 
-# ---- What holds for the exported controller of any problem, with any weights and readings ----
-
-
 OPTIONS = st.sampled_from([
     {"networks": "per_region", "max_correction": 0.2},
     {"networks": "shared"},

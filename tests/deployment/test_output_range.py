@@ -69,9 +69,6 @@ def test_a_law_stays_within_the_bounds_of_its_problem(tmp_path) -> None:
     assert np.all((mpc.u_min <= actions) & (actions <= mpc.u_max))
 
 
-# ---- Exported controllers keep the hard bounds of the model, whatever was learnt ----
-
-
 def largest_excess(mpc, act: Callable[[np.ndarray], np.ndarray], steps: int = 50) -> float:
     """Return the largest excess, in half-widths, of plants that are the model."""
     rng = np.random.default_rng(0)

@@ -128,9 +128,6 @@ def test_a_bad_action_is_refused_and_leaves_the_state_alone(
     np.testing.assert_array_equal(env.step(act(1.0))[0], twin.step(act(1.0))[0])
 
 
-# ---- Both environment checkers accept both environments, but for one recommendation each ----
-
-
 ENV_IDS = ["CSTR-v0", "ClippedPendulum-v0"]
 
 # Actions are in physical units on purpose: the controllers that these environments are for have
@@ -155,9 +152,6 @@ def test_stable_baselines3_only_recommends_normalized_actions(env_id: str, wrapp
     (message,) = told(lambda: sb3.check_env(checked, warn=True, skip_render_check=False))
     assert "We recommend you to use a" in message
     assert NORMALIZE in message
-
-
-# ---- Frames of both environments are pictures, and rendering says where it cannot be ----
 
 
 @pytest.mark.parametrize(

@@ -112,9 +112,6 @@ def test_a_dependency_missing_inside_the_module_is_reported_as_such(
         _ = space.problem
 
 
-# ---- The vectorized environments are the single ones, many at a time ----
-
-
 IDS = {"CSTR-v0": 400, "ClippedPendulum-v0": 200}
 
 
@@ -216,9 +213,6 @@ def test_what_does_not_fit_is_refused() -> None:
     for wrong in (np.zeros(2), np.full((2, 1), np.nan)):
         with pytest.raises(ValueError, match=r"actions must be numbers of shape \(2, 1\)"):
             env.step(wrong)
-
-
-# ---- One action for several steps: the sum of their rewards, and nothing lost ----
 
 
 class Counter(gym.Env):

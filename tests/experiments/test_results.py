@@ -155,9 +155,6 @@ def test_the_short_table_has_a_row_for_each_plant_that_was_learnt() -> None:
     assert in_short(left) == ""
 
 
-# ---- The quick form of the experiments: the command itself, from its runs to its report ----
-
-
 @pytest.mark.nightly
 def test_the_quick_form_runs_to_its_report_and_does_nothing_twice(tmp_path) -> None:
     assert "9 of 9 runs" in run_module(tmp_path, "experiments", "--quick")

@@ -58,9 +58,6 @@ def test_the_residual_policy_is_the_mpc_before_training(env_id) -> None:
     np.testing.assert_array_equal(learner.policy.predict(states[0])[0], expected[0])
 
 
-# ---- The optimum of both plants ----
-
-
 STEPS = 60
 PLANTS = {
     "CSTR-v0": (

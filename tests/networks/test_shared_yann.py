@@ -108,9 +108,6 @@ def test_inputs_without_bounds_are_refused() -> None:
         SharedYannLayer(mpc.online())
 
 
-# ---- The paper's own network, layer by layer ----
-
-
 @pytest.fixture
 def float64() -> Iterator[None]:
     before = th.get_default_dtype()

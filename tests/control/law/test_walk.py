@@ -144,9 +144,6 @@ def test_without_a_compiler_the_law_is_the_same(tmp_path: Path) -> None:
     assert compiled == plain
 
 
-# ---- What holds for the law of any problem: random plants, bounds, units and parts of theta ----
-
-
 SEEDS = st.integers(0, 2**32 - 1)
 
 

@@ -264,9 +264,6 @@ def test_what_is_no_environment_of_a_plant_is_named(env: Any, message: str) -> N
         LinearModel.from_env(env)
 
 
-# ---- How a simulator is set, read and scaled: what is tolerated, and where it ends ----
-
-
 def settling(u: Any = (-1.0, 1.0)) -> Plant:
     return Plant(lambda x, u: 0.5 * x + 0.25 * u, (-4.0, 4.0), u)
 

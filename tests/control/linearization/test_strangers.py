@@ -174,9 +174,6 @@ def test_a_plant_that_a_search_runs_away_from_is_left_to_settle() -> None:
     np.testing.assert_allclose(model.x_ss, (200 / 45) ** 2, rtol=1e-6)
 
 
-# ---- Equations in any shape, their steady state, and the differences taken of them ----
-
-
 NAN = np.nan
 A = np.array([[0.0, 1.0], [-2.0, -0.3]])
 B = np.array([[0.0], [1.0]])

@@ -135,9 +135,6 @@ def test_a_strong_discount_over_a_long_horizon_makes_nothing_infeasible(pole) ->
         assert law.in_domain(theta) or not kept
 
 
-# ---- Infinity is the word for no bound; a number that only looks like it is named, never used ----
-
-
 MODEL = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
 
 

@@ -211,9 +211,6 @@ def test_what_does_not_fit_theta_or_the_states_is_named() -> None:
         LinearMPC(tanks, **given, tracking=Tracking(["h"], 0, 9))
 
 
-# ---- By how much episodes exceed the bounds of their problem, and what its soft bounds cost ----
-
-
 TANK = LinearModel(np.diag([0.9, 0.8]), np.eye(2), dt=1.0)
 BOX: Any = {"theta_min": [-4, -50], "theta_max": [4, 50]}
 
@@ -397,9 +394,6 @@ def test_of_inputs_that_cost_their_moves_alone_the_least_norm_is_taken(horizon: 
         u = law([x, 0.3, *u])
         x = 0.8 * x + np.array([0.3, 0.2]) @ u
     np.testing.assert_allclose(x, 0.3, atol=1e-9)
-
-
-# ---- The MPC with a disturbance of each state: what is added, and that all else stays ----
 
 
 MPC = servo(x_min=[-5, -2], x_max=[5, 2])

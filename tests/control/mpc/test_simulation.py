@@ -85,9 +85,6 @@ def test_what_identify_returns_is_a_model_for_it() -> None:
     assert isinstance(mpc.model, LinearModel) and mpc.explicit()([5.0])[0] == pytest.approx(-1)
 
 
-# ---- The report of a problem says in words what its law is ----
-
-
 def test_it_names_every_parameter_with_its_box_and_meaning() -> None:
     text = solved("servo with all of it").report(samples=50)
     for line in (
@@ -159,9 +156,6 @@ def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> Non
         assert (hint in solved(name).report(samples=5)) == told
     assert hint not in small_mpc().report(samples=5)
     assert "headroom(mpc, env) plays it" in solved("servo").report(samples=5)
-
-
-# ---- Which law a problem takes, and that it keeps to it ----
 
 
 def test_auto_is_the_online_law_beyond_the_budget_and_says_so_once(monkeypatch) -> None:

@@ -185,9 +185,6 @@ def test_what_a_law_remembers_does_not_travel() -> None:
     assert np.any(law.known._keys) and not np.any(pickle.loads(pickle.dumps(law)).known._keys)
 
 
-# ---- What an online law makes of numbers that float64 cannot hold or tell apart ----
-
-
 STEEP = SoftBounds(x=True, penalty=1e3)
 
 
