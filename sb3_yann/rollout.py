@@ -59,7 +59,7 @@ class Trajectories:
     excess : BoundExcess, optional
         By how much each episode exceeds the bounds of the problem, where one was given.
     penalty : ndarray, shape (episodes,)
-        Sum of ``info["penalty"]``, what soft bounds cost: it is in no reward.
+        What soft bounds cost, of `StageCost` and twins: it is in no reward.
 
     Examples
     --------
@@ -296,7 +296,8 @@ class _Envs:
         violated = bool(info.get("violation", False))
         success = bool(info.get("is_success", False))
         ends = bool(terminated), bool(truncated)
-        told = violated, success, may_change_reward(info), as_reward(info.get("penalty", 0.0))
+        paid = float(info["penalty"]) if "excess" in info else 0.0  # as StageCost tells it
+        told = violated, success, may_change_reward(info), paid
         return np.array(observation), as_reward(reward), *ends, *told
 
     def _asked(self, i: int, call: Callable[..., Any], *given: Any, **named: Any) -> Any:
@@ -338,7 +339,7 @@ class _Copies:
         success = np.array(info.get("is_success", none), dtype=bool)
         earned = np.array(rewards, dtype=np.float64)
         ends = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
-        paid = np.array(info.get("penalty", np.zeros(len(rows))))
+        paid = np.zeros(len(rows))
         return _Step(np.array(observations), earned, *ends, violated, success, violated, paid)
 
 

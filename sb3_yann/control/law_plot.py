@@ -61,8 +61,8 @@ def require_regions(law: Any) -> None:
     """Raise ValueError where a law is solved online."""
     if not hasattr(law, "starts"):
         raise ValueError(
-            f"{law!r} is solved online and has no regions. Take LinearMPC.explicit(), or draw its "
-            "input by sb3_yann.evaluation.plots.plot_surface."
+            f"{law!r} is solved online and has no regions. Call explicit() of its LinearMPC, "
+            "or draw its input by sb3_yann.evaluation.plots.plot_surface."
         )
 
 

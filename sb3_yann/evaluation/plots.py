@@ -92,7 +92,7 @@ def plot_regions(
     Parameters
     ----------
     problem : LinearMPC
-        The one that has the law.
+        The one that has the law: explicit, else ValueError.
     axes : matplotlib Axes, optional
         Where to draw; a new figure's by default.
     entries : pair of int or str, default (0, 1)
@@ -253,7 +253,7 @@ def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figur
 
     Regions are those visited most. The distance is the mean and the largest one, of the input that
     is farthest. ``policy`` is as of :func:`plot_surface`, and observations of the episodes are
-    theta, in plant units.
+    theta, in plant units. ValueError if the problem's law is solved online.
 
     Examples
     --------

@@ -87,7 +87,7 @@ class Headroom:
         Of :func:`offset_free`, where its default is less than the disturbances of this plant.
     lost : float, optional
         By how much plans cost more than the MPC when they were first played, relative to it, where
-        the model of the env's episodes is poor, or that is half a percent.
+        the model of the env's episodes is poor, or that is no chance.
     observer_played, reidentified_played : ndarray, shape (starts,), optional
         What the MPC with an observer and the re-identified one cost when they were played, losses
         included; None where they were not.
@@ -528,9 +528,10 @@ class _Search:
         if verdict == [*ADVICE][1]:  # where it loses from some starts, others may bring less
             if not offset > SURE * dataclasses.replace(whole, best_costs=observer).standard_error:
                 verdict = UNKNOWN
-        lost = -gain(base, self.played.get("plan", base))
-        if not self.poor and lost < LITTLE:  # noise is that as well
-            lost = 0.0
+        more = self.played.get("plan", base) - base
+        lost = float(more.mean() / (abs(base.mean()) or 1.0)) if self.twin is None else 0.0
+        if not self.poor and more.mean() < SURE * np.std(more, ddof=1) / np.sqrt(len(more)):
+            lost = 0.0  # it may be noise
         unplanned = int(np.count_nonzero(~self.planned))
         if (lost > 0 or unplanned) and verdict_of(*parts) == "keep the MPC":
             verdict = UNKNOWN

@@ -248,11 +248,14 @@ def forecast(
             says = REMEMBERED if remembers else judge.says
             played = [[replays.costs(each, *of) for each in (law, act)] for of in (logged, new)]
             runs = [each.reshape(len(each), -1) for each in played[1]]
-            objections.append(_objection(*runs))
+            with np.errstate(all="ignore"):
+                objections.append(_objection(*runs))
             for mpc, policy in played:
                 means = mpc.mean(axis=2), policy.mean(axis=2)
                 found.append((*_changed(*means, independent, runs), says))
-                lost.append(float((policy - mpc).max() / np.abs(mpc).mean()))
+                with np.errstate(all="ignore"):
+                    most = np.max(policy - mpc) / np.abs(mpc).mean()
+                lost.append(float(np.nan_to_num(most, nan=np.inf)))
     low = [each[1] for each in found]
     high = [each[2] for each in found]
     change = (found[0][0] + found[1][0]) / 2
@@ -265,7 +268,10 @@ def forecast(
 def _objection(mpc: Array, policy: Array) -> str:
     """Return what the acceptance rule says of the worst starts of all members, by their costs."""
     tolerance = replace(RULE.tolerance(mpc), saved=float(np.mean(mpc - policy)))
-    return tolerance.objection(tolerance.excess(mpc, policy).ravel())
+    excess = tolerance.excess(mpc, policy).ravel()
+    if excess.max() > tolerance.worst_start:
+        return "one costs far more than with the MPC"
+    return tolerance.objection(excess).partition(": start")[0]
 
 
 def surely_worse(behind: Array) -> NDArray[np.bool_]:

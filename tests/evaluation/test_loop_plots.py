@@ -202,6 +202,10 @@ def test_use_counts_steps_and_distances_by_region() -> None:
     assert named == regions[order].tolist()
     shares = 100 * counts[order] / len(theta)
     np.testing.assert_allclose([bar.get_height() for bar in above.patches], shares)
+    online = problems.cstr()
+    online.law("online")
+    with pytest.raises(ValueError, match=r"no regions\. Call explicit\(\)"):
+        use_figure(online, moved, played)
     largest = below.lines[0].get_ydata()
     assert max(largest) == pytest.approx(10)  # of half the range
     assert all(bar.get_height() <= top for bar, top in zip(below.patches, largest, strict=True))

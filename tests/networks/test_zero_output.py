@@ -143,9 +143,6 @@ def test_a_stack_too_large_to_be_multiplied_as_a_whole_does_the_same(hidden, mon
         th.testing.assert_close(whole, gathered, rtol=1e-4, atol=1e-4)
 
 
-# ---- RowAdam is Adam for every row by itself, and leaves rows without a gradient alone ----
-
-
 ROWS = 5
 
 

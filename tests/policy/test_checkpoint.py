@@ -51,9 +51,6 @@ def test_a_shrunk_correction_is_a_share_of_what_the_networks_add() -> None:
     assert whole.is_confined_as(before)
 
 
-# ---- Another MPC for a model, with what a shared network has learnt ----
-
-
 def learnt(algorithm: Any = DDPG, **options: Any) -> Any:
     """A model whose network has moved, without learning."""
     options = {"networks": "shared", "pin_equilibrium": False, **options}

@@ -97,9 +97,6 @@ def test_an_export_holds_theta_with_what_lies_ahead(tmp_path: Any) -> None:
     assert all(name in report for name in mpc.layout.names)
 
 
-# ---- Policies around a law that is solved online, or with one network for all of theta ----
-
-
 SERVOS: dict[str, dict[str, Any]] = {
     "tracking": {},
     "a measured disturbance": {"disturbances": DisturbanceBounds(-0.5, 0.5)},

@@ -173,9 +173,6 @@ def test_a_plant_that_lacks_a_part_of_theta_is_told_of_the_wrappers() -> None:
         build(units.plant("plant", "plant"), mpc=mpc)
 
 
-# ---- No setting carries a unit: the same plant in other units is learnt the same way ----
-
-
 EPISODES = 3
 STEPS = 100
 

@@ -13,7 +13,7 @@ from sample_plants import Sampled
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.forecast import REMEMBERED, Forecast, _changed, _cure, _Replays
+from sb3_yann.twin.forecast import REMEMBERED, Forecast, _changed, _cure, _objection, _Replays
 from sb3_yann.twin.trust import costs_of
 from sb3_yann.wrappers import SetPoint
 from sb3_yann_envs import ProblemBox
@@ -101,7 +101,18 @@ def test_new_set_points_lie_between_those_of_the_log(levels: tuple[float, float]
         return law_of(mpc)(theta) + 0.5 * (np.abs(theta[:, 1:]) < 0.3)
 
     _, low, high, _, worst, objection = PlantTwin.fit(mpc, log, residuals=POLYNOMIALS).forecast(act)
-    assert low == 0 and (high == 0) == (worst == 0) == (objection == "") == sure
+    assert low == 0 and (high == 0) == (worst == 0) == (not objection) == sure
+
+
+def test_what_new_starts_lose_is_said_without_their_numbers() -> None:
+    mpc = np.ones((5, 100))
+    assert _objection(mpc, mpc - 0.01) == ""
+    policy = np.where(np.arange(100) < 5, 1.04, 0.99 * mpc)
+    assert _objection(mpc, policy).endswith(
+        "cost 4 % of the median cost more on average, 1 % is allowed"
+    )
+    policy[0, 0] = 3.0
+    assert _objection(mpc, policy) == "one costs far more than with the MPC"
 
 
 def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> None:

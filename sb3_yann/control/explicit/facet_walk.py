@@ -247,7 +247,7 @@ class Conditions:
         self.kept = moving[np.flatnonzero(alive[: len(moving)])]
 
     def active_at(self, theta: Array) -> int | None:
-        """Return DAQP's working set at theta, None if infeasible.
+        """Return DAQP's working set at theta, None if infeasible by more than `APART`.
 
         With constraints moved apart: of several sets with one law it is that which has a region.
         """
