@@ -36,6 +36,7 @@ from sb3_yann.control.observer import StateEstimator
 from sb3_yann.log import Arrays, Episode, Log
 
 EARLY_LAGS = 4  # earlier outputs beside which inputs of later rows are tried
+FEWEST = 30  # readings of an output that is read now and then: a model fits fewer by heart
 MAX_CONDITION = 1e3
 """Condition number of C up to which outputs serve as states."""
 
@@ -206,8 +207,8 @@ def identify_outputs(
     Raises
     ------
     ValueError
-        For data in which some combination of outputs and inputs does not move, or inputs that are
-        a function of earlier outputs: the message names it.
+        For data in which some combination of outputs and inputs does not move, inputs that are a
+        function of earlier outputs, or an output that is read too few times: the message names it.
 
     Examples
     --------
@@ -231,6 +232,11 @@ def identify_outputs(
     wanted = None if isinstance(order, str) and order == "auto" else check_int("order", order, 1)
     (q, m, d) = log.sizes
     read = list(log.episodes)
+    for i, each in enumerate(np.concatenate([e.states for e in read]).T):
+        count = np.isfinite(each).sum()
+        if log.every[i] > 1 and count < FEWEST:
+            words = f"y[{i}] has {count} readings, and fewer than {FEWEST} tell no dynamics"
+            raise ValueError(log.in_names(f"{words}: leave it out, or log for longer."))
     episodes = stand_ins(read)
     try:
         require_moving(episodes, log.sizes)

@@ -245,6 +245,8 @@ def test_a_slow_output_hides_dead_time_only_if_it_answers_sooner() -> None:
     assert identify_outputs(y, u, dt=1, order=3).delays == (0,)
     alone = identify_outputs(y[:, 1:], u, dt=1, order=3)
     assert (alone.every, alone.delays) == ((10,), (0,)) and alone.long_fit > 80
+    with pytest.raises(ValueError, match=r"y\[1\] has 29 readings.*fewer than 30"):
+        identify_outputs(y[:290], u[:289], dt=1)
 
 
 @pytest.mark.nightly
