@@ -191,9 +191,6 @@ def test_the_file_of_the_page_trains_a_plant_of_the_reader_s(tmp_path, monkeypat
     assert "is the MPC" in callbacks[0].summary()
 
 
-# ---- Search spaces for RL Zoo: trials keep the problem of their entry, workers share a study ----
-
-
 optuna = pytest.importorskip("optuna")
 pytest.importorskip("rl_zoo3")
 
