@@ -35,7 +35,8 @@ from sb3_yann.control.polyhedra import (
 THINNEST = 1e-9
 """Regions that hold no ball of this radius, in half-widths of the box, are left out."""
 APART = 1e-8
-"""How far constraints are moved out, where one of several active sets is to be told."""
+"""How far unit rows are moved out, in half-widths, so that one of several active sets is told:
+above the tolerance of the QP, 1e-11, and below the step across a facet, 1e-7."""
 OUTER = -1
 """Stands for the constraint of a facet with nothing feasible beyond."""
 SHARED = -2
