@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
@@ -337,7 +338,8 @@ class Log:
         ValueError
             For a column that is not there or there twice, a row that holds no number where it
             should, or one that is longer than the header. An episode ends where a reading is
-            missing, but for states that are read now and then, as a laboratory's: these stay NaN.
+            missing, or words such as "Bad Input" are in its place, but for states that are read now
+            and then, as a laboratory's: these stay NaN.
         """
         more = {"disturbances": disturbances, "references": references}
         for name, given in {"states": states, "inputs": inputs, **more}.items():
@@ -376,6 +378,7 @@ class Log:
         )
         if not len(table):
             raise ValueError(f"{path} has no rows below its header.")
+        _warn_of_words(path, content, wanted, table)
         unread = [each for each in header if each not in wanted]
         if unread and episode is None and time is None:
             warn(
@@ -609,11 +612,29 @@ def _number(path: object, row: int, content: dict[str, str], name: str, decimal:
     try:
         return float(text.replace(decimal, ".")) if text else np.nan
     except ValueError:
+        if not any(map(str.isdigit, text)):  # "Bad Input", "No Data": see `_warn_of_words`
+            return np.nan
         raise ValueError(
             f"{path}, row {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
             "where there is no reading; for decimal commas pass decimal=','; leave out thousands' "
             "separators."
         ) from None
+
+
+def _warn_of_words(
+    path: object, content: Sequence[dict[str, str]], names: Sequence[str], values: Array
+) -> None:
+    """Warn of words in place of readings; raise where a column has nothing else."""
+    for name, column in zip(names, values.T, strict=True):
+        texts = [(row[name] or "").strip() for row in content]
+        words = Counter(each for each in texts if not any(map(str.isdigit, each)))
+        for blank in ("", "nan", "NaN"):
+            words.pop(blank, None)
+        shown = ", ".join(f"{word!r} in {count:,} rows" for word, count in words.most_common(3))
+        if words and not np.isfinite(column).any():
+            raise ValueError(f"{path}: {name} is {shown}, and never a number.")
+        if words:
+            warn(f"{name} of {path} is {shown}: taken for no reading.")
 
 
 def _time(

@@ -233,8 +233,9 @@ def test_gaps_do_not_change_how_often_a_state_is_read_and_repeats_are_named() ->
 
 @pytest.mark.filterwarnings("ignore:valve has no effect")
 def test_a_state_that_is_often_read_is_cut_where_it_is_missing(write) -> None:
-    rows = [f"{'' if k % 5 == 4 else np.sin(k)},{np.sin(3 * k)}" for k in range(40)]
-    log = Log.from_csv(write("T,valve", *rows), ["T"], ["valve"], dt=1)
+    rows = [f"{'Bad Input' if k % 5 == 4 else np.sin(k)},{np.sin(3 * k)}" for k in range(40)]
+    with pytest.warns(UserWarning, match="T of .* is 'Bad Input' in 8 rows: taken for no reading"):
+        log = Log.from_csv(write("T,valve", *rows), ["T"], ["valve"], dt=1)
     assert {len(each) for each in log.episodes} == {3} and log.every == (1,)
     assert identify(log).model.n_states == 1
 
@@ -251,8 +252,9 @@ TWO = "level,valve\n"
         ("", ["h"], r"it has \[\]. It is empty."),
         (CSV, "level", "list of column names"),
         (CSV, ["level"], r"disturbances = 'level' must be a list of column names"),
-        (CSV.replace("1.1", "high"), ["level"], "row 3: level is 'high', expected a number"),
+        (CSV.replace("1.1", "1.1.1"), ["level"], "row 3: level is '1.1.1', expected a number"),
         (TWO, ["level"], "no rows below its"),
+        (f"{TWO}1,ON\n3,OFF\n", ["level"], "valve is 'ON' in 1 rows, 'OFF' in 1 rows, and never"),
         (f"{TWO}1,2\n", ["level"], "no two rows"),
         (f"{TWO}1,\n,2\n", ["level"], "no two samples"),
         ("level,level,valve\n1,2,3\n4,5,6\n", ["level"], "several columns 'level'"),

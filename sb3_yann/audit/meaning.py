@@ -16,7 +16,7 @@ from sb3_yann._validation import Array, Mask, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.misreading import misread_states
-from sb3_yann.control.wrapper_stack import require_state_shown, require_theta_order
+from sb3_yann.control.wrapper_stack import SHOW_THETA, require_state_shown, require_theta_order
 from sb3_yann.rollout import Trajectories
 from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers.theta import EstimateState, below, require_vector
@@ -295,10 +295,8 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
     if shape != (problem.n_theta,) or actions != (problem.model.n_inputs,):
         raise ValueError(
             f"The env shows {shape} and takes {actions}; theta of the MPC has {problem.n_theta} "
-            f"entries {problem.labels()}, and there are {problem.model.n_inputs} inputs. Wrap "
-            "the env so that it shows theta: see PastInputs, EstimateState (of outputs) and "
-            "ObserveDisturbance in sb3_yann.wrappers; with_extra(mpc, low, high) has signals that "
-            "the model ignores."
+            f"entries {problem.labels()}, and there are {problem.model.n_inputs} inputs. "
+            f"{SHOW_THETA} with_extra(mpc, low, high) has signals that the model ignores."
         )
     require_theta_order(env, problem)
 

@@ -300,8 +300,10 @@ def connect(
         tried.append(f"set by {setter}, read from {reader}: {failure}")
     if not tried:
         sizes = {name: None if v is None else v.shape for name, v in begun.items()}
-        wanted = "" if x is None else f" of shape {x.shape}, like the one given,"
-        tried = [f"a state{wanted} is nowhere to be read: {sizes}"]
+        tried = [f"a state is nowhere to be read: {sizes}"]
+        if x is not None:
+            tried[0] = f"x_ss has shape {x.shape}, and no state that is read has: {sizes}; where "
+            tried[0] += "an entry is not known, give NaN"
     ways = "".join(f"\n  - {each}" for each in tried)
     if simulator.set_state is None or simulator.get_state is None:
         ways += "\nPass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."

@@ -30,6 +30,13 @@ def layers_of(env: Any) -> Iterator[Any]:
         yield from layers_of(each)
 
 
+SHOW_THETA = (
+    "Wrap the env so that it shows all of theta: SetPoint, MeasuredDisturbance, EstimateState (of "
+    "outputs), ObserveDisturbance and PreviousInput in sb3_yann.wrappers append what is missing, "
+    "PastInputs what is on its way."
+)
+
+
 def require_theta_order(env: Any, problem: MPCProblem) -> None:
     """Raise ValueError where our wrappers append what has another place in theta, or another model.
 

@@ -12,11 +12,18 @@ __all__ = ["Trajectories", "comparison_table", "evaluate"]
 MAX_ROWS = 20  # episodes that have a row each, at most
 
 
-def comparison_table(title: str, before: Trajectories, after: Trajectories) -> str:
+def comparison_table(
+    title: str,
+    before: Trajectories,
+    after: Trajectories,
+    *,
+    names: tuple[str, str] = ("MPC", "after"),
+) -> str:
     """Return what the same episodes cost with the MPC and after training, to be printed.
 
     The last rows are those of :meth:`Improvement.report`; above them each episode has a row, where
-    there are no more than twenty. The episodes must be those of the same seeds.
+    there are no more than twenty. The episodes must be those of the same seeds. ``names`` says
+    what was played before and after.
 
     Examples
     --------
@@ -33,10 +40,10 @@ def comparison_table(title: str, before: Trajectories, after: Trajectories) -> s
         )
     lines = [title]
     if counts[0] <= MAX_ROWS:
-        lines.append(f"  {'episode':<13}{'MPC':>12}{'after':>12}{'change':>12}")
+        lines.append(f"  {'episode':<13}{names[0]:>12}{names[1]:>12}{'change':>12}")
         for number, (old, new) in enumerate(zip(before.costs, after.costs, strict=True), start=1):
             lines.append(f"  {number:<13}{old:>12,.2f}{new:>12,.2f}{new - old:>+12,.2f}")
-    violations = f"{after.violations.sum()} steps, {before.violations.sum()} with the MPC"
+    violations = f"{after.violations.sum()} steps, {names[0]} {before.violations.sum()}"
     old, new = (each.observations[0].shape[-1] for each in (before, after))
     paid = [float(np.sum(each.penalty)) / counts[0] for each in (after, before)]
     soft = f"{paid[0]:.5g} instead of {paid[1]:.5g} an episode, which is in no cost above"

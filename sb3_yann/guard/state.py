@@ -328,10 +328,11 @@ def summary_of(state: GuardState, policy: StartsAsMPC, eval_freq: int = 1) -> st
     mpc = starts.mpc.at(played)
     rows = paired_rows(ours.costs, mpc.costs)
     rows["change"] += " from the final starts" * (evidence.confirmed is not None)
+    gains = bool(ours.costs.mean() < mpc.costs.mean() - 1e-3 * abs(mpc.costs.mean()))
     verdict = "The policy accepted last is better than the MPC."
     if state.accepted.has_networks_of(evidence.mpc):
         verdict = "The policy accepted last is the MPC."
-    elif not ours.costs.mean() < mpc.costs.mean() - 1e-3 * abs(mpc.costs.mean()):
+    elif not gains:
         verdict = "The policy accepted last is not the MPC, and gains nothing."
     if not state.accepted.is_actor_of(policy):
         verdict += (
@@ -364,6 +365,7 @@ def summary_of(state: GuardState, policy: StartsAsMPC, eval_freq: int = 1) -> st
         kind, times = Counter(kinds).most_common(1)[0]
         refusals = f"most often ({times} times): {refused[kinds.index(kind)]}"
         more = REFUSAL_ADVICE.get(kind, "")
+        more *= not (gains and "improve(" in more)  # it has found a gain
     candidates += f", one every eval_freq = {eval_freq} episodes, not steps" * (eval_freq > 1)
     return summary_lines(
         verdict,

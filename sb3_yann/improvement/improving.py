@@ -190,6 +190,7 @@ class Improvement:
             rows["violations"] = "no more than the MPC's" if last.safe else "more than the MPC's"
             if last.mpc_exceeds:
                 rows["violations"] += f"; that exceeds a hard bound from {last.mpc_exceeds} starts"
+                rows["violations"] += ": give the MPC tighter ones"
         more = f'report(result.model, "report.html", {source}={source}), then '
         more += "Commissioning(result.model, plant, shadow=True)"
         text = "Accepted: a better policy."
@@ -237,7 +238,9 @@ class Improvement:
             end = "end episodes by a TimeLimit, " * ("TimeLimit" in self.note)
             return f"{end}give more max_steps, or keep the MPC"
         if self.where == "the twin":
-            return "keep the MPC; log more episodes, of other starts and set-points, and fit anew"
+            tracks = self.model is None or self.model.policy.problem.layout.n_references
+            other = "starts and set-points" if tracks else "starts"
+            return f"keep the MPC; log more episodes, of other {other}, and fit anew"
         more = [f"{k}={2 * v}" for k, v in self.settings.items() if k in ("n_starts", "updates")]
         return f"keep the MPC, or learn from more: improve(..., {', '.join(more)})"
 

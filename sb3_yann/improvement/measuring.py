@@ -44,7 +44,7 @@ WORTH = 0.02  # A gain below this is not worth learning, which finds a part of i
 SAME_COST = 1e-9  # of an episode's cost: so much more is the same
 CURE = (
     "mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, observer, "
-    "mpc.disturbances.d_min, mpc.disturbances.d_max)."
+    "mpc.disturbances.d_min, mpc.disturbances.d_max) of sb3_yann.wrappers."
 )
 CURE_IN_TWIN = (
     "mpc, observer = offset_free(mpc), and export(mpc, path, estimator=observer), or on to "
@@ -54,9 +54,9 @@ CURE_IN_TWIN = (
 ADVICE = {
     "keep the MPC": f"little was found to gain over the MPC, less than {100 * WORTH:g} %. It is no "
     "bound: improve(mpc, {source}) may still find some of it, or more.",
-    "add ObserveDisturbance first": "that brings most of it: {observer}",
-    "re-identify": "a linear model of the plant as it is brings most of it: take the MPC "
-    "headroom(...).reidentified.",
+    "add ObserveDisturbance first": "that brings {share:.0f} % of what was found: {observer}",
+    "re-identify": "a linear model of the plant as it is brings {share:.0f} % of what was found: "
+    "take the MPC headroom(...).reidentified.",
     "learn": "{why}: improve(mpc, {source}), or DDPG under an ImprovementGuard.",
 }
 UNKNOWN = "not known"
@@ -210,10 +210,14 @@ class Headroom:
             return f"nothing was found, but {poor}"
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
         observer = CURE_IN_TWIN if self._in_twin else CURE
-        why = "most of it is beyond a linear model"
+        # The new model has the observer's part too.
+        shares = sum(parts[:2]) if self.verdict == "re-identify" else max(parts)
+        share = min(100.0, 100 * shares / (sum(parts) or 1.0))
+        why = f"{share:.0f} % of it is beyond a linear model"
         if not self._rivals_played:
             why = "what a better linear model brings is not known"
-        advice = ADVICE[self.verdict].format(source=source, observer=observer, why=why)
+        fields = {"source": source, "observer": observer, "why": why, "share": share}
+        advice = ADVICE[self.verdict].format(**fields)
         if self.d_max is not None:  # the disturbances of this plant
             largest = ", ".join(f"{each:.3g}" for each in self.d_max)
             advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")

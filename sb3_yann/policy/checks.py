@@ -16,6 +16,7 @@ from torch import nn
 
 from sb3_yann._validation import Array, check_array, check_int, warn
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.wrapper_stack import SHOW_THETA
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.observations import (
@@ -103,8 +104,8 @@ def require_algorithm(algorithm: BaseAlgorithm | None, kinds: tuple[type, ...]) 
         name = type(algorithm).__name__
         what = " and ".join(each.__name__ for each in kinds)
         raise TypeError(
-            f"This policy is one of {what}, not of {name}. By its name each algorithm that has one "
-            f'finds its own: {name}("YannPolicy", env).'
+            f"This policy is one of {what}, not of {name}. DDPG, TD3, SAC, TQC and PPO each have "
+            'one, found by its name: PPO("YannPolicy", env).'
         )
 
 
@@ -282,10 +283,8 @@ def require_theta(
         more = 0 if shape is None or len(shape) != 1 else shape[0] - problem.n_theta
         extra = f" Signals for networks alone are policy_kwargs={{'extra': {more}}}." * (more > 0)
         raise ValueError(
-            f"The observation has shape {shape}, but the law of the problem {takes}. Wrap the env "
-            "so that it shows all of theta: SetPoint, MeasuredDisturbance, EstimateState (of "
-            "outputs), ObserveDisturbance and PreviousInput in sb3_yann.wrappers append what is "
-            f"missing.{extra} Or pass the map from an observation to theta: "
+            f"The observation has shape {shape}, but the law of the problem {takes}. "
+            f"{SHOW_THETA}{extra} Or pass the map from an observation to theta: "
             "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
         )
     given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import shown
-from sb3_yann._validation import Array, check_bool, check_int, check_type
+from sb3_yann._validation import Array, check_bool, check_int, check_type, warn
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.identification.residuals import FOLDS
 from sb3_yann.control.linear_system import labels_of
@@ -195,6 +195,11 @@ class PlantTwin(LearntModel):
                 whole, notes = without_short_pieces(whole)
                 held = [(each.references, each.disturbances) for each in whole.episodes]
                 counts = problem.layout.n_references, problem.layout.n_disturbances
+                if held[0][0].size and not counts[0]:
+                    warn(
+                        "The log has set-points and the problem has none: they are ignored. An MPC "
+                        "that follows them has tracking=Tracking([...], low, high)."
+                    )
                 references, disturbances = (
                     [np.vstack([each, each[-1:]]) for each in of] if of[0].size and n else None
                     for of, n in zip(zip(*held, strict=True), counts, strict=True)

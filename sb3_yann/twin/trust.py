@@ -168,7 +168,8 @@ def judge(
         found.append((text, units))
     if beyond[0] > OUTSIDE:
         rows = f"{100 * beyond[0]:.3g} % of the logged {beyond[1]}"
-        found.append((f"{rows} lie beyond the problem's box of theta.", units))
+        wider = f"Widen the box (theta_min, theta_max; r_min, r_max of Tracking), or c{units[1:]}"
+        found.append((f"{rows} lie beyond the problem's box of theta.", wider))
     error = relative_error(*costs)
     if several and not error <= COST_ERROR:
         found.append(

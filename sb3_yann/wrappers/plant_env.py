@@ -27,7 +27,7 @@ from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.control.linearization import called_as, require_order, slope_of
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
-from sb3_yann.control.wrapper_stack import require_theta_order
+from sb3_yann.control.wrapper_stack import SHOW_THETA, require_theta_order
 from sb3_yann.env_pool import name_of
 from sb3_yann.units import ActionUnits
 from sb3_yann.wrappers.theta import (
@@ -94,9 +94,9 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
             what = "The observation" if observation is None else "What the map makes of it"
             raise ValueError(
                 f"{what} has shape {shape}, but theta = [{', '.join(problem.labels())}] has "
-                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order; "
-                "pass observation=AffineObservation(matrix, offset); or take with_extra(mpc, low, "
-                "high), whose theta has signals that the model ignores."
+                f"{problem.n_theta} entries, in this order. {SHOW_THETA} Or pass observation="
+                "AffineObservation(matrix, offset); or take with_extra(mpc, low, high), whose "
+                "theta has signals that the model ignores."
             )
         if observation is None:
             require_theta_order(env, problem)

@@ -18,6 +18,7 @@ from sb3_yann.control.online import Law, OnlineLaw
 LOOP_STEPS = 50  # of a closed loop on the model
 BEYOND = 0.1  # widths of theta's box beyond it, in which states are tried
 APART = 0.05  # of an input's range, by which laws that differ by more are named
+FAINT = 0.01  # of what the state that costs the most does, below which a state hardly counts
 BOUND = "bound of entry {}, which may move in"
 
 
@@ -74,6 +75,7 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
         yield f"The law is solved online, with {law.n_constraints} constraints."
     else:
         yield f"The law has {law.n_regions} regions and {law.n_halfspaces} half-spaces."
+    yield from _weights(problem)
     if len(problem.blocks) < problem.horizon:
         yield f"Inputs are held over blocks of {', '.join(map(str, problem.blocks))} steps."
     if problem.price.counts:
@@ -94,6 +96,18 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
         yield "There is no integral action: a plant that is not its model may rest beside its"
         yield "set-points. offset_free(mpc) has it, and may cost less or more on the way there:"
         yield "  headroom(mpc, env) plays it in a simulator. Add it where that gains."
+
+
+def _weights(problem: MPCProblem) -> Iterator[str]:
+    """Yield what half the range of each state and input costs in a step, and what hardly counts."""
+    labels = chain(*labels_of(problem.model)[:2])
+    half = ((problem.theta_max - problem.theta_min) / 2)[problem.layout.state]
+    states = np.diag(problem.Q) * half**2
+    costs = [*states, *(np.diag(problem.R) * problem.u_half**2)]
+    named = [(name, cost) for name, cost in zip(labels, costs, strict=True) if cost]
+    yield f"Half its range costs, in a step: {', '.join(f'{n} {cost:.3g}' for n, cost in named)}."
+    if small := [n for n, cost in named[: np.count_nonzero(states)] if cost < FAINT * max(states)]:
+        yield f"  {', '.join(small)} hardly counts beside others: weights are in plant units."
 
 
 def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> Iterator[str]:

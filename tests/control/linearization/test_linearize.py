@@ -165,7 +165,7 @@ BAD_PLANTS: list[tuple[Any, dict[str, Any], str]] = [
     (lambda x, u: x + u + 2, {"x_ss": [0], "u_ss": [0]}, "no steady state: one step moves it"),
     (lambda x, u: 0.999 * x, {"x_ss": [1], "u_ss": [0]}, "no steady state: one step moves it"),
     (lambda x, u: x, {"x_ss": [[0]]}, "expected a vector of finite numbers, or NaN"),
-    (lambda x, u: x, {"x_ss": [0, 0]}, r"a state of shape \(2,\), like the one given, is nowhere"),
+    (lambda x, u: x, {"x_ss": [0, 0]}, r"x_ss has shape \(2,\), and no state that is read has"),
     (lambda x, u: x, {"u_ss": [0, 0]}, r"u_ss has shape \(2,\), expected \(1,\)"),
     (lambda x, u: x, {"scale": [0]}, r"scale = \[0\.0\] must be above 0"),
     (lambda x, u: x, {"dt": -1}, "dt = -1 must be a finite number above 0"),

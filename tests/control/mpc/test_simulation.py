@@ -145,6 +145,12 @@ def test_a_parameter_without_a_solution_is_said_to_be_none() -> None:
     assert "not feasible" not in solved("servo").report(samples=20)
 
 
+def test_what_a_weight_leaves_nearly_alone_is_said() -> None:
+    text = small_mpc(Q=[[4, 0], [0, 1e-3]], theta_min=[-3, -2], theta_max=[3, 2]).report(samples=5)
+    assert "Half its range costs, in a step: x[0] 36, x[1] 0.004, u[0]" in text
+    assert "\n  x[1] hardly counts beside others" in text
+
+
 def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> None:
     hint = "There is no integral action"
     for name, told in (
