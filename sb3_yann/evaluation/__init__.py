@@ -22,8 +22,16 @@ def comparison_table(
     """Return what the same episodes cost with the MPC and after training, to be printed.
 
     The last rows are those of :meth:`Improvement.report`; above them each episode has a row, where
-    there are no more than twenty. The episodes must be those of the same seeds. ``names`` says
-    what was played before and after.
+    there are no more than twenty.
+
+    Parameters
+    ----------
+    title : str
+        The first line.
+    before, after : Trajectories
+        Of the same seeds.
+    names : tuple of two str
+        What was played before and after, for the heads of the columns.
 
     Examples
     --------

@@ -109,8 +109,7 @@ def test_it_counts_regions_half_spaces_and_rows_of_the_terminal_set() -> None:
 
 def test_shares_are_those_of_the_box() -> None:
     mpc = small_mpc(terminal=Terminal(set=([[1, 1], [-1, -1]], [0.5, 0.7])))
-    rng = np.random.default_rng(0)
-    points = rng.uniform(mpc.theta_min, mpc.theta_max, (500, 2))
+    points = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (500, 2))
     share = 100 * mpc.explicit().in_domain(points).mean()
     assert f"{share:.1f} % are feasible" in mpc.report()
     assert "100.0 % are feasible" in input_bounds_only().report(samples=20)
@@ -129,8 +128,7 @@ def test_how_far_the_explicit_law_is_from_the_online_one_beyond_the_box_is_said(
     assert words not in input_bounds_only().report(samples=50)
     said = problems.clipped_pendulum().report(samples=200)
     assert words in said
-    most = float(re.search(r"range, by (\d+) % at most", said)[1])
-    assert 5 < most <= 100
+    assert 5 < float(re.search(r"range, by (\d+) % at most", said)[1]) <= 100
 
 
 def test_active_constraints_are_shares_of_the_feasible_parameters() -> None:
@@ -143,12 +141,8 @@ def test_a_parameter_without_a_solution_is_said_to_be_none() -> None:
     text = sample_problem("origin outside the box").report(samples=20)
     assert "\n  [0, 0] -> u = " in text and text.count("(not feasible)") == 1
     assert "not feasible" not in solved("servo").report(samples=20)
-
-
-def test_what_a_weight_leaves_nearly_alone_is_said() -> None:
     text = small_mpc(Q=[[4, 0], [0, 1e-3]], theta_min=[-3, -2], theta_max=[3, 2]).report(samples=5)
-    assert "Half its range costs, in a step: x[0] 36, x[1] 0.004, u[0]" in text
-    assert "\n  x[1] hardly counts beside others" in text
+    assert re.search(r": x\[0\] 36, x\[1\] 0.004, u\[0\] .*\n  x\[1\] hardly counts beside", text)
 
 
 def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> None:
