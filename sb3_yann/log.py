@@ -274,8 +274,10 @@ class Log:
             if of != "reference":
                 labels += own
                 columns += [*whole.T]
-        _warn_of_other_units(labels, columns, records[0].states.shape[1])
-        _warn_of_repeats(labels[: records[0].states.shape[1]], records)
+        n = records[0].states.shape[1]
+        _warn_of_spikes(labels[:n], columns[:n])
+        _warn_of_other_units(labels, columns, n)
+        _warn_of_repeats(labels[:n], records)
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
@@ -540,6 +542,27 @@ UNITS = (
 JUMP = 5.0  # times any other step of a column that a change of its unit is, at least
 LEAST_READ = 10  # readings on either side of it
 REGULAR = 0.9  # share of a column's changes that are as many rows apart, where it repeats readings
+
+
+SPIKE = 50.0  # times nearly all other steps of a state are the two to and from a single reading
+
+
+def _warn_of_spikes(labels: Sequence[str], columns: Sequence[Array]) -> None:
+    """Warn of single readings that are far from those before and after."""
+    for name, column in zip(labels, columns, strict=True):
+        rows = np.flatnonzero(np.isfinite(column))
+        steps = np.diff(column[rows])
+        if len(steps) < LEAST_READ:
+            continue
+        both = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
+        back = np.abs(steps[:-1] + steps[1:]) < both / 10
+        usual = np.quantile(np.abs(steps), 0.9)
+        far = rows[1:-1][back & (both > SPIKE * usual) & (usual > 0)]
+        if len(far):
+            warn(
+                f"{name} of the log is {column[far[0]]:g} in row {far[0]}, and far from it before "
+                f"and after ({len(far)} such rows): leave what is no reading empty, or NaN."
+            )
 
 
 def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int) -> None:

@@ -231,7 +231,11 @@ class Improvement:
         if settled:
             return f"keep the MPC and {cure.partition(';')[0]}; then fit the twin anew"
         if "too little to teach" in self.reason:
-            return "keep the MPC: there is little to gain"
+            source = "twin" if self.where == "the twin" else "env"
+            return (
+                "keep the MPC: plans gain little over it. Whether an observer or a new model does, "
+                f"headroom(mpc, {source}) says"
+            )
         if "Ctrl-C" in self.note:
             return "keep the MPC, or start again"
         if "max_steps" in self.note:

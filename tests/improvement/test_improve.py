@@ -448,7 +448,7 @@ def test_a_log_that_holds_nothing_worth_having_asks_for_no_more_of_it(monkeypatc
     monkeypatch.setattr(PlantTwin, "forecast", lambda *_: narrow)
     found = improve(problem(), twin_of(), **FEW)
     assert found.reason.endswith("by -0.01 to +0.02 %: too little to teach.")
-    assert found.report().splitlines()[-1].endswith("keep the MPC: there is little to gain")
+    assert found.report().splitlines()[-1].endswith("headroom(mpc, twin) says")
 
 
 def test_what_no_check_lets_through_changes_nothing(monkeypatch) -> None:
@@ -567,7 +567,7 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     ("where", "note", "leads_on"),
     [
         ("the twin", "it may lose: to settle it, log steps of u", "the MPC and log steps of u"),
-        ("the twin", "plans +0.00 %, too little to teach", "keep the MPC: there is little to gain"),
+        ("the twin", "plans +0.00 %, too little to teach", "keep the MPC: plans gain little"),
         ("the twin", "2 starts with violations", "log more episodes, of other starts"),
         (
             "the twin",

@@ -28,6 +28,7 @@ LAGS = (1, 2, 4, 6, 9, 13, 19, 28)
 """Lags of the ARX models that are tried."""
 CHUNK = 2000
 """Longest stretch of samples whose first state is estimated on its own."""
+FORGOTTEN = 20.0  # errors of a filter's states fall to exp(-20) within a chunk
 CHANCE = 0.001
 """Significance level of the effects of inputs."""
 CHANCES = (CHANCE, 1e-6)
@@ -279,10 +280,15 @@ class Chunks:
         self.rare: NDArray[np.bool_] = self.readings < self.samples
 
     def forgets(self, model: Innovations) -> bool:
-        """Return whether errors of the states decay, with and without the rare outputs."""
+        """Return whether errors of the states decay, with and without the rare outputs.
+
+        Within a chunk, or half as fast as the model forgets: one that never does has made of each
+        first state, which is free, a constant that no other record has.
+        """
         often = ~self.rare
         between = model.A - model.K[:, often] @ model.C[often]
-        return spectral_radius(model.inner) < 1 and spectral_radius(between) < 1
+        slowest = max(1 - FORGOTTEN / self.y.shape[1], (1 + spectral_radius(model.A)) / 2)
+        return spectral_radius(model.inner) < min(slowest, 1) and spectral_radius(between) < 1
 
     def covariance(self, model: Innovations) -> Array:
         """Return the mean square (q, q) of the prediction errors, the first states by its noise."""

@@ -202,7 +202,8 @@ class Search:
                     break
                 n += step
         best = min(found.values(), key=lambda each: each.criterion)
-        free = min([*self.tried, *found.values()], key=lambda each: each.error)
+        rough = [] if self.chunks.rare.any() else self.tried  # those read slow outputs never
+        free = min([*rough, *found.values()], key=lambda each: each.error)
         return free if free.error < BETTER * best.error else best
 
     def trial(self, order: int, *, refine: bool = True) -> Structure:
@@ -211,7 +212,8 @@ class Search:
         if not refine or not np.isfinite(rough.criterion):
             return rough
         found = replace(self.assessed(refined(rough.model, self.chunks)), refined=True)
-        return found if found.criterion < rough.criterion else rough
+        slow = self.chunks.rare.any() and np.isfinite(found.criterion)
+        return found if slow or found.criterion < rough.criterion else rough
 
     def assessed(self, model: Innovations) -> Structure:
         """Return a model with its criterion and its free runs over held-out data."""

@@ -107,7 +107,7 @@ def _weights(problem: MPCProblem) -> Iterator[str]:
     named = [(name, cost) for name, cost in zip(labels, costs, strict=True) if cost]
     yield f"Half its range costs, in a step: {', '.join(f'{n} {cost:.3g}' for n, cost in named)}."
     if small := [n for n, cost in named[: np.count_nonzero(states)] if cost < FAINT * max(states)]:
-        yield f"  {', '.join(small)} hardly counts beside others: weights are in plant units."
+        yield f"  Little beside others: {', '.join(small)}. Weights are in plant units."
 
 
 def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> Iterator[str]:

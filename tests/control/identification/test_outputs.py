@@ -10,6 +10,9 @@ import pytest
 from experiments.outputs import Plant, inputs, random_plant
 from sb3_yann import IdentifiedOutputs, LinearModel, Log, identify_outputs
 from sb3_yann._validation import Array
+from sb3_yann.control.identification.innovations import Chunks, Innovations
+from sb3_yann.control.identification.outputs import free_run_errors
+from sb3_yann.log import Episode
 
 A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.0, 0.3], [0.5, 0.0]])
@@ -215,11 +218,25 @@ def test_C_is_kept_by_copies_units_and_sampling() -> None:
     np.testing.assert_array_equal(sampled.C, [[1, 0]])
 
 
-def test_an_output_that_is_read_now_and_then_is_no_gap() -> None:
+def test_a_filter_forgets_within_a_record_or_half_as_fast_as_its_model() -> None:
+    one, zero = np.eye(1), np.zeros(1)
+    model = Innovations(one / 2, one, -0.4 * one, one, zero, zero, one)  # its filter's pole is .9
+    for count, forgets in ((50, False), (500, True)):
+        record = Episode(np.zeros((count + 1, 1)), np.zeros((count, 1)), np.zeros((count, 0)))
+        assert Chunks([record]).forgets(model) == forgets
+
+
+def test_an_output_that_is_read_now_and_then_is_no_gap(monkeypatch) -> None:
     u = steps(1200, 2, 0)
     y = played(u, A, B, C, 1)
     y[np.arange(len(y)) % 10 > 0, 1] = np.nan
+
+    def seeming(model, *more):  # none of a model that never reads the slow output
+        return tuple(each * model.K[:, 1].any() for each in free_run_errors(model, *more))
+
+    monkeypatch.setattr("sb3_yann.control.identification.outputs.free_run_errors", seeming)
     found = identify_outputs(y, u, dt=0.5, order=3, delay=0)
+    assert found.gain[:, 1].any()
     assert found.every == (1, 10) and "Read now and then: y[1] every 10" in found.report()
     fresh = steps(800, 2, 5)
     z = played(fresh, A, B, C, 6)

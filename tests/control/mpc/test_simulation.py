@@ -142,7 +142,7 @@ def test_a_parameter_without_a_solution_is_said_to_be_none() -> None:
     assert "\n  [0, 0] -> u = " in text and text.count("(not feasible)") == 1
     assert "not feasible" not in solved("servo").report(samples=20)
     text = small_mpc(Q=[[4, 0], [0, 1e-3]], theta_min=[-3, -2], theta_max=[3, 2]).report(samples=5)
-    assert re.search(r": x\[0\] 36, x\[1\] 0.004, u\[0\] .*\n  x\[1\] hardly counts beside", text)
+    assert re.search(r": x\[0\] 36, x\[1\] 0.004, u\[0\] .*\n  Little beside others: x\[1\]", text)
 
 
 def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> None:
