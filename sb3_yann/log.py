@@ -432,15 +432,18 @@ SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
 NO_READING = -999, -9999, -99999, 999, 9999, 99999  # in place of one, as historians write it
 OFTEN_READ = 2 / 3
 """Share of the samples below which isolated readings make a state one that is read now and then."""
+SHORT = 8  # readings, on average between two gaps, from which on a state is cut at each of them
+FEWEST_RUNS = 10  # so many that an average says something
 
 
 def _read_now_and_then(records: Sequence[Episode]) -> NDArray[np.bool_]:
-    """Return which states (n,) have isolated readings, as a laboratory's."""
+    """Return which states (n,) have isolated readings, as a laboratory's, or many short gaps."""
     read = np.isfinite(np.concatenate([each.states for each in records]))
     # A reading whose sample before has none begins a run; records count as one.
     runs = np.sum(read[1:] > read[:-1], axis=0) + read[0]
     count = np.sum(read, axis=0)
-    return np.asarray((0 < count) & (count < OFTEN_READ * len(read)) & (runs > count / 2))
+    isolated = (count < OFTEN_READ * len(read)) & (runs > count / 2)
+    return np.asarray((0 < count) & (isolated | ((runs >= FEWEST_RUNS) & (runs > count / SHORT))))
 
 
 def _cut(
