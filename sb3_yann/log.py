@@ -555,12 +555,12 @@ def _warn_of_spikes(labels: Sequence[str], columns: Sequence[Array]) -> None:
     for name, column in zip(labels, columns, strict=True):
         rows = np.flatnonzero(np.isfinite(column))
         steps = np.diff(column[rows])
-        if len(steps) < LEAST_READ:
+        moves = np.abs(steps[steps != 0])
+        if len(moves) < LEAST_READ:
             continue
         both = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
         back = np.abs(steps[:-1] + steps[1:]) < both / 10
-        usual = np.quantile(np.abs(steps), 0.9)
-        far = rows[1:-1][back & (both > SPIKE * usual) & (usual > 0)]
+        far = rows[1:-1][back & (both > SPIKE * np.quantile(moves, 0.9))]
         if len(far):
             warn(
                 f"{name} of the log is {column[far[0]]:g} in row {far[0]}, and far from it before "

@@ -228,7 +228,14 @@ def test_gaps_do_not_change_how_often_a_state_is_read_and_repeats_are_named() ->
     x = np.zeros((201, 2))
     x[np.arange(201) % 20 > 0, 1] = np.nan
     x[[40, 50, 80, 120]] = np.nan
-    assert Log.with_gaps(x, np.ones((200, 1)), 1).every == (1, 20)
+    u = np.ones((200, 1))
+    assert Log.with_gaps(x, u, 1).every == (1, 20)
+    x[1::3, 0] = np.nan  # many short gaps, as of readings that are lost at random
+    assert len(Log.with_gaps(x, u, 1)) == 1
+    x[3, 0] = 1e6
+    x[:, 0] += moving[:201]
+    with pytest.warns(UserWarning, match=r"x\[0\] of the log is 1e\+06 in row 3, and far from it"):
+        Log.with_gaps(x[:, :1], u, 1)
 
 
 @pytest.mark.filterwarnings("ignore:valve has no effect")

@@ -39,7 +39,9 @@ RUN_AHEAD = 20
 """Samples of the free runs over held-out data."""
 MAX_ORDER = 16
 BETTER = 0.85
-"""Mean square of free runs, relative to the criterion's choice, below which another is taken."""
+"""Mean square of free runs, relative to the criterion's choice, below which another is taken,"""
+NEARLY = 0.1
+"""if its criterion is at most so much more for each output: errors of one step 5 % larger."""
 ORDER_PATIENCE = 4  # orders without a better criterion after which none is tried any more
 SURE_DELAY = 10.0
 """By so much, over all steps, dead time must lower the criterion."""
@@ -189,7 +191,7 @@ class Search:
         return self.tried[best]
 
     def best(self, order: int | None) -> Structure:
-        """Return the best model near the rough one, or one that runs freely far better."""
+        """Return the best model near the rough one, or one nearly as good that runs far better."""
         if not self.tried:
             self.rough(order)
         start = min(self.tried, key=lambda each: each.criterion).model.order
@@ -202,12 +204,17 @@ class Search:
                     break
                 n += step
         best = min(found.values(), key=lambda each: each.criterion)
+        limit = best.criterion + NEARLY * len(best.errors)
         rough = [] if self.chunks.rare.any() else self.tried  # those read slow outputs never
-        free = min([*rough, *found.values()], key=lambda each: each.error)
+        near = [each for each in (*rough, *found.values()) if each.criterion <= limit]
+        free = min(near, key=lambda each: each.error)
         return free if free.error < BETTER * best.error else best
 
     def trial(self, order: int, *, refine: bool = True) -> Structure:
-        """Return the model of an order, refined where that lowers the criterion."""
+        """Return the model of an order, refined where that lowers the criterion.
+
+        Outputs that are read now and then the rough one knows by stand-ins alone.
+        """
         rough = self.assessed(self.past.model(order))
         if not refine or not np.isfinite(rough.criterion):
             return rough

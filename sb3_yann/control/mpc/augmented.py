@@ -146,7 +146,8 @@ def with_extra(mpc: LinearMPC, low: ArrayLike, high: ArrayLike) -> LinearMPC:
 
     An ambient temperature, an analyser, a feed that the model leaves out: networks see them, and
     twins and `improve` learn what they do. They are measured disturbances with a zero column of E,
-    and come last of those: before estimated ones. They may lie beyond their bounds.
+    and come last of those: before estimated ones. They may lie beyond their bounds, where an
+    exported controller acts as ever and its status says OUTSIDE.
 
     Parameters
     ----------

@@ -9,15 +9,7 @@ from scipy import stats
 
 from errors import Message, raises
 from sample_plants import played
-from sb3_yann import (
-    Identified,
-    LinearModel,
-    LinearMPC,
-    Log,
-    Tracking,
-    identify,
-    identify_outputs,
-)
+from sb3_yann import Identified, LinearModel, LinearMPC, Log, Tracking, identify, identify_outputs
 from sb3_yann.control.gains import Gains, responses
 from sb3_yann.control.identification.least_squares import gains_of, regress
 from sb3_yann.log import Episode
