@@ -266,6 +266,7 @@ class Log:
             whole = np.concatenate(parts)
             own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(whole.shape[1])]
             whole = _without_marks(own, whole)
+            whole = _without_spikes(own, whole) if of == "state" else whole
             empty += [a for a, z in zip(own, whole.T, strict=True) if not np.isfinite(z).any()]
             cut = np.split(whole, np.cumsum([len(each) for each in parts])[:-1])
             records = [
@@ -275,7 +276,6 @@ class Log:
                 labels += own
                 columns += [*whole.T]
         n = records[0].states.shape[1]
-        _warn_of_spikes(labels[:n], columns[:n])
         _warn_of_other_units(labels, columns, n)
         _warn_of_repeats(labels[:n], records)
         on_time = None if time is None else _on_time(records, time, dt)
@@ -550,9 +550,10 @@ REGULAR = 0.9  # share of a column's changes that are as many rows apart, where 
 SPIKE = 50.0  # times nearly all other steps of a state are the two to and from a single reading
 
 
-def _warn_of_spikes(labels: Sequence[str], columns: Sequence[Array]) -> None:
-    """Warn of single readings that are far from those before and after."""
-    for name, column in zip(labels, columns, strict=True):
+def _without_spikes(names: Sequence[str], values: Array) -> Array:
+    """Return states (N, n) with NaN for single readings that are far from those beside them."""
+    values = values.copy()
+    for name, column in zip(names, values.T, strict=True):
         rows = np.flatnonzero(np.isfinite(column))
         steps = np.diff(column[rows])
         moves = np.abs(steps[steps != 0])
@@ -561,11 +562,13 @@ def _warn_of_spikes(labels: Sequence[str], columns: Sequence[Array]) -> None:
         both = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
         back = np.abs(steps[:-1] + steps[1:]) < both / 10
         far = rows[1:-1][back & (both > SPIKE * np.quantile(moves, 0.9))]
-        if len(far):
+        if 0 < len(far) <= 1 + len(rows) // 100:  # an angle may well jump there and back, often
             warn(
                 f"{name} of the log is {column[far[0]]:g} in row {far[0]}, and far from it before "
-                f"and after ({len(far)} such rows): leave what is no reading empty, or NaN."
+                f"and after ({len(far)} such rows): taken for no reading."
             )
+            column[far] = np.nan
+    return values
 
 
 def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int) -> None:

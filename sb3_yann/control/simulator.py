@@ -333,6 +333,8 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str:
     else:
         return failure
     for wanted, got in seen:
+        if got is not None and got.shape != wanted.shape:
+            return f"a state of {wanted.size} entries is read as {got.size}: {got.tolist()}"
         if got is not None and np.any(np.abs(got - wanted) > 1e-5 * (scale + np.abs(wanted))):
             reading = f"set to {wanted.tolist()} it reads {got.tolist()}"
             return f"{reading} (a state that is ignored, or an angle that wraps there)"

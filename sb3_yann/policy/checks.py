@@ -157,6 +157,8 @@ def require_sb3_kwargs(given: dict[str, Any], own: list[str], theirs: tuple[str,
             f"YannPolicy takes no {', '.join(map(repr, unknown))}. Its own policy_kwargs are "
             f"{', '.join(own)}; of SB3's it takes {', '.join(known)}. Options of the critic "
             "go into policy_kwargs={'critic': CriticOptions(...)}."
+            + " SB3's SAC and PPO write it into the dict: pass each model its own."
+            * ("use_sde" in unknown)
         )
     if given.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
         raise ValueError(

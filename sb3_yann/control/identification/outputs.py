@@ -263,7 +263,10 @@ def free_run_errors(
     start: tuple[Array, Array],
     ahead: int = RUN_AHEAD,
 ) -> tuple[Array, Array]:
-    """Return the root mean square (q,) so many samples ahead, and the fit in percent."""
+    """Return the root mean square (q,) so many samples ahead, and the fit in percent.
+
+    Of fewer than ten readings the fit is NaN.
+    """
     longer = [each for each in episodes if len(each) > ahead]
     if not longer:
         none = np.full(len(model.C), np.nan)
@@ -275,7 +278,7 @@ def free_run_errors(
         mean = np.nansum(target, axis=0) / count
         moved = np.sqrt(np.nansum((target - mean) ** 2, axis=0) / count)
         errors = np.sqrt(np.nansum((target - guess) ** 2, axis=0) / count)
-    return errors, 100 * (1 - errors / np.where(moved > 0, moved, np.nan))
+    return errors, 100 * (1 - errors / np.where((moved > 0) & (count >= 10), moved, np.nan))
 
 
 def predicted(

@@ -402,9 +402,10 @@ def _notes(
         "found.estimator())."
     ]
     if not np.all(np.isnan(found.fits[0])):
+        longer = f", {listed(found.fits[1])} % {RUN_AHEAD} steps ahead"
         notes.append(
-            f"Fit over data held out, 100 % is perfect: {listed(found.fits[0])} % one step ahead, "
-            f"{listed(found.fits[1])} % {RUN_AHEAD} steps ahead."
+            f"Fit over data held out, 100 % is perfect: {listed(found.fits[0])} % one step ahead"
+            f"{longer * bool(np.any(np.isfinite(found.fits[1])))}."
         )
     if any(found.delays):
         notes.append(
