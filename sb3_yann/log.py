@@ -547,11 +547,12 @@ LEAST_READ = 10  # readings on either side of it
 REGULAR = 0.9  # share of a column's changes that are as many rows apart, where it repeats readings
 
 
-SPIKE = 50.0  # times nearly all other steps of a state are the two to and from a single reading
+SPIKE = 50.0  # times nearly all other steps of a state are the two to and from a spike
+LONGEST_SPIKE = 3  # readings
 
 
 def _without_spikes(names: Sequence[str], values: Array) -> Array:
-    """Return states (N, n) with NaN for single readings that are far from those beside them."""
+    """Return states (N, n) with NaN for up to three readings in a row that are far from all."""
     values = values.copy()
     for name, column in zip(names, values.T, strict=True):
         rows = np.flatnonzero(np.isfinite(column))
@@ -559,9 +560,14 @@ def _without_spikes(names: Sequence[str], values: Array) -> Array:
         moves = np.abs(steps[steps != 0])
         if len(moves) < LEAST_READ:
             continue
-        both = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
-        back = np.abs(steps[:-1] + steps[1:]) < both / 10
-        far = rows[1:-1][back & (both > SPIKE * np.quantile(moves, 0.9))]
+        found = np.zeros(len(rows), bool)
+        for length in range(1, LONGEST_SPIKE + 1):
+            there = steps[:-length]
+            both = np.minimum(np.abs(there), np.abs(steps[length:]))
+            back = np.abs(column[rows[length + 1 :]] - column[rows[: -length - 1]]) < both / 10
+            for k in np.flatnonzero(back & (both > SPIKE * np.quantile(moves, 0.9))):
+                found[k + 1 : k + 1 + length] = True
+        far = rows[found]
         if 0 < len(far) <= 1 + len(rows) // 100:  # an angle may well jump there and back, often
             warn(
                 f"{name} of the log is {column[far[0]]:g} in row {far[0]}, and far from it before "

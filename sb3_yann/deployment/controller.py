@@ -35,12 +35,13 @@ class Status(IntFlag):
 
     NOT_FINITE = 1  # a reading, or manual where it counts, is NaN or infinite
     OUT_OF_RANGE = 2  # a reading is beyond the limits that the export was given
-    FROZEN = 4  # a reading stays the same to the bit while others move
+    FROZEN = 4  # a reading stays the same to the bit while others, or the output, move
     LATE = 8  # more time has passed since the last step than it may
     OUTSIDE = 16  # the MPC has no solution there; the law acts by its `infeasible` option
     NETWORK = 32  # a network's output is not finite; the law acted
 
 
+DRIVING = 1e-4  # of an input's range: an output that moves by more moves the plant
 SENSOR = Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.FROZEN
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": np.tanh,
@@ -181,6 +182,7 @@ class Controller:
         self._loads: Array = np.zeros(0)  # the measured disturbances that act until the next step
         self._bump = np.zeros(m)
         self._left = 0
+        self._drives = False  # whether the output moved at the last step
 
     def evaluate(self, obs: ArrayLike, networks: bool = True) -> Array:
         """Return the policy's actions, without memory: (m,), or (batch, m) for a batch.
@@ -257,7 +259,10 @@ class Controller:
             if lost[shows_previous[shows_previous < len(lost)]].any():
                 last = (self._output - shift) / scale  # rates count from the own output then
                 low, high = np.clip(last + data["change"], *data["bounds"])[:, None]
+        before = self._output
         self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
+        least = DRIVING * np.ptp(data["bounds"], axis=0) * scale
+        self._drives = bool((np.abs(self._output - before) > least).any())
         self.mode = mode
         self.status = status
         found = [str(each.name).lower() for each in Status if each in status]
@@ -299,7 +304,7 @@ class Controller:
         beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
         moved = obs != self._last
         others = (moved & finite & np.isfinite(self._last)).any()  # NaN has not moved
-        self._same = np.where(moved, 0, self._same + bool(others))
+        self._same = np.where(moved, 0, self._same + bool(others or self._drives))
         self._last = obs.copy()  # a caller may fill the same array again
         after = int(self.data["frozen_after"])
         frozen = finite & self.data["watched"] & (self._same >= after) & (after > 0)

@@ -42,9 +42,9 @@ class Checks:
         Limits of the readings, in the units of the export. None is no limit. Readings are what the
         sensors say, not what an estimator makes of them.
     frozen_after : int, default 0
-        A state that stays the same to the bit for so many steps in which another reading moves is
-        frozen: not found where there is no other one, or none but a constant set-point. 0 checks
-        nothing: only you know how coarse a sensor is.
+        A state that stays the same to the bit for so many steps in which another reading moves, or
+        the output by 1e-4 of its range, is frozen. 0 checks nothing: only you know how coarse a
+        sensor is.
     missing : int or list of int, default 0
         For how many steps in a row a reading may be NaN before that is a fault, one number or one
         for each: 60 for a laboratory's hourly value among readings of every minute. An estimator

@@ -52,6 +52,8 @@ def comparison_table(
         for number, (old, new) in enumerate(zip(before.costs, after.costs, strict=True), start=1):
             lines.append(f"  {number:<13}{old:>12,.2f}{new:>12,.2f}{new - old:>+12,.2f}")
     violations = f"{after.violations.sum()} steps, {names[0]} {before.violations.sum()}"
+    ended = f"{after.terminated.sum()} by the env before their time, {names[0]} "
+    ended += f"{before.terminated.sum()}: their costs are of fewer steps"
     old, new = (each.observations[0].shape[-1] for each in (before, after))
     paid = [float(np.sum(each.penalty)) / counts[0] for each in (after, before)]
     soft = f"{paid[0]:.5g} instead of {paid[1]:.5g} an episode, which is in no cost above"
@@ -60,6 +62,7 @@ def comparison_table(
         "\n".join(lines),
         **paired_rows(after.costs, before.costs),
         violations=violations,
+        ended=ended * bool(after.terminated.any() or before.terminated.any()),
         soft_bounds=soft * any(paid),
         note=other * (old != new),
     )

@@ -182,6 +182,10 @@ def test_limits_frozen_sensors_and_late_steps(tmp_path):
     assert controller.status == 0 and controller.mode == "policy"
     controller(obs[1], elapsed=1.6)
     assert controller.status == Status.LATE and controller.mode == "mpc"
+    controller.request = "manual"
+    for k in range(6):  # the output moves, and no reading answers: the whole link is frozen
+        controller(obs[1], manual=[0.5 * (k % 2)])
+    assert controller.status == Status.FROZEN
 
 
 def test_a_lost_sensor_does_not_make_the_others_frozen(tmp_path):

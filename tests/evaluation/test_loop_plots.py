@@ -47,8 +47,9 @@ def test_the_table_shows_losses_as_well_as_gains() -> None:
     after.costs[:] = 9.0, 27.0
     text = comparison_table("costs", before, after, names=("PI", "after"))
     assert all(each in text for each in ("PI  ", "-1.00", "+7.00", "  +20.00 %", "+46.67 %"))
-    assert "observations have" not in text and "soft bounds" not in text
-    paid = replace(before, penalty=np.array([1.0, 3.0]))
+    assert not any(each in text for each in ("observations have", "soft bounds", "ended"))
+    paid = replace(before, penalty=np.array([1.0, 3.0]), terminated=np.array([True, False]))
+    assert "ended        0 by the env before their time, MPC 1" in comparison_table("", paid, after)
     assert "soft bounds  0 instead of 2 an episode" in comparison_table("", paid, after)
     assert "observations have 1 and 2 entries" in comparison_table("", before, episodes(2, size=2))
 

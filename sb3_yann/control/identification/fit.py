@@ -29,6 +29,7 @@ from sb3_yann.control.identification.least_squares import (
     regress,
     regularized,
 )
+from sb3_yann.control.identification.outputs import feedback
 from sb3_yann.control.identification.residuals import (
     LONG_PREDICTION,
     TIED,
@@ -92,6 +93,7 @@ def fit_log(
     found = regress(fitted, sizes, origin, weight)
     if not weight:
         _require_excited(found, fitted, n, m)
+        feedback(log.episodes)  # an integral action ties inputs to earlier states
     shrunk = list[str]()
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)

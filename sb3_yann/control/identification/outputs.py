@@ -143,7 +143,10 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
     rows = [each.regressors for each in with_lags(episodes, lags + 1, lags)]
     if sum(map(len, rows)) <= 10 * lags * width:
         return []
-    past = np.concatenate(rows).reshape(-1, lags + 1, width)
+    whole = np.concatenate(rows)
+    spread = whole.std(axis=0)
+    whole = (whole - whole.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    past = whole.reshape(-1, lags + 1, width)
     now = past[:, 0, q : q + m]
     own = np.column_stack([np.ones(len(now)), past[:, 1:, q : q + m].reshape(len(now), -1)])
     known = np.hstack([own, past[..., :q].reshape(len(now), -1)])

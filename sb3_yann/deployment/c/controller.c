@@ -384,6 +384,7 @@ void yann_init(yann_state *state)
     for (int i = 0; i < N_INPUTS; i++) {
         state->bump[i] = ZERO;
     }
+    state->drives = 0;
     state->faults = 0;
     state->sound = RECOVER;
     state->left = 0;
@@ -404,7 +405,7 @@ void yann_init(yann_state *state)
 static unsigned read_sensors(yann_state *state, const real obs[N_OBS], real good[N_OBS])
 {
     unsigned status = 0;
-    int moved = !state->started;
+    int moved = !state->started || state->drives;
     for (int i = 0; i < N_OBS; i++) {
         /* What is not finite has not moved. */
         moved = moved || (isfinite(obs[i]) && isfinite(state->last[i]) && obs[i] != state->last[i]);
@@ -505,6 +506,7 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
 {
     real target[N_INPUTS], low[N_INPUTS], high[N_INPUTS], good[N_OBS], seen[N_SEEN];
     const int begins = !state->started;
+    int drives = 0;
     int told = begins && manual != NULL;
     for (int i = 0; i < N_INPUTS && told; i++) {
         told = isfinite(manual[i]);
@@ -554,9 +556,13 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
         if (state->left > 0) {
             target[i] += state->bump[i] * ((real)state->left / (real)TRANSFER);
         }
+        const real before = state->output[i];
+        const real least = (real)1e-4 * (input_max[i] - input_min[i]) * action_scale[i];
         state->output[i] = between(target[i], low[i], high[i]);
         action[i] = state->output[i];
+        drives = drives || action[i] - before > least || before - action[i] > least;
     }
+    state->drives = drives;
     if (state->left > 0) {
         state->left--;
     }

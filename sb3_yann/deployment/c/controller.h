@@ -26,7 +26,7 @@ typedef enum { YANN_POLICY = 0, YANN_MPC = 1, YANN_MANUAL = 2 } yann_mode;
 /* What a step found; the first four are faults. */
 #define YANN_NOT_FINITE 1u   /* a reading, or manual where it counts, is NaN or infinite */
 #define YANN_OUT_OF_RANGE 2u /* a reading is beyond its limits */
-#define YANN_FROZEN 4u       /* a reading stays the same while others move */
+#define YANN_FROZEN 4u       /* a reading stays the same while others, or the output, move */
 #define YANN_LATE 8u         /* too much time has passed since the last step */
 #define YANN_OUTSIDE 16u     /* the MPC has no solution here */
 #define YANN_NETWORK 32u     /* a network put out what is no number; the law acted */
@@ -39,6 +39,7 @@ typedef struct {
     yann_real bump[YANN_N_INPUTS]; /* what a change of who acts must still make up for */
 @MEMORY@    int same[YANN_N_OBS];   /* for how many steps a reading has not moved */
     int absent[YANN_N_OBS]; /* for how many steps it has been missing */
+    int drives;             /* whether the output moved at the last step */
     int faults, sound, left;
     int started;
     yann_mode mode;      /* who acted at the last step */
