@@ -369,7 +369,7 @@ class Log:
             )
         if longer := [k for k, row in enumerate(content) if rows.restkey in row]:
             raise ValueError(
-                f"{path}, row {longer[0] + 2} has more entries than the header has names. Numbers "
+                f"{path}, line {longer[0] + 2} has more entries than the header has names. Numbers "
                 f"with a decimal comma need another delimiter than {delimiter!r}, and decimal=','."
             )
         table = np.array(
@@ -650,7 +650,7 @@ def _number(path: object, row: int, content: dict[str, str], name: str, decimal:
         if not any(map(str.isdigit, text)):  # "Bad Input", "No Data": see `_warn_of_words`
             return np.nan
         raise ValueError(
-            f"{path}, row {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
+            f"{path}, line {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
             "where there is no reading; for decimal commas pass decimal=','; leave out thousands' "
             "separators."
         ) from None
@@ -683,8 +683,8 @@ def _time(
             stamp = datetime.fromisoformat(content[name].strip())
         except ValueError:
             raise ValueError(
-                f"{path}, row {row + 2}: {name} is {content[name]!r}, expected a number or a time "
-                "stamp such as 2026-01-31 08:00. pandas.to_datetime(..., dayfirst=True) makes it."
+                f"{path}, line {row + 2}: {name} is {content[name]!r}, expected a number or a time "
+                "stamp such as 2026-01-31 08:00. pandas.to_datetime(column, format=...) makes it."
             ) from None
     if unit not in ("", *SECONDS):
         raise ValueError(

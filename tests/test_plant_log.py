@@ -259,14 +259,14 @@ TWO = "level,valve\n"
         ("", ["h"], r"it has \[\]. It is empty."),
         (CSV, "level", "list of column names"),
         (CSV, ["level"], r"disturbances = 'level' must be a list of column names"),
-        (CSV.replace("1.1", "1.1.1"), ["level"], "row 3: level is '1.1.1', expected a number"),
+        (CSV.replace("1.1", "1.1.1"), ["level"], "line 3: level is '1.1.1', expected a number"),
         (TWO, ["level"], "no rows below its"),
         (f"{TWO}1,ON\n3,OFF\n", ["level"], "valve is 'ON' in 1 rows, 'OFF' in 1 rows, and never"),
         (f"{TWO}1,2\n", ["level"], "no two rows"),
         (f"{TWO}1,\n,2\n", ["level"], "no two samples"),
         ("level,level,valve\n1,2,3\n4,5,6\n", ["level"], "several columns 'level'"),
         (f"{TWO}1,2\n3,4\n", ["level", "valve"], "'valve' is named twice"),
-        (f"{TWO}1,2\n1,5,2,3\n", ["level"], "row 3 has more entries than the header"),
+        (f"{TWO}1,2\n1,5,2,3\n", ["level"], "line 3 has more entries than the header"),
     ],
 )
 def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> None:
@@ -334,7 +334,7 @@ def test_time_stamps_are_in_the_unit_of_dt(dt, unit, found, write) -> None:
     log = Log.from_csv(write("at,T,valve", *rows), ["T"], ["valve"], dt, time="at", time_unit=unit)
     assert (len(log.episodes[0]), log.time_unit, log.lost_steps) == (19, found, 0)
     path = write("at,T,valve", *rows, "13/03/2026 08:00,1,2")
-    with pytest.raises(ValueError, match=r"row 22: at is '13/03/.*a number or a time stamp"):
+    with pytest.raises(ValueError, match=r"line 22: at is '13/03/.*a number or a time stamp"):
         Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at")
     with pytest.raises(ValueError, match="time_unit = 'hours': expected one of"):
         Log.from_csv(path, ["T"], ["valve"], dt=dt, time="at", time_unit="hours")

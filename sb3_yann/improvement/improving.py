@@ -178,6 +178,7 @@ class Improvement:
             text = f"{self.reason} The model is as it was."
             last = self._last
             refused = f"the last candidate, {self._change(last.change, last)}" if last else ""
+            refused += f": {last.reason}" if last and last.reason and self.note else ""
             most = min((each.change for each in self.checks), default=0.0)
             if last and most < last.change:
                 refused += f"; of another one it was {change_in_percent(most)}"
@@ -191,8 +192,8 @@ class Improvement:
             if last.mpc_exceeds:
                 rows["violations"] += f"; that exceeds a hard bound from {last.mpc_exceeds} starts"
                 rows["violations"] += ": give the MPC tighter ones"
-        more = f'report(result.model, "report.html", {source}={source}), then '
-        more += "Commissioning(result.model, plant, shadow=True)"
+        more = f'report(result.model, "report.html", {source}={source}), result.model.save(path), '
+        more += "then Commissioning(result.model, plant, shadow=True), which begins with the MPC"
         text = "Accepted: a better policy."
         if self.model is not None:
             text += of_estimates(self.model.policy.problem)

@@ -364,11 +364,6 @@ def test_bad_data_are_named(changes: dict[str, Any], message: Message) -> None:
         identify(**{"states": X, "actions": U, "dt": 1, **changes})
 
 
-def test_a_mask_that_hides_nothing_is_as_good_as_none() -> None:
-    plain = LinearModel.from_data(X, U, dt=1)
-    assert LinearModel.from_data(np.ma.array(X), np.ma.array(U), dt=1) == plain
-
-
 @pytest.mark.parametrize(("name", "level"), [("C", 0.95), ("A", 1.0), ("A", 0.0)])
 def test_bad_interval_is_named(name: str, level: float) -> None:
     with pytest.raises(ValueError, match=r"must be one of \('A', 'B', 'E'\)|must lie in \(0, 1\)"):
