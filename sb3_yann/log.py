@@ -266,9 +266,9 @@ class Log:
             whole = np.concatenate(parts)
             own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(whole.shape[1])]
             whole = _without_marks(own, whole)
-            whole = _without_spikes(own, whole) if of == "state" else whole
             empty += [a for a, z in zip(own, whole.T, strict=True) if not np.isfinite(z).any()]
             cut = np.split(whole, np.cumsum([len(each) for each in parts])[:-1])
+            cut = _without_spikes(own, cut) if of == "state" else cut
             records = [
                 replace(each, **{f"{of}s": part}) for each, part in zip(records, cut, strict=True)
             ]
@@ -353,29 +353,22 @@ class Log:
             raise ValueError(
                 f"{path} is not in {encoding}: pass encoding='latin-1', 'utf-16' or what it is in."
             ) from None
-        rows = csv.DictReader(StringIO(text), delimiter=delimiter)
-        header = list(rows.fieldnames or [])
+        header, content, lines = _rows(path, text, delimiter)
         columns = {
             name: _column(path, name, header)
             for name in (*states, *inputs, *disturbances, *references, episode, time)
             if name is not None
         }
-        content = list(rows)
         wanted = [columns[name] for name in (*states, *inputs, *disturbances, *references)]
         if twice := [name for name in wanted if wanted.count(name) > 1]:
             raise ValueError(
                 f"Column {twice[0]!r} is named twice. Each state, input and disturbance has a "
                 "column of its own."
             )
-        if longer := [k for k, row in enumerate(content) if rows.restkey in row]:
-            raise ValueError(
-                f"{path}, line {longer[0] + 2} has more entries than the header has names. Numbers "
-                f"with a decimal comma need another delimiter than {delimiter!r}, and decimal=','."
-            )
         table = np.array(
             [
-                [_number(path, k, row, name, decimal) for name in wanted]
-                for k, row in enumerate(content)
+                [_number(path, line, row, name, decimal) for name in wanted]
+                for line, row in zip(lines, content, strict=True)
             ]
         )
         if not len(table):
@@ -404,7 +397,8 @@ class Log:
         if time is not None:
             unit = time_unit or own
             pairs = [
-                _time(path, k, row, columns[time], unit, decimal) for k, row in enumerate(content)
+                _time(path, line, row, columns[time], unit, decimal)
+                for line, row in zip(lines, content, strict=True)
             ]
             instants, stamped = np.array(pairs).T
             if np.any(stamped):
@@ -432,7 +426,7 @@ SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
 NO_READING = -999, -9999, -99999, 999, 9999, 99999  # in place of one, as historians write it
 OFTEN_READ = 2 / 3
 """Share of the samples below which isolated readings make a state one that is read now and then."""
-SHORT = 8  # readings, on average between two gaps, from which on a state is cut at each of them
+SHORT = 4  # readings, on average between two gaps, from which on a state is cut at each of them
 FEWEST_RUNS = 10  # so many that an average says something
 
 
@@ -551,30 +545,47 @@ SPIKE = 50.0  # times nearly all other steps of a state are the two to and from 
 LONGEST_SPIKE = 3  # readings
 
 
-def _without_spikes(names: Sequence[str], values: Array) -> Array:
-    """Return states (N, n) with NaN for up to three readings in a row that are far from all."""
-    values = values.copy()
-    for name, column in zip(names, values.T, strict=True):
-        rows = np.flatnonzero(np.isfinite(column))
-        steps = np.diff(column[rows])
-        moves = np.abs(steps[steps != 0])
+def _without_spikes(names: Sequence[str], parts: Sequence[Array]) -> list[Array]:
+    """Return records of states (T + 1, n), NaN where up to three in a row are far beyond the rest.
+
+    They are left alone where there are many: a plant may answer a pulse so.
+    """
+    parts = [each.copy() for each in parts]
+    for i, name in enumerate(names):
+        columns = [each[:, i] for each in parts]
+        moves = np.abs(np.concatenate([np.diff(each[np.isfinite(each)]) for each in columns]))
+        moves = moves[moves > 0]
         if len(moves) < LEAST_READ:
             continue
-        found = np.zeros(len(rows), bool)
-        for length in range(1, LONGEST_SPIKE + 1):
-            there = steps[:-length]
-            both = np.minimum(np.abs(there), np.abs(steps[length:]))
-            back = np.abs(column[rows[length + 1 :]] - column[rows[: -length - 1]]) < both / 10
-            for k in np.flatnonzero(back & (both > SPIKE * np.quantile(moves, 0.9))):
-                found[k + 1 : k + 1 + length] = True
-        far = rows[found]
-        if 0 < len(far) <= 1 + len(rows) // 100:  # an angle may well jump there and back, often
+        least = SPIKE * float(np.quantile(moves, 0.9))
+        spikes = [_there_and_back(each, least) for each in columns]
+        whole = np.concatenate(columns)
+        far = np.concatenate(spikes)
+        rest = whole[~far & np.isfinite(whole)]
+        beyond = far & (np.abs(whole - np.median(rest)) > 1.5 * np.ptp(rest))
+        rows = np.flatnonzero(beyond)
+        if 0 < len(rows) <= LONGEST_SPIKE + len(whole) // 1000:
             warn(
-                f"{name} of the log is {column[far[0]]:g} in row {far[0]}, and far from it before "
-                f"and after ({len(far)} such rows): taken for no reading."
+                f"{name} of the log is {whole[rows[0]]:g} in row {rows[0]}, and far from it before "
+                f"and after ({len(rows)} such rows): taken for no reading."
             )
-            column[far] = np.nan
-    return values
+            for column, spike in zip(columns, spikes, strict=True):
+                column[spike] = np.nan
+    return parts
+
+
+def _there_and_back(column: Array, least: float) -> NDArray[np.bool_]:
+    """Return where up to three readings of a record are a jump of ``least`` there and back away."""
+    rows = np.flatnonzero(np.isfinite(column))
+    z = column[rows]
+    steps = np.diff(z)
+    found = np.zeros(len(column), bool)
+    for length in range(1, LONGEST_SPIKE + 1):
+        both = np.minimum(np.abs(steps[:-length]), np.abs(steps[length:]))
+        back = np.abs(z[length + 1 :] - z[: -length - 1]) < both / 10
+        for k in np.flatnonzero(back & (both > least)):
+            found[rows[k + 1 : k + 1 + length]] = True
+    return found
 
 
 def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int) -> None:
@@ -642,18 +653,42 @@ def _period(parts: Sequence[Array]) -> int:
     return every if np.mean(np.array(apart) % every == 0) > REGULAR else 1
 
 
-def _number(path: object, row: int, content: dict[str, str], name: str, decimal: str) -> float:
+def _number(path: object, line: int, content: dict[str, str], name: str, decimal: str) -> float:
     text = (content[name] or "").strip()
     try:
         return float(text.replace(decimal, ".")) if text else np.nan
     except ValueError:
-        if not any(map(str.isdigit, text)):  # "Bad Input", "No Data": see `_warn_of_words`
+        if _is_word(text):  # see `_warn_of_words`
             return np.nan
         raise ValueError(
-            f"{path}, line {row + 2}: {name} is {text!r}, expected a number. Leave the cell empty "
+            f"{path}, line {line}: {name} is {text!r}, expected a number. Leave the cell empty "
             "where there is no reading; for decimal commas pass decimal=','; leave out thousands' "
             "separators."
         ) from None
+
+
+def _rows(
+    path: object, text: str, delimiter: str
+) -> tuple[list[str], list[dict[str, str]], list[int]]:
+    """Return header, rows and their lines in the file: blank ones are skipped."""
+    rows = csv.DictReader(StringIO(text), delimiter=delimiter)
+    header = list(rows.fieldnames or [])
+    content: list[dict[str, str]] = []
+    lines: list[int] = []
+    for row in rows:
+        if rows.restkey in row:
+            raise ValueError(
+                f"{path}, line {rows.line_num} has more entries than the header has names. Numbers "
+                f"with a decimal comma need another delimiter than {delimiter!r}, and decimal=','."
+            )
+        content.append(row)
+        lines.append(rows.line_num)
+    return header, content, lines
+
+
+def _is_word(text: str) -> bool:
+    """Return whether a cell is no number, as "Bad Input", "Bad (0x80)", "#DIV/0!" and "---"."""
+    return text[:1].isalpha() or text[:1] == "#" or not any(map(str.isdigit, text))
 
 
 def _warn_of_words(
@@ -662,7 +697,7 @@ def _warn_of_words(
     """Warn of words in place of readings; raise where a column has nothing else."""
     for name, column in zip(names, values.T, strict=True):
         texts = [(row[name] or "").strip() for row in content]
-        words = Counter(each for each in texts if not any(map(str.isdigit, each)))
+        words = Counter(each for each in texts if _is_word(each))
         for blank in ("", "nan", "NaN"):
             words.pop(blank, None)
         shown = ", ".join(f"{word!r} in {count:,} rows" for word, count in words.most_common(3))
@@ -673,17 +708,17 @@ def _warn_of_words(
 
 
 def _time(
-    path: object, row: int, content: dict[str, str], name: str, unit: str, decimal: str
+    path: object, line: int, content: dict[str, str], name: str, unit: str, decimal: str
 ) -> tuple[float, bool]:
     """Return a time as it is given, an ISO 8601 time stamp in the unit, and which of them it is."""
     try:
-        return _number(path, row, content, name, decimal), False
+        return _number(path, line, content, name, decimal), False
     except ValueError:
         try:
             stamp = datetime.fromisoformat(content[name].strip())
         except ValueError:
             raise ValueError(
-                f"{path}, line {row + 2}: {name} is {content[name]!r}, expected a number or a time "
+                f"{path}, line {line}: {name} is {content[name]!r}, expected a number or a time "
                 "stamp such as 2026-01-31 08:00. pandas.to_datetime(column, format=...) makes it."
             ) from None
     if unit not in ("", *SECONDS):

@@ -210,9 +210,9 @@ class Headroom:
             return f"nothing was found, but {poor}"
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
         observer = CURE_IN_TWIN if self._in_twin else CURE
-        # The new model has the observer's part too.
-        shares = sum(parts[:2]) if self.verdict == "re-identify" else max(parts)
-        share = min(100.0, 100 * shares / (sum(parts) or 1.0))
+        named = [*ADVICE].index(self.verdict)  # a new model has the observer's part too
+        brought = sum(parts[:2]) if named == 2 else parts[named - 1]
+        share = min(100.0, 100 * brought / (sum(parts) or 1.0))
         why = f"{share:.0f} % of it is beyond a linear model"
         if not self._rivals_played:
             why = "what a better linear model brings is not known"

@@ -93,7 +93,9 @@ def fit_log(
     found = regress(fitted, sizes, origin, weight)
     if not weight:
         _require_excited(found, fitted, n, m)
-        feedback(log.episodes)  # an integral action ties inputs to earlier states
+        # Where an integral action ties inputs to earlier states the noise of the sensors biases
+        # all gains, by more than they are, and the residuals may be white all the same.
+        feedback(log.episodes)
     shrunk = list[str]()
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)

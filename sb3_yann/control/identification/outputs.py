@@ -145,7 +145,8 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
         return []
     whole = np.concatenate(rows)
     spread = whole.std(axis=0)
-    whole = (whole - whole.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    still = spread <= NO_MOVE * np.abs(whole).max(axis=0)
+    whole = (whole - whole.mean(axis=0)) / np.where(still, 1.0, spread)
     past = whole.reshape(-1, lags + 1, width)
     now = past[:, 0, q : q + m]
     own = np.column_stack([np.ones(len(now)), past[:, 1:, q : q + m].reshape(len(now), -1)])
@@ -153,7 +154,7 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
     alone = np.mean(project_out(own, now) ** 2, axis=0)
     rest = project_out(known, now)
     left = np.mean(rest**2, axis=0) / np.maximum(alone, NO_MOVE)
-    moves = alone > NO_MOVE * np.var(now, axis=0)
+    moves = alone > NO_MOVE  # of scaled inputs
     tied = moves & ((left < NO_MOVE) | (within_rounding(known, now) & (left < TIED)))
     if tied.any():
         raise ValueError(
@@ -268,7 +269,7 @@ def free_run_errors(
 ) -> tuple[Array, Array]:
     """Return the root mean square (q,) so many samples ahead, and the fit in percent.
 
-    Of fewer than ten readings the fit is NaN.
+    Where no output has ten readings the fit is NaN.
     """
     longer = [each for each in episodes if len(each) > ahead]
     if not longer:
@@ -281,7 +282,7 @@ def free_run_errors(
         mean = np.nansum(target, axis=0) / count
         moved = np.sqrt(np.nansum((target - mean) ** 2, axis=0) / count)
         errors = np.sqrt(np.nansum((target - guess) ** 2, axis=0) / count)
-    return errors, 100 * (1 - errors / np.where((moved > 0) & (count >= 10), moved, np.nan))
+    return errors, 100 * (1 - errors / np.where((moved > 0) & (count.max() >= 10), moved, np.nan))
 
 
 def predicted(

@@ -283,20 +283,16 @@ class LinearMPC(MPCProblem):
             states = own.layout.state
             limits |= {"x_min": own.x_min, "x_max": own.x_max}
             limits |= {"theta_min": own.theta_min[states], "theta_max": own.theta_max[states]}
-        limits |= options
-        bottom, top = (
-            np.broadcast_to(-far if limits.get(name) is None else limits[name], model.x_ss.shape)
-            for name, far in (("x_min", np.inf), ("x_max", -np.inf))
-        )
+        mpc = cls(model, Q=Q, R=R, horizon=horizon, **{**limits, **options})
         room = 1e-6 * (1 + np.abs(model.x_ss))
-        outside = (model.x_ss < bottom - room) | (model.x_ss > top + room)
+        outside = (model.x_ss < mpc.x_min - room) | (model.x_ss > mpc.x_max + room)
         if "x_ss" not in of_model and np.any(outside):
             raise ValueError(
                 f"A reset led the plant to rest at x_ss = {model.x_ss.round(4).tolist()}, beyond "
-                f"x_min = {bottom.tolist()} or x_max = {top.tolist()}. Pass x_ss=[...], the state "
-                "to hold; NaN where it is not known."
+                f"x_min = {mpc.x_min.tolist()} or x_max = {mpc.x_max.tolist()}. Pass x_ss=[...], "
+                "the state to hold; NaN where it is not known."
             )
-        return cls(model, Q=Q, R=R, horizon=horizon, **limits)
+        return mpc
 
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""

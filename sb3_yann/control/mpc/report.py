@@ -105,6 +105,8 @@ def _weights(problem: MPCProblem) -> Iterator[str]:
     states = np.diag(problem.Q) * half**2
     costs = [*states, *(np.diag(problem.R) * problem.u_half**2)]
     named = [(name, cost) for name, cost in zip(labels, costs, strict=True) if cost]
+    if not named:
+        return
     yield f"Half its range costs, in a step: {', '.join(f'{n} {cost:.3g}' for n, cost in named)}."
     if small := [n for n, cost in named[: np.count_nonzero(states)] if cost < FAINT * max(states)]:
         yield f"  Little beside others: {', '.join(small)}. Weights are in plant units."

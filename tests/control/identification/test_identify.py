@@ -201,7 +201,6 @@ def test_input_that_holds_a_given_state_is_found() -> None:
 
 
 DOUBLE = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
-"""Position and speed."""
 
 
 def drive(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -281,20 +280,23 @@ def test_sensor_noise_is_taken_for_no_delay() -> None:
         assert identify(*noisy, dt=1, delay="auto").delays == (0,)
 
 
-def closed_loop(test_signal: float) -> tuple[np.ndarray, np.ndarray]:
+def closed_loop(test_signal: float, noise=0.0, integral=0.0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
-    x = np.ones((201, 2))
-    u = np.zeros((200, 1))
+    x, u = np.ones((201, 2)), np.zeros((200, 1))
+    sensor = noise * np.random.default_rng(1).normal(size=x.shape)
     for k in range(200):
-        u[k] = -0.4 * x[k, 0] - 0.2 * x[k, 1] + test_signal * rng.normal()
+        y = (x + sensor)[: k + 1]
+        u[k] = y[-1] @ [-0.4, -0.2] - integral * y[:, 0].sum() + test_signal * rng.normal()
         x[k + 1] = A @ x[k] + B @ u[k] + 0.1 * rng.normal(size=2)
-    return x, u
+    return x + sensor, u
 
 
 def test_feedback_without_a_test_signal_is_refused_and_named() -> None:
     with pytest.raises(ValueError, match=r"0\.4 x\[0\] \+0\.2 x\[1\] \+1 u\[0\] never changes|"
                        r"1 x\[0\] \+0\.5 x\[1\] \+2\.5 u\[0\] never changes"):  # fmt: skip
         LinearModel.from_data(*closed_loop(0.0), dt=1)
+    with pytest.raises(ValueError, match=r"u\[0\] is a function of earlier outputs and inputs"):
+        identify(*closed_loop(0.0, noise=0.3, integral=0.1), dt=1)
 
 
 def test_feedback_with_a_test_signal_is_identified() -> None:
