@@ -41,7 +41,7 @@ class Status(IntFlag):
     NETWORK = 32  # a network's output is not finite; the law acted
 
 
-DRIVING = 1e-4  # of an input's range: an output that moves by more moves the plant
+DRIVING = 0.01  # of an input's range: an output that moves by more moves the plant
 SENSOR = Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.FROZEN
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": np.tanh,
@@ -182,7 +182,7 @@ class Controller:
         self._loads: Array = np.zeros(0)  # the measured disturbances that act until the next step
         self._bump = np.zeros(m)
         self._left = 0
-        self._drives = False  # whether the output moved at the last step
+        self._anchor: Array = self._output  # what came out when a reading moved last
 
     def evaluate(self, obs: ArrayLike, networks: bool = True) -> Array:
         """Return the policy's actions, without memory: (m,), or (batch, m) for a batch.
@@ -259,10 +259,8 @@ class Controller:
             if lost[shows_previous[shows_previous < len(lost)]].any():
                 last = (self._output - shift) / scale  # rates count from the own output then
                 low, high = np.clip(last + data["change"], *data["bounds"])[:, None]
-        before = self._output
         self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
-        least = DRIVING * np.ptp(data["bounds"], axis=0) * scale
-        self._drives = bool((np.abs(self._output - before) > least).any())
+        self._anchor = self._output if self._moved else self._anchor
         self.mode = mode
         self.status = status
         found = [str(each.name).lower() for each in Status if each in status]
@@ -304,7 +302,10 @@ class Controller:
         beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
         moved = obs != self._last
         others = (moved & finite & np.isfinite(self._last)).any()  # NaN has not moved
-        self._same = np.where(moved, 0, self._same + bool(others or self._drives))
+        self._moved = bool(others) or not self.counters["steps"]
+        least = DRIVING * np.ptp(self.data["bounds"], axis=0) * self.data["action_scale"]
+        drives = (np.abs(self._output - self._anchor) > least).any()
+        self._same = np.where(moved, 0, self._same + bool(self._moved or drives))
         self._last = obs.copy()  # a caller may fill the same array again
         after = int(self.data["frozen_after"])
         frozen = finite & self.data["watched"] & (self._same >= after) & (after > 0)

@@ -43,8 +43,8 @@ class Checks:
         sensors say, not what an estimator makes of them.
     frozen_after : int, default 0
         A state that stays the same to the bit for so many steps in which another reading moves, or
-        the output by 1e-4 of its range, is frozen. 0 checks nothing: only you know how coarse a
-        sensor is, and how long the dead time.
+        the output is 1 % of its range from what it was when one moved last, is frozen. 0 checks
+        nothing: only you know how coarse a sensor is, and how long the dead time.
     missing : int or list of int, default 0
         For how many steps in a row a reading may be NaN before that is a fault, one number or one
         for each: 60 for a laboratory's hourly value among readings of every minute. An estimator

@@ -103,9 +103,10 @@ def require_algorithm(algorithm: BaseAlgorithm | None, kinds: tuple[type, ...]) 
     if algorithm is not None and not isinstance(algorithm, kinds):
         name = type(algorithm).__name__
         what = " and ".join(each.__name__ for each in kinds)
+        names = "DDPG", "TD3", "SAC", "TQC", "PPO"
         raise TypeError(
-            f"This policy is one of {what}, not of {name}. DDPG, TD3, SAC, TQC and PPO each have "
-            'one, found by its name: PPO("YannPolicy", env).'
+            f"This policy is one of {what}, not of {name}. {', '.join(names)} each have one, found "
+            f'by its name: {name if name in names else "PPO"}("YannPolicy", env).'
         )
 
 

@@ -383,8 +383,8 @@ void yann_init(yann_state *state)
     }
     for (int i = 0; i < N_INPUTS; i++) {
         state->bump[i] = ZERO;
+        state->anchor[i] = ZERO;
     }
-    state->drives = 0;
     state->faults = 0;
     state->sound = RECOVER;
     state->left = 0;
@@ -405,16 +405,24 @@ void yann_init(yann_state *state)
 static unsigned read_sensors(yann_state *state, const real obs[N_OBS], real good[N_OBS])
 {
     unsigned status = 0;
-    int moved = !state->started || state->drives;
+    int drives = 0;
+    state->moved = !state->started;
     for (int i = 0; i < N_OBS; i++) {
         /* What is not finite has not moved. */
-        moved = moved || (isfinite(obs[i]) && isfinite(state->last[i]) && obs[i] != state->last[i]);
+        if (isfinite(obs[i]) && isfinite(state->last[i]) && obs[i] != state->last[i]) {
+            state->moved = 1;
+        }
+    }
+    for (int i = 0; i < N_INPUTS; i++) {
+        const real away = state->output[i] - state->anchor[i];
+        const real least = (real)0.01 * (input_max[i] - input_min[i]) * action_scale[i];
+        drives = drives || away > least || -away > least;
     }
     for (int i = 0; i < N_OBS; i++) {
         unsigned fault = 0;
         if (!state->started || obs[i] != state->last[i]) {
             state->same[i] = 0;
-        } else if (moved && state->same[i] < FROZEN_AFTER) {
+        } else if ((state->moved || drives) && state->same[i] < FROZEN_AFTER) {
             state->same[i]++;
         }
         state->last[i] = obs[i];
@@ -506,7 +514,6 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
 {
     real target[N_INPUTS], low[N_INPUTS], high[N_INPUTS], good[N_OBS], seen[N_SEEN];
     const int begins = !state->started;
-    int drives = 0;
     int told = begins && manual != NULL;
     for (int i = 0; i < N_INPUTS && told; i++) {
         told = isfinite(manual[i]);
@@ -556,13 +563,10 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
         if (state->left > 0) {
             target[i] += state->bump[i] * ((real)state->left / (real)TRANSFER);
         }
-        const real before = state->output[i];
-        const real least = (real)1e-4 * (input_max[i] - input_min[i]) * action_scale[i];
         state->output[i] = between(target[i], low[i], high[i]);
         action[i] = state->output[i];
-        drives = drives || action[i] - before > least || before - action[i] > least;
+        state->anchor[i] = state->moved ? action[i] : state->anchor[i];
     }
-    state->drives = drives;
     if (state->left > 0) {
         state->left--;
     }

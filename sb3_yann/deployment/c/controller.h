@@ -36,10 +36,11 @@ typedef struct {
     yann_real good[YANN_N_OBS]; /* the last good readings */
     yann_real last[YANN_N_OBS]; /* the last readings */
     yann_real output[YANN_N_INPUTS];
+    yann_real anchor[YANN_N_INPUTS]; /* what came out when a reading moved last */
     yann_real bump[YANN_N_INPUTS]; /* what a change of who acts must still make up for */
 @MEMORY@    int same[YANN_N_OBS];   /* for how many steps a reading has not moved */
     int absent[YANN_N_OBS]; /* for how many steps it has been missing */
-    int drives;             /* whether the output moved at the last step */
+    int moved; /* whether a reading moved */
     int faults, sound, left;
     int started;
     yann_mode mode;      /* who acted at the last step */
