@@ -558,9 +558,8 @@ def _without_spikes(names: Sequence[str], parts: Sequence[Array]) -> list[Array]
         if len(moves) < LEAST_READ:
             continue
         least = SPIKE * float(np.quantile(moves, 0.9))
-        spikes = [_there_and_back(each, least) for each in columns]
         whole = np.concatenate(columns)
-        far = np.concatenate(spikes)
+        far = np.concatenate([_there_and_back(each, least) for each in columns])
         rest = whole[~far & np.isfinite(whole)]
         beyond = far & (np.abs(whole - np.median(rest)) > 1.5 * np.ptp(rest))
         rows = np.flatnonzero(beyond)
@@ -569,7 +568,8 @@ def _without_spikes(names: Sequence[str], parts: Sequence[Array]) -> list[Array]
                 f"{name} of the log is {whole[rows[0]]:g} in row {rows[0]}, and far from it before "
                 f"and after ({len(rows)} such rows): taken for no reading."
             )
-            for column, spike in zip(columns, spikes, strict=True):
+            ends = np.cumsum([len(each) for each in columns])[:-1]
+            for column, spike in zip(columns, np.split(beyond, ends), strict=True):
                 column[spike] = np.nan
     return parts
 
