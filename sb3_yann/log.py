@@ -274,7 +274,7 @@ class Log:
             ]
             if of != "reference":
                 labels += own
-                columns += [*whole.T]
+                columns += [*np.concatenate(cut).T]
         n = records[0].states.shape[1]
         _warn_of_other_units(labels, columns, n)
         _warn_of_repeats(labels[:n], records)
@@ -426,7 +426,7 @@ SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
 NO_READING = -999, -9999, -99999, 999, 9999, 99999  # in place of one, as historians write it
 OFTEN_READ = 2 / 3
 """Share of the samples below which isolated readings make a state one that is read now and then."""
-SHORT = 4  # readings, on average between two gaps, from which on a state is cut at each of them
+SHORT_RUN = 4  # readings, on average between two gaps, from which on a state is cut at each of them
 FEWEST_RUNS = 10  # so many that an average says something
 
 
@@ -437,7 +437,9 @@ def _read_now_and_then(records: Sequence[Episode]) -> NDArray[np.bool_]:
     runs = np.sum(read[1:] > read[:-1], axis=0) + read[0]
     count = np.sum(read, axis=0)
     isolated = (count < OFTEN_READ * len(read)) & (runs > count / 2)
-    return np.asarray((0 < count) & (isolated | ((runs >= FEWEST_RUNS) & (runs > count / SHORT))))
+    return np.asarray(
+        (0 < count) & (isolated | ((runs >= FEWEST_RUNS) & (runs > count / SHORT_RUN)))
+    )
 
 
 def _cut(

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array, warn
 from sb3_yann.deployment import code
 from sb3_yann.deployment.code import ControllerArrays
-from sb3_yann.deployment.controller import KEPT_ROUNDING, MODES, Controller, steps_of
+from sb3_yann.deployment.controller import DRIVING, KEPT_ROUNDING, MODES, Controller, steps_of
 
 
 def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
@@ -255,7 +255,11 @@ def _definitions(data: ControllerArrays, precision: str) -> str:
     flags |= {
         key.upper(): int(data[key]) for key in ("frozen_after", "hold", "recover", "transfer")
     }
-    tolerances = {"late_after": data["late_after"], **code.search_tolerances(data, precision)}
+    tolerances = {
+        "late_after": data["late_after"],
+        "driving": DRIVING,
+        **code.search_tolerances(data, precision),
+    }
     flags |= {key.upper(): code.literal(value, precision) for key, value in tolerances.items()}
     if walks:
         flags["WALK_FROM"] = int(data["walk_from"])

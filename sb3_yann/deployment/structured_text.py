@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_yann.deployment import code
 from sb3_yann.deployment.code import ControllerArrays, decimal
-from sb3_yann.deployment.controller import KEPT_ROUNDING
+from sb3_yann.deployment.controller import DRIVING, KEPT_ROUNDING
 
 ACTIVATE = {
     "tanh": """k := 0;
@@ -176,6 +176,7 @@ def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:
         "FADES_TO": fade_end,
         "KEPT_ROUNDING": KEPT_ROUNDING,
         "LATE_AFTER": min(float(data["late_after"]), MAX_REAL),
+        "DRIVING": DRIVING,
     }
     lines = [f"{name} : {kind} := {decimal(value, precision)};" for name, value in reals.items()]
     for name in ("frozen_after", "hold", "recover", "transfer"):

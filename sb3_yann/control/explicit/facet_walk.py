@@ -34,7 +34,7 @@ from sb3_yann.control.polyhedra import (
 
 THINNEST = 1e-9
 """Regions that hold no ball of this radius, in half-widths of the box, are left out."""
-APART = 1e-8
+PERTURBED = 1e-8
 """How far unit rows are moved out, in half-widths, so that one of several active sets is told:
 above the tolerance of the QP, 1e-11, and below the step across a facet, 1e-7."""
 OUTER = -1
@@ -248,7 +248,7 @@ class Conditions:
         self.kept = moving[np.flatnonzero(alive[: len(moving)])]
 
     def active_at(self, theta: Array) -> int | None:
-        """Return DAQP's working set at theta, None if infeasible by more than `APART`.
+        """Return DAQP's working set at theta, None if infeasible by more than `PERTURBED`.
 
         With constraints moved apart: of several sets with one law it is that which has a region.
         """
@@ -261,7 +261,7 @@ class Conditions:
         import daqp
 
         n = len(theta)
-        upper = (self.D[:, :n] @ theta + self.D[:, n] + APART * self.apart) * self.units
+        upper = (self.D[:, :n] @ theta + self.D[:, n] + PERTURBED * self.apart) * self.units
         lower = np.full(rows, -1e30)
         sense = np.zeros(rows, dtype=np.intc)
         _, _, status, info = daqp.solve(*self.least_distance, upper, lower, sense, primal_tol=1e-11)

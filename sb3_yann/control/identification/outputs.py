@@ -39,9 +39,9 @@ RUN_AHEAD = 20
 """Samples of the free runs over held-out data."""
 MAX_ORDER = 16
 BETTER = 0.85
-"""Mean square of free runs, relative to the criterion's choice, below which another is taken,"""
-NEARLY = 0.1
-"""if its criterion is at most so much more for each output: errors of one step 5 % larger."""
+"""Mean square of free runs, relative to the criterion's choice, below which another is taken."""
+AS_LIKELY = 0.1
+"""For each output, how much larger its criterion may be: errors of one step are 5 % larger then."""
 ORDER_PATIENCE = 4  # orders without a better criterion after which none is tried any more
 SURE_DELAY = 10.0
 """By so much, over all steps, dead time must lower the criterion."""
@@ -208,7 +208,7 @@ class Search:
                     break
                 n += step
         best = min(found.values(), key=lambda each: each.criterion)
-        limit = best.criterion + NEARLY * len(best.errors)
+        limit = best.criterion + AS_LIKELY * len(best.errors)
         rough = [] if self.chunks.rare.any() else self.tried  # those read slow outputs never
         near = [each for each in (*rough, *found.values()) if each.criterion <= limit]
         free = min(near, key=lambda each: each.error)

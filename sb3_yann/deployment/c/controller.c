@@ -415,7 +415,7 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS], real good
     }
     for (int i = 0; i < N_INPUTS; i++) {
         const real away = state->output[i] - state->anchor[i];
-        const real least = (real)0.01 * (input_max[i] - input_min[i]) * action_scale[i];
+        const real least = DRIVING * (input_max[i] - input_min[i]) * action_scale[i];
         drives = drives || away > least || -away > least;
     }
     for (int i = 0; i < N_OBS; i++) {
