@@ -60,6 +60,7 @@ from sb3_yann.policy.policies import (
 )
 from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.env import LearntModel
+from sb3_yann.twin.forecast import SURE_SHARE
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.row_layout import RowLayout
@@ -560,11 +561,12 @@ class _Work:
             if passes(1.0):
                 return improvement(True)
             scenarios = self.hard
-        whole = self.weights()
-        for share in RETREATS:
-            self.scale(share, whole)
-            if passes(share):
-                return improvement(True)
+        if self.checks[-1].interval is None:  # else a forecast is not sure: of a part neither
+            whole = self.weights()
+            for share in RETREATS:
+                self.scale(share, whole)
+                if passes(share):
+                    return improvement(True)
         return improvement(False)
 
     def _of_estimates(self, scenarios: Scenarios, episodes: list[Episode], seed: int) -> Scenarios:
@@ -614,11 +616,12 @@ class _Work:
         change, low, high, cure, worst, objection = twin.forecast(self.act())
         found = replace(check, logged=change, error=(high - low) / 2, interval=(low, high))
         found = replace(found, worst=max(check.worst, worst))
-        if high < 0 and not objection:
-            return found
-        if high < 0:
-            return replace(found, accepted=False, reason=f"from new starts, {objection}")
+        if high < SURE_SHARE * min(change, 0.0):
+            reason = f"from new starts, {objection}" if objection else ""
+            return replace(found, accepted=not objection, reason=reason)
         text = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
+        if high < 0:
+            text += f", and {100 * SURE_SHARE:.0f} % of the expected gain must be sure"
         little = max(-low, high) < RULE.least_gain
         leads_on = "too little to teach" if little else f"to settle it, {cure}"
         return replace(found, accepted=False, reason=f"{text}: {leads_on}")

@@ -24,6 +24,7 @@ from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
 ONE_SIDED = 0.95  # probability that a change is not above an interval's end, or not below
+SURE_SHARE = 0.1  # of what a policy gains in the twin must be sure on the plant
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
 TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
 EACH = 5  # episodes, at least, that show by themselves how much they vary
@@ -338,5 +339,5 @@ def _cure(
         kind = " for longer than the actuator takes" if says == REMEMBERED else ""
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
-    needed = independent * min(((high - middle) / middle) ** 2, 100.0)
+    needed = independent * min(((high - middle) / (middle - SURE_SHARE * middle)) ** 2, 100.0)
     return f"log about {more(max(int(np.ceil(needed)), EACH) - independent + 1)} more"

@@ -438,12 +438,17 @@ def test_in_plant_units_it_finds_the_same(source) -> None:
     assert found.change == pytest.approx(plain.change, rel=0.05)
 
 
-def test_a_log_that_holds_nothing_worth_having_asks_for_no_more_of_it(monkeypatch) -> None:
+def test_a_forecast_that_may_lose_or_holds_too_little_is_refused(monkeypatch) -> None:
     lost = Forecast(-0.1, -0.2, -0.05, "", 0.3, "the worst 5 % of the starts cost too much")
     monkeypatch.setattr(PlantTwin, "forecast", lambda *_: lost)
     found = improve(problem(), twin_of(), **FEW)
     assert not found.accepted and found.checks[-1].worst >= 0.3
     assert found.checks[-1].reason == f"from new starts, {lost.objection}"
+    barely = Forecast(-0.02, -0.03, -1e-5, "log about 2 episodes more")
+    monkeypatch.setattr(PlantTwin, "forecast", lambda *_: barely)
+    found = improve(problem(), twin_of(), **FEW)
+    sure = "10 % of the expected gain must be sure: to settle it, log about 2 episodes more"
+    assert not found.accepted and found.reason.endswith(f"to -0.001 %, and {sure}.")
     narrow = Forecast(0.0, -1e-4, 2e-4, "log about 5 episodes more")
     monkeypatch.setattr(PlantTwin, "forecast", lambda *_: narrow)
     found = improve(problem(), twin_of(), **FEW)
