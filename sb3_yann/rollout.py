@@ -96,16 +96,10 @@ class Trajectories:
 
         After its end an episode stays where it is, and its rewards are NaN.
         """
-        longest = int(self.lengths.max())
-
-        def filled(parts: Sequence[Array], length: int) -> Array:
-            rows = [np.minimum(np.arange(length), len(each) - 1) for each in parts]
-            return np.stack([each[at] for each, at in zip(parts, rows, strict=True)], axis=1)
-
-        rewards = np.full((longest, len(self.actions)), np.nan)
+        rewards = np.full((int(self.lengths.max()), len(self.actions)), np.nan)
         for i, each in enumerate(self.own_rewards):
             rewards[: len(each), i] = each
-        return filled(self.observations, longest + 1), filled(self.actions, longest), rewards
+        return padded(self.observations), padded(self.actions), rewards
 
     def steps(self) -> tuple[Array, Array, Array]:
         """Return observations, actions and following observations of all steps, in time."""
@@ -127,6 +121,12 @@ class Trajectories:
     def no_worse(self, others: Trajectories) -> NDArray[np.bool_]:
         """Return which episodes are as long as others, and break no bound by more."""
         return np.asarray(~less_safe(self.unsafe(), others.unsafe()).any(axis=1))
+
+
+def padded(parts: Sequence[Array]) -> Array:
+    """Return arrays of rows side by side, (T, k, ...); after its end each stays where it is."""
+    rows = np.arange(max(map(len, parts)))
+    return np.stack([each[np.minimum(rows, len(each) - 1)] for each in parts], axis=1)
 
 
 def evaluate(

@@ -1,12 +1,10 @@
 """Whether the inputs and states of a log are those of the plant: rows, columns, signs and units.
 
-Two regressions tell. Where the MPC made the log, an input regressed on what the law gives has slope
-one and offset zero: then it is proven, whatever the plant's gain. Any other slope of a log that the
-law explains is a fault of the log, where the model predicts better without it. Where the law does
-not explain an input, only the plant can speak: the next states, regressed on states and inputs,
-show in which row, direction and size it acts. A plant whose gain is not the model's looks like an
-input in other units; a gain beyond 0.6 and 1.7 times the model's must be confirmed by whoever knows
-the plant.
+Two regressions tell. An input of the MPC, regressed on the law, has slope one and offset zero: then
+it is proven, whatever the plant's gain, and another slope is a fault of the log where the model
+predicts better without it. Where the law does not explain an input, the next states, regressed on
+states and inputs, show in which row, direction and size it acts. A gain beyond 0.6 and 1.7 times
+the model's looks like other units, and must be confirmed by whoever knows the plant.
 """
 
 from __future__ import annotations
@@ -26,17 +24,12 @@ from sb3_yann.twin.dynamics import Coordinates, law_of
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import basis
 
-STANDARD_ERRORS = 4.0
-"""A coefficient of a regression differs from a value where it is farther away than so many."""
-CLEARLY_BETTER = 0.25
-"""Another reading of a log counts where it leaves less than so much of the squared error."""
-EXACT_SHARE = 4e-4
-"""A regression that leaves less of an input's variance explains all of it: 2 % of its deviation."""
+STANDARD_ERRORS = 4.0  # so far from a value a coefficient of a regression differs from it
+CLEARLY_BETTER = 0.25  # share of the squared error that another reading of a log leaves at most
+EXACT_SHARE = 4e-4  # of an input's variance: a regression that leaves less explains all of it
 DITHERED_SHARE = 0.7  # the most of an input's variance that a dither on top of the law may be
-SLOPE_TOLERANCE = 0.1
-"""How far from one the slope of an input on the law may be: sensors' noise lowers it."""
-LEAST_GAIN = 0.6
-"""A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
+SLOPE_TOLERANCE = 0.1  # from one, of an input on the law: sensors' noise lowers the slope
+LEAST_GAIN = 0.6  # times the model's: a gain below, or above the inverse, must be confirmed
 MUCH_BETTER = 0.8  # share of the model's squared error that a unit's factor leaves at most
 ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
 PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
@@ -51,11 +44,7 @@ ROW_NAMES = {-1: "the row before", 0: "the same row", 1: "the row after"}
 
 
 class Logged:
-    """What is checked: rows (N, size), inputs (N, m), and the states after them (N, n).
-
-    Where its units are confirmed another gain, zero or pace than the model's is the plant's own,
-    and another law is another controller's.
-    """
+    """What is checked: rows (N, size), inputs (N, m), and the states after them (N, n)."""
 
     def __init__(
         self, coordinates: Coordinates, episodes: tuple[Episode, ...], units_confirmed: bool = False
@@ -78,11 +67,7 @@ class Logged:
 
     @cached_property
     def made_by_law(self) -> NDArray[np.bool_]:
-        """Which inputs (m,) are the MPC's own in enough rows: then units are beyond doubt.
-
-        In these rows the law moves nearly as much as in all of them: in other units what is logged
-        would meet it only where it stands still, or on a bound.
-        """
+        """Which inputs (m,) are the MPC's own in enough rows, in which it moves: in its units."""
         room = LAW * self.problem.u_half
         own = self.problem.deviations
         inside = (self.law > own.u_min + room) & (self.law < own.u_max - room)
@@ -96,17 +81,12 @@ class Logged:
 
     @cached_property
     def excitation(self) -> Array:
-        """How much of each input's variance (m,) neither the MPC nor a line in theta explains.
-
-        Set-points and bounds that change count as held: what they move is excitation. Previous
-        inputs move no state beside those of now, and a test that is held follows them: the line
-        has none of them.
-        """
+        """How much of each input's variance (m,) neither the MPC nor a line in theta explains."""
         theta = self.row.shown(self.rows).copy()
         layout = self.problem.layout
         given = np.r_[layout.reference, layout.limits]
-        theta[:, given] = theta[:, given].mean(axis=0)
-        known = np.delete(theta, layout.previous, axis=1)
+        theta[:, given] = theta[:, given].mean(axis=0)  # what set-points move is excitation
+        known = np.delete(theta, layout.previous, axis=1)  # a test that is held follows itself
         columns = np.column_stack([np.ones(len(theta)), known, law_of(self.problem)(theta)])
         left = self.inputs - columns @ np.linalg.lstsq(columns, self.inputs, rcond=None)[0]
         variance = np.var(self.inputs, axis=0)
@@ -127,8 +107,7 @@ class Logged:
 
     def errors(self, change: Array, shift: Any = 0.0, inputs: Array | None = None) -> Array:
         """Return how far the given model errs (N, n) where states x are ``change x + shift``."""
-        u = self.inputs if inputs is None else inputs
-        rows = np.concatenate([self.rows, u], axis=1)
+        rows = np.concatenate([self.rows, self.inputs if inputs is None else inputs], axis=1)
         rows[:, self.row.state] = self.rows[:, self.row.state] @ change.T + shift
         left = self.after @ change.T + shift - rows @ self.row.linear[self.row.state].T
         return np.asarray(left / np.abs(change @ self.unit))
@@ -158,10 +137,9 @@ def objections(log: Logged) -> list[str]:
 class _OnLaw(NamedTuple):
     """Each logged input j regressed on each column i of the law, some rows away, at [i, j].
 
-    ``slope`` and ``offset`` are known to an ``error`` and an ``offset_error`` of four standard
-    errors, and what sensors' noise adds to the latter. The regression leaves a share ``left`` of
-    the input's variance, and would leave ``left_of_rows`` with theta besides, were all that it adds
-    chance. ``unique`` (m,): the law is more than a multiple of one entry of theta.
+    Errors are four standard errors. The regression leaves a share ``left`` of the input's variance,
+    and would leave ``left_of_rows`` with theta besides, were all that it adds chance. ``unique``
+    (m,): the law is more than a multiple of one entry of theta.
     """
 
     slope: Array
@@ -180,19 +158,13 @@ class _OnLaw(NamedTuple):
 
     @property
     def as_it_is(self) -> NDArray[np.bool_]:
-        """Where column i of the law gives input j as it is, (m, m).
-
-        No plausible factor of units is as near to one as the slope may yet be.
-        """
+        """Where column i of the law gives input j as it is, in no other unit, (m, m)."""
         near = (np.abs(self.slope - 1) < SLOPE_TOLERANCE) & (self.error < 1 - LEAST_GAIN)
         return near & (np.abs(self.offset) < self.offset_error)
 
 
 def _on_law(log: Logged, shift: int, change: tuple[Array, Array] | None = None) -> _OnLaw:
-    """Return the regressions on the law at the rows ``shift`` away.
-
-    With ``change`` = (M, v) the law sees M x + v in place of the logged states x.
-    """
+    """Return the regressions on the law at the rows ``shift`` away, of M x + v by ``change``."""
     m = log.problem.model.n_inputs
     theta, u = log.on_law(shift)
     if change is not None:
@@ -200,9 +172,7 @@ def _on_law(log: Logged, shift: int, change: tuple[Array, Array] | None = None) 
         theta[:, state] = theta[:, state] @ change[0].T + change[1]
     answer = law_of(log.problem)(theta)
     known = np.isfinite(answer).all(axis=1)
-    theta = theta[known]
-    u = u[known]
-    answer = answer[known]
+    theta, u, answer = (each[known] for each in (theta, u, answer))
     slope, offset, offset_error = np.zeros((3, m, m))
     error, left, left_of_rows = np.ones((3, m, m))
     error *= STANDARD_ERRORS
@@ -211,30 +181,26 @@ def _on_law(log: Logged, shift: int, change: tuple[Array, Array] | None = None) 
     for i in range(m):
         inside = np.minimum(answer[:, i] - own.u_min[i], own.u_max[i] - answer[:, i])
         inside = inside > 1e-3 * log.problem.u_half[i]
-        y = u[inside]
-        a = answer[inside, i]
-        x = theta[inside]
+        y, a, x = (each[inside] for each in (u, answer[:, i], theta))
         if len(a) < LEAST_ROWS or np.std(a) < 1e-6 * log.problem.u_half[i]:
             continue
         x = x[:, np.std(x, axis=0) > 1e-9 * log.problem.theta_half]
         F = np.column_stack([a - a.mean(), np.ones(len(a))])
         rows = np.column_stack([F, (x - x.mean(axis=0)) / np.std(x, axis=0)])
         spread = np.maximum(np.var(y, axis=0), 1e-12 * log.problem.u_half**2)
-        found = np.linalg.lstsq(F, y, rcond=None)[0]
-        slope[i] = found[0]
-        offset[i] = found[1] - found[0] * a.mean()
-        left[i] = np.mean((y - F @ found) ** 2, axis=0) / spread
+        slope[i], mean = np.linalg.lstsq(F, y, rcond=None)[0]
+        offset[i] = mean - slope[i] * a.mean()
+        left[i] = np.mean((y - F @ [slope[i], mean]) ** 2, axis=0) / spread
         rest = y - rows @ np.linalg.lstsq(rows, y, rcond=1e-9)[0]
         # An F test: p columns that say nothing explain p of N rows.
-        chance = 1 + 3 * x.shape[1] / len(a)
-        left_of_rows[i] = chance * np.mean(rest**2, axis=0) / spread
+        left_of_rows[i] = (1 + 3 * x.shape[1] / len(a)) * np.mean(rest**2, axis=0) / spread
         sure = STANDARD_ERRORS * np.sqrt(left[i] * spread / len(a))
         error[i] = sure / np.std(a)
         # Of one entry of theta every linear controller is the law times a factor.
         share = x - F @ np.linalg.lstsq(F, x, rcond=None)[0]
         unique[i] = np.any(np.var(share, axis=0) > 0.02 * np.var(x, axis=0))
-        moved = sure * np.sqrt(np.mean(a**2) / np.var(a))
-        offset_error[i] = SLOPE_TOLERANCE * np.sqrt(spread) + moved
+        noise = SLOPE_TOLERANCE * np.sqrt(spread)
+        offset_error[i] = noise + sure * np.sqrt(np.mean(a**2) / np.var(a))
     return _OnLaw(slope, offset, error, offset_error, left, left_of_rows, unique)
 
 
@@ -242,40 +208,34 @@ def _against_law(
     log: Logged, readings: dict[int, _OnLaw], proven: NDArray[np.bool_]
 ) -> Iterator[str]:
     """Yield where an input is the law's of other rows or columns, or in other units."""
-    logged = readings[0]
     names = log.names[1]
     for j in np.flatnonzero(~proven):
-        own = logged.left[j, j]
+        own = readings[0].left[j, j]
         found = [
             (float(on.left[i, j]), s, i)
             for s, on in readings.items()
-            for i in range(len(names))
-            if on.alone[i, j]
-            and ((s == 0 and i == j) or on.left[i, j] < CLEARLY_BETTER * own - 1e-9)
+            for i in np.flatnonzero(on.alone[:, j])
+            if (s == 0 and i == j) or on.left[i, j] < CLEARLY_BETTER * own - 1e-9
         ]
         if not found:
             continue
         _, s, i = min(found)
         slope = readings[s].slope[i, j]
-        cures = ["move the inputs by a row"] if s else []
-        cures += ["exchange the columns"] if i != j else []
-        cures += ["change the sign"] if slope < 0 else []
+        cures = ["move the inputs by a row"] * bool(s) + ["exchange the columns"] * bool(i != j)
+        cures += ["change the sign"] * bool(slope < 0)
         if cures and abs(abs(slope) - 1) < SLOPE_TOLERANCE + readings[s].error[i, j]:
-            what = f"{'minus ' if slope < 0 else ''}what the MPC gives {names[i]}"
             late = " A controller that acts a sample late is dead time: PastInputs."
             yield (
-                f"The logged {names[j]} is {what} in {ROW_NAMES[s]} (it leaves "
+                f"The logged {names[j]} is {'minus ' * bool(slope < 0)}what the MPC gives "
+                f"{names[i]} in {ROW_NAMES[s]} (it leaves "
                 f"{100 * np.sqrt(readings[s].left[i, j]):.3g} % of its deviation; its own leaves "
-                f"{100 * np.sqrt(logged.left[j, j]):.3g} %). In the log, "
+                f"{100 * np.sqrt(own):.3g} %). In the log, "
                 f"{' and '.join(cures)}.{late if s == -1 else ''}"
             )
 
 
 def _against_states(log: Logged, logged: Array, proven: NDArray[np.bool_]) -> Iterator[str]:
-    """Yield where two columns of the states are exchanged, or one has the other sign.
-
-    Then the law gives the inputs from the states so changed, or the given model predicts them.
-    """
+    """Yield where law or model fit the states with two columns exchanged, or one negated."""
     n = log.problem.model.n_states
     names = log.names[0]
 
@@ -293,21 +253,18 @@ def _against_states(log: Logged, logged: Array, proven: NDArray[np.bool_]) -> It
             better = np.diagonal(on.left) < CLEARLY_BETTER * logged - 1e-9
             fits = np.any(np.diagonal(on.as_it_is & on.alone) & better & ~proven)
         if fits:
-            what = (
-                f"{names[i]} and {names[j]} are exchanged" if i != j else f"{names[i]} is negated"
-            )
+            what = f"and {names[j]} are exchanged" if i != j else "is negated"
             yield (
-                f"The log fits the MPC, or its model, clearly better where {what}: look at the "
-                "columns and signs of the states."
+                f"The log fits the MPC, or its model, clearly better where {names[i]} {what}: look "
+                "at the columns and signs of the states."
             )
 
 
 def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield which inputs, or which state instead, in another unit or with another zero are the law.
 
-    A law that is nearly linear takes the zero of one state for that of another, or of its input:
-    the model tells them apart, or all are named. Where it predicts no better so, another controller
-    wrote the log.
+    A law that is nearly linear takes the zero of one for another's: the model tells them apart, or
+    all are named. Where it predicts no better so, another controller wrote the log.
     """
     names = log.names
     n = log.problem.model.n_states
@@ -319,10 +276,10 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
     of_inputs = []
     read = log.inputs.copy()
     for j in np.flatnonzero(~proven & np.diagonal(logged.alone)):
-        slope = logged.slope[j, j]
-        error = logged.error[j, j]
-        away = logged.offset[j, j]
-        away = away if abs(away) > logged.offset_error[j, j] else 0.0
+        slope, error, away, known = (
+            each[j, j] for each in (logged.slope, logged.error, logged.offset, logged.offset_error)
+        )
+        away = away if abs(away) > known else 0.0
         if abs(slope) > error and (abs(slope - 1) > SLOPE_TOLERANCE + error or away):
             zero = f", {away:+.4g}" if away else ""
             of_inputs.append(
@@ -331,14 +288,13 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
             read[:, j] = (log.inputs[:, j] - away) / slope
     if of_inputs:
         found = [(left_by_model(np.eye(n), np.zeros(n), read), " and ".join(of_inputs))]
-    left_open = ~proven
     law = law_of(log.problem)
     theta, u = log.on_law()
     some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
     theta = theta[some]
     u = u[some]
     scale = np.maximum(np.std(u, axis=0), 1e-6 * log.problem.u_half)
-    for i in range(n) if left_open.any() else ():
+    for i in range(n) if not proven.all() else ():
 
         def left(p: Array, i: int = i) -> Array:
             rows = theta.copy()
@@ -352,15 +308,13 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
         if not moved or not np.mean(fit.fun**2) < 0.5 * before:
             continue
         change = np.eye(n)
-        shift = np.zeros(n)
         change[i, i] = factor
-        shift[i] = zero * log.unit[i]
+        shift = zero * log.unit[i] * np.eye(n)[i]
         on = _on_law(log, 0, (change, shift))
-        if np.any(np.diagonal(on.as_it_is & on.alone) & left_open):
+        if np.any(np.diagonal(on.as_it_is & on.alone) & ~proven):
             times = f"{factor:.4g} times " if abs(factor - 1) > 0.01 else ""
             words = f"The MPC gives the logged inputs where {names[0][i]} is {times}what is logged"
-            words += f", {shift[i]:+.4g}"
-            found.append((left_by_model(change, shift, log.inputs), words))
+            found.append((left_by_model(change, shift, log.inputs), f"{words}, {shift[i]:+.4g}"))
     as_it_is = left_by_model(np.eye(n), np.zeros(n), log.inputs)
     found = [(error, words) for error, words in found if error < as_it_is]
     least = min((error for error, _ in found), default=0.0)
@@ -369,10 +323,7 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
 
 
 def _other_pace(log: Logged) -> Iterator[str]:
-    """Yield where the states move as the model's do in several samples: rows are missing.
-
-    The gains are left open, and the zeros: a plant may have others.
-    """
+    """Yield where the states move as the model's do in several samples, with any gain and zero."""
     model = log.problem.model
     x = log.rows[:, log.row.state]
     n = model.n_states
@@ -385,8 +336,7 @@ def _other_pace(log: Logged) -> Iterator[str]:
         power = model.A @ power
         rest = (log.after - x @ power.T) / log.unit
         rest -= rest.mean(axis=0)
-        moves = log.inputs - log.inputs.mean(axis=0)
-        u = moves[:, None] * (driven / log.unit[:, None])
+        u = (log.inputs - log.inputs.mean(axis=0))[:, None] * (driven / log.unit[:, None])
         gains = np.linalg.lstsq(u.reshape(-1, m), rest.ravel(), rcond=1e-9)[0]
         left.append(np.var(rest - u @ gains, axis=0) + ROUNDING)
     ratio = np.array(left) / left[0]
@@ -403,16 +353,13 @@ def _against_plant(log: Logged, proven: NDArray[np.bool_]) -> Iterator[str]:
     if words := _by_innovations(log):
         yield words
         return
-    fit = _Effects.of(log, 0)
-    B = log.problem.model.B
-    unit = log.unit
-    if fit is None:
+    if (fit := _Effects.of(log, 0)) is None:
         return
-    sizes = np.maximum(np.sum((B / unit[:, None]) ** 2, axis=0), 1e-300)
-    weights = (B / unit[:, None] ** 2 / sizes).T  # they make 1 of a column of B
+    B = log.problem.model.B / log.unit[:, None]
+    sizes = np.maximum(np.sum(B**2, axis=0), 1e-300)
+    weights = (B / log.unit[:, None] / sizes).T  # they make 1 of a column of B
     for s in (-1, 1):
-        other = _Effects.of(log, s)
-        if other is None:
+        if (other := _Effects.of(log, s)) is None:
             continue
         # Inputs that follow the state of their own row tell it, with the other sign: no cause.
         caused = other.follows.min() > 0.7 or np.min(np.sum(weights * other.B.T, axis=1)) > 1 / 3
@@ -429,8 +376,7 @@ def _against_plant(log: Logged, proven: NDArray[np.bool_]) -> Iterator[str]:
 def _by_innovations(log: Logged) -> str:
     """Return in which other row, or with which other sign, an estimator needs the inputs.
 
-    It knows the plant by its model. Its innovations are those of the log, less what a linear filter
-    makes of the inputs' change.
+    Its innovations are those of the log, less what a linear filter makes of the inputs' change.
     """
     estimator = log.row.estimator
     state = log.problem.layout.state
@@ -446,8 +392,7 @@ def _by_innovations(log: Logged) -> str:
         errors.append(left[1:-1, state] @ np.linalg.pinv(seen).T)
     e = np.concatenate(errors)
 
-    def shown(changes: list[Array]) -> Array:
-        """Return what inputs (T - 2, m) more in each episode add to the innovations (N, q)."""
+    def shown(changes: list[Array]) -> Array:  # what so much more input adds to innovations (N, q)
         found = []
         for change in changes:
             z = np.zeros(len(estimator.A))
@@ -464,8 +409,8 @@ def _by_innovations(log: Logged) -> str:
         if ratio.min() < 0.5 and ratio.max() < 1.5:
             return f"The outputs follow {_moved(s, ratio.min())}"
     constant = [np.ones_like(u) for u in inputs]  # of inputs that count from elsewhere
-    one = np.eye(inputs[0].shape[1])
-    columns = [shown([u[1:-1] * on for u in of]) for of in (inputs, constant) for on in one]
+    each_input = np.eye(inputs[0].shape[1])
+    columns = [shown([u[1:-1] * on for u in of]) for of in (inputs, constant) for on in each_input]
     scale = np.maximum(e.std(axis=0), 1e-300)
     F = (np.array(columns) / scale).reshape(len(columns), -1).T
     y = (e / scale).ravel()
@@ -501,10 +446,9 @@ def _against_gains(
     names = log.names[1]
     own = np.arange(len(weights))
     B = log.problem.model.B
-    same = np.eye(len(B))
-    unit = log.unit[:, None]
-    norms = np.outer(np.linalg.norm(fit.B / unit, axis=0), np.linalg.norm(B / unit, axis=0))
-    apart = 1 - ((fit.B / unit).T @ (B / unit) / np.maximum(norms, 1e-300)) ** 2
+    found, given = (each / log.unit[:, None] for each in (fit.B, B))
+    norms = np.outer(np.linalg.norm(found, axis=0), np.linalg.norm(given, axis=0))
+    apart = 1 - (found.T @ given / np.maximum(norms, 1e-300)) ** 2
     columns = linear_sum_assignment(apart)[1]
     sizes = np.linalg.norm(fit.B / np.sqrt(np.diag(fit.covariance))[:, None], axis=0)
     known = np.all(sizes > STANDARD_ERRORS * np.sqrt(len(B)) * fit.factors)
@@ -523,14 +467,13 @@ def _against_gains(
         error = STANDARD_ERRORS * float(np.sqrt(max(variance, 0.0)) * fit.factors[j])
         measured = f"{gain:.3g} ± {error:.2g} times"
         # Units make the model better; where they do not, the gain is curvature.
-        read = np.where(np.arange(len(own)) == j, gain, 1.0) * log.inputs
-        both = (np.var(log.errors(same, inputs=u), axis=0).sum() for u in (read, log.inputs))
-        left, before = both
+        read = np.where(own == j, gain, 1.0) * log.inputs
+        errors = (log.errors(np.eye(len(B)), inputs=u) for u in (read, log.inputs))
+        left, before = (np.var(each, axis=0).sum() for each in errors)
         far = not LEAST_GAIN < gain < 1 / LEAST_GAIN and abs(gain - 1) > error
-        far = far and bool(left < MUCH_BETTER * before)
         if gain + error < 0 and gain < -0.1:
             yield _against_sign(names[j], measured)
-        elif far and not log.units_confirmed:
+        elif far and left < MUCH_BETTER * before and not log.units_confirmed:
             yield (
                 f"The logged {names[j]} moves the plant {measured} as much as the model says: "
                 f"is it in other units, or a row off? {CONFIRM}"
@@ -564,41 +507,38 @@ def _resting(log: Logged, fit: _Effects) -> Iterator[str]:
 def _rest_of(log: Logged) -> Array:
     """Return the state (n,) at which the plant rests, or hardly moves, with u = 0.
 
-    A regression on states and inputs, and on their products where rows are enough, tells; rows
-    nearby count more.
+    It is that of a regression, on products as well where rows are enough; rows nearby count more.
     """
-    row = log.row
     unit = log.unit
     n = unit.size
-    z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes]) / log.scale
-    y = np.concatenate([e.thetas[1:, row.state] for e in log.episodes]) / unit
+    z = log.row.features(log.rows, log.inputs) / log.scale
+    y = log.after / unit
     curved = basis(z, False, 2)
     F = np.column_stack([np.ones(len(z)), curved if len(z) > 5 * (curved.shape[1] + 1) else z])
-    here = np.zeros(z.shape[1])
     spread = z.std(axis=0)
     spread[spread == 0] = 1.0
 
+    def features(x: Array) -> Array:
+        return np.append(x * unit / log.scale[:n], np.zeros(z.shape[1] - n))
+
     def motion(x: Array) -> Array:
-        now = np.concatenate([x * unit / log.scale[:n], here[n:]])
-        terms = basis(now[None], False, 2)[0]
+        terms = basis(features(x)[None], False, 2)[0]
         return np.asarray(weights[0] + terms[: F.shape[1] - 1] @ weights[1:] - x)
 
-    x = here[:n]
+    x: Array = np.zeros(n)
     for _ in range(5):
-        near = np.exp(-np.mean(((z - here) / spread) ** 2, axis=1) / 2)[:, None]
+        near = np.exp(-np.mean(((z - features(x)) / spread) ** 2, axis=1) / 2)[:, None]
         weights = np.linalg.lstsq(near * F, near * y, rcond=1e-9)[0]
         x = least_squares(motion, x).x
-        here = np.concatenate([x * unit / log.scale[:n], here[n:]])
     return np.asarray(unit * x)
 
 
 class _Effects(NamedTuple):
-    """A regression of the next states on states and inputs.
+    """A regression of the next states on states and inputs: B (n, m), and what it leaves.
 
-    It finds B (n, m), and leaves the ``covariance`` (n, n). ``factors`` (m,) are standard errors of
-    a column of B over the deviation of what is left. ``drift`` (n,) is the next state of x = 0 and
-    u = 0. ``follows`` (m,) is the deviation of the inputs that the states leave, relative to their
-    own.
+    ``factors`` (m,) are standard errors of a column of B over the deviation of what is left,
+    ``drift`` (n,) is the next state of x = 0 and u = 0, ``follows`` (m,) the deviation of the
+    inputs that the states leave, relative to their own.
     """
 
     B: Array
@@ -610,17 +550,14 @@ class _Effects(NamedTuple):
 
     @classmethod
     def of(cls, log: Logged, shift: int) -> _Effects | None:
-        """Return the regression on the inputs some rows away; None where there are few rows.
-
-        Squares of the states count where rows are enough.
-        """
+        """Return the regression on the inputs some rows away; None where there are few rows."""
         row = log.row
         m = log.problem.model.n_inputs
         steps = [(e, np.arange(1, len(e) - 1)) for e in log.episodes]
         z = np.concatenate([row.features(e.thetas[k], e.actions[k + shift]) for e, k in steps])
         y = np.concatenate([e.thetas[k + 1, row.state] for e, k in steps])
         x, u = np.split(z / log.scale, [-m], axis=1)
-        curved = basis(x, False, 2)
+        curved = basis(x, False, 2)  # where rows are enough
         states = curved if len(z) > 5 * (curved.shape[1] + m + 1) else x
         F = np.column_stack([u, np.ones(len(z)), states])
         if len(z) <= 5 * F.shape[1]:
@@ -637,6 +574,5 @@ class _Effects(NamedTuple):
         own = u - F[:, m:] @ np.linalg.lstsq(F[:, m:], u, rcond=None)[0]
         follows = np.std(own, axis=0) / np.maximum(np.std(u, axis=0), 1e-12)
         size = log.scale[-m:]
-        drift_error = np.sqrt(np.diag(covariance)) * factors[m]
-        B = slopes[:m].T / size
-        return cls(B, covariance, factors[:m] / size, slopes[m], drift_error, follows)
+        drift = slopes[m], np.sqrt(np.diag(covariance)) * factors[m]
+        return cls(slopes[:m].T / size, covariance, factors[:m] / size, *drift, follows)

@@ -19,20 +19,17 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann_envs.spaces import ProblemBox
 
-WIDEST_DRAW = 3.0
-WIDEST = 2.0
-RARE = 0.05
-"""How many boxes wide starts are drawn at most; how much wider than the log's starts their box is
-at most; how likely a start is, in one coordinate, beyond what the log shows."""
+WIDEST_DRAW = 3.0  # boxes of starts: as wide others are drawn at most
+WIDEST = 2.0  # times as wide as the log's starts their box is at most
+RARE = 0.05  # how likely a start is, in one coordinate, beyond what the log shows
 
 
 @dataclass(frozen=True)
 class Starts:
-    """The box of first states, and the logged rows.
+    """The box of first states, and the logged rows: the first one of each episode, and all.
 
     The box is that of a uniform distribution, estimated without bias from the first states of the
-    log: with k of them it is (k + 1) / (k - 1) times as wide as they are, twice at most. ``first``
-    and ``rows`` are the first row of each episode, and all of them.
+    log: with k of them it is (k + 1) / (k - 1) times as wide as they are, twice at most.
     """
 
     row: RowLayout
@@ -44,16 +41,15 @@ class Starts:
     @classmethod
     def of(cls, row: RowLayout, episodes: tuple[Episode, ...]) -> Starts:
         """Return those of a log, whose episodes hold rows of this layout."""
-        problem = row.problem
+        own = row.problem.deviations
         first = np.array([each.thetas[0] for each in episodes])
         rows = np.concatenate([each.thetas[:-1] for each in episodes])
-        n = problem.model.n_states
+        n = own.model.n_states
         x = first[:, :n]
-        k = len(first)
         middle = (x.max(0) + x.min(0)) / 2
-        half = (x.max(0) - x.min(0)) / 2 * _widened(k)
-        low = np.maximum(middle - half, problem.deviations.theta_min[:n])
-        high = np.minimum(middle + half, problem.deviations.theta_max[:n])
+        half = (x.max(0) - x.min(0)) / 2 * _widened(len(x))
+        low = np.maximum(middle - half, own.theta_min[:n])
+        high = np.minimum(middle + half, own.theta_max[:n])
         # Where all begin beyond theta's box, they begin there.
         return cls(row, np.minimum(low, high), np.maximum(low, high), first, rows)
 
@@ -75,8 +71,7 @@ class Starts:
         high = first.max(0)
         ranges = 2 * (2 / (k + 1) / RARE) ** (1 / max(k - 1, 1)) - 1
         further = (high - low) / 2 * max(ranges - 1, 0.0)
-        low = np.minimum(rows.min(0), low - further)
-        return low, np.maximum(rows.max(0), high + further)
+        return np.minimum(rows.min(0), low - further), np.maximum(rows.max(0), high + further)
 
     def draw(self, count: int, rng: np.random.Generator, episodes: Any = None) -> Array:
         """Return rows (count, size) where episodes begin: in the box, the rest as logged.
@@ -100,9 +95,8 @@ class Starts:
             return drawn
         held = self.row.given
         some = drawn[::2].copy()
-        low, high = np.clip(
-            self.shown, self.problem.deviations.theta_min, self.problem.deviations.theta_max
-        )
+        own = self.problem.deviations
+        low, high = np.clip(self.shown, own.theta_min, own.theta_max)
         some[:, held] = rng.uniform(low[held], high[held], some[:, held].shape)
         inside = self.problem.law().in_domain(self.row.shown(some))
         drawn[::2][inside] = some[inside]
@@ -115,25 +109,19 @@ class Starts:
     def draw_around(self, count: int, rng: np.random.Generator) -> Array:
         """Return rows (count, size) from boxes up to three times as wide: nothing is known.
 
-        How wide is drawn evenly, and wider where :meth:`chance_beyond` says so: the fewer starts
-        there are in the log, the wider. Those that the law has no solution for are replaced by
-        logged ones.
+        How wide is drawn evenly, and wider where :meth:`chance_beyond` says so. Those that the law
+        has no solution for are replaced by logged ones.
         """
         drawn = self.draw_between(count, rng)
+        own = self.problem.deviations
         n = len(self.low)
         k = len(self.first)
-        middle = (self.high + self.low) / 2
-        half = (self.high - self.low) / 2
         nearest = (1 + _widened(k)) / 2
         ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
         wide = np.maximum(ranges / _widened(k), rng.uniform(1, WIDEST_DRAW, (count, 1)))
-        reach = np.minimum(wide, WIDEST_DRAW) * half
-        drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
-        shown = np.clip(
-            self.row.shown(drawn),
-            self.problem.deviations.theta_min,
-            self.problem.deviations.theta_max,
-        )
+        reach = np.minimum(wide, WIDEST_DRAW) * (self.high - self.low) / 2
+        drawn[:, :n] = (self.high + self.low) / 2 + reach * rng.uniform(-1, 1, (count, n))
+        shown = np.clip(self.row.shown(drawn), own.theta_min, own.theta_max)
         outside = ~self.problem.law().in_domain(shown)
         drawn[:, : shown.shape[1]] = shown
         drawn = self.row.begin(drawn)
@@ -149,11 +137,9 @@ class Starts:
         """
         n = len(self.low)
         k = len(self.first)
-        x = thetas[..., :n]
-        seen = self.first[:, :n]
-        middle = (self.high + self.low) / 2
-        half = np.ptp(seen, axis=0) / 2
-        rho = (np.abs(x - middle) / np.maximum(half, 1e-300)).max(axis=-1)
+        away = np.abs(thetas[..., :n] - (self.high + self.low) / 2)
+        half = np.ptp(self.first[:, :n], axis=0) / 2
+        rho = (away / np.maximum(half, 1e-300)).max(axis=-1)
         return np.asarray(2 / (k + 1) * ((1 + np.maximum(rho, 1.0)) / 2) ** (1.0 - k))
 
 
@@ -192,9 +178,9 @@ class Limits:
             low = np.minimum(low, least - width)
             high = np.maximum(high, most + width)
         room = ON_BOUND * problem.theta_half[:n]
-        bounded = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min))
-        limited = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max))
-        return cls(coordinates.row, bounded - room, limited + room)
+        low = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min)) - room
+        high = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max)) + room
+        return cls(coordinates.row, low, high)
 
     def violated(self, thetas: Array, room: float = 0.0) -> NDArray[np.bool_]:
         """Return whether states lie beyond by some half-widths, for rows (..., size); NaN does."""
@@ -206,15 +192,15 @@ class Limits:
 def _planned(coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
     """Return the box of the MPC's runs on its own model: as long as the log's, from its starts."""
     problem = starts.problem
+    own = problem.deviations
     n = problem.model.n_states
     steps = len(starts.rows) // len(starts.first)
     model = Dynamics(problem, coordinates, (Residual.zero(len(coordinates.scale), n),))
     first = starts.draw(PLANNED, np.random.default_rng(0))
     rows = model.roll_out(law_of(problem), first[None], steps)[0]
     x = rows[..., coordinates.row.state].reshape(-1, n)
-    least = problem.deviations.theta_min[:n]
-    most = problem.deviations.theta_max[:n]
-    return np.clip(x.min(axis=0), least, most), np.clip(x.max(axis=0), least, most)
+    low, high = np.clip([x.min(axis=0), x.max(axis=0)], own.theta_min[:n], own.theta_max[:n])
+    return low, high
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -240,16 +226,13 @@ class TwinEnv(gym.Env[Single, Single]):
     """Episodes of a member of a twin: theta is observed, the reward is minus the stage cost.
 
     Theta and inputs are in plant units where the problem's model has an operating point.
-
-    ``info["excess"]`` and ``info["penalty"]`` are those of
-    :class:`~sb3_yann.wrappers.StageCost`, and an excess is a violation.
+    ``info["excess"]`` and ``info["penalty"]`` are those of :class:`~sb3_yann.wrappers.StageCost`.
+    ``info["violation"]`` reports an excess, or a state outside what the log shows: there the twin
+    knows nothing.
 
     An episode begins in the box of the log's first states, takes the references and disturbances of
-    one of its episodes, and lasts as long. ``info["violation"]`` reports a state beyond the
-    problem's bounds, or outside what the log shows: there the twin knows nothing.
-
-    The seed of an episode decides which member acts: seed modulo members. :meth:`PlantTwin.env`
-    makes one.
+    one of its episodes, and lasts as long. Its seed decides which member acts: seed modulo members.
+    :meth:`PlantTwin.env` makes one.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
@@ -260,9 +243,9 @@ class TwinEnv(gym.Env[Single, Single]):
         self.dynamics = model.dynamics
         problem = model.problem
         self.render_mode = None
-        low, high = (each.astype(np.float32) for each in (problem.theta_min, problem.theta_max))
+        bounds = problem.theta_min, problem.theta_max, problem.u_min, problem.u_max
+        low, high, u_min, u_max = (each.astype(np.float32) for each in bounds)
         self.observation_space = ProblemBox(low, high, problem=problem)
-        u_min, u_max = (each.astype(np.float32) for each in (problem.u_min, problem.u_max))
         self.action_space = gym.spaces.Box(u_min, u_max)
         self._theta: Array | None = None  # a row
 
@@ -278,16 +261,14 @@ class TwinEnv(gym.Env[Single, Single]):
         super().reset(seed=seed)
         problem = self.dynamics.problem
         members = self.dynamics.members
-        acting = int(self.np_random.integers(len(members)))
-        if seed is not None:
-            acting = seed % len(members)
+        drawn = int(self.np_random.integers(len(members)))
+        acting = drawn if seed is None else seed % len(members)
         self._acting = Dynamics(problem, self.dynamics.coordinates, (members[acting],))
         self._episode = self.model.episodes[int(self.np_random.integers(len(self.model.episodes)))]
         row = self.dynamics.row
         first = self._episode.thetas[0].copy()
         theta = row.shown(first)
         state = problem.layout.state
-        units = problem.units
         theta[state] = self.model.starts.draw(1, self.np_random)[0, state]
         if options:
             given = np.asarray(options.get("state"), np.float64)
@@ -297,10 +278,10 @@ class TwinEnv(gym.Env[Single, Single]):
                     f"options['state'] = {given.tolist()} must be finite numbers of the shape "
                     f"{sizes[0]} or {sizes[1]}."
                 )
-            theta[: len(given)] = units.to_deviations(given)
+            theta[: len(given)] = problem.units.to_deviations(given)
         self._theta = row.begin(first)
         self._steps = 0
-        shown = units.to_plant(theta)
+        shown = problem.units.to_plant(theta)
         return shown.astype(np.float32), {"state": shown.copy(), "member": acting}
 
     def step(self, action: Single) -> tuple[Single, float, bool, bool, dict[str, Any]]:
@@ -309,8 +290,9 @@ class TwinEnv(gym.Env[Single, Single]):
             raise gym.error.ResetNeeded("Call env.reset() before env.step().")
         u = np.asarray(action, np.float64)
         if u.shape != self.action_space.shape or not np.all(np.isfinite(u)):
-            wanted = f"{self.action_space.shape} finite numbers"
-            raise ValueError(f"action = {action!r} must be {wanted}.")
+            raise ValueError(
+                f"action = {action!r} must be {self.action_space.shape} finite numbers."
+            )
         row = self.dynamics.row
         units = self.dynamics.problem.units
         problem = self.dynamics.problem.deviations

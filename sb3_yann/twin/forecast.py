@@ -19,6 +19,7 @@ from sb3_yann._progress import bar
 from sb3_yann._validation import Array, Feedback
 from sb3_yann.compare import RULE
 from sb3_yann.control.mpc.bound_excess import costs_of
+from sb3_yann.rollout import padded
 from sb3_yann.twin.dynamics import Dynamics, law_of, play
 from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
@@ -28,7 +29,7 @@ SURE_SHARE = 0.1  # of what a policy gains in the twin must be sure on the plant
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
 TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
 EACH = 5  # episodes, at least, that show by themselves how much they vary
-MEMORY = 2  # earlier samples that a memory knows
+AGO = 1, 2  # so many samples ago is what a memory knows
 REMEMBERED = (
     "errors that follow earlier inputs and errors, as in this log, perhaps because of a lag or a "
     "load that lasts"
@@ -44,10 +45,9 @@ STEPS_PER_WEIGHT = 4  # steps of a log for each coefficient, at least
 class Judge:
     """A twin that a log may refute, fitted without each fold of the episodes.
 
-    Member k has not seen fold k: every episode whose number is k modulo the members, of fewer than
-    five a part of each. ``says`` is what sets it apart. It is ``refuted`` where it predicts
-    held-out episodes surely worse than the twin; dynamics that both lack may feign that: with a
-    memory it counts.
+    Member k has not seen the episodes whose number is k modulo the members. ``says`` is what sets
+    it apart. Where it is ``refuted``, predicts held-out episodes surely worse than the twin, it
+    counts with a memory alone: dynamics that both lack may feign that.
     """
 
     dynamics: Dynamics
@@ -82,27 +82,24 @@ class _Replays:
         self.explains = False
         self.units = judge.dynamics.coordinates.units
         row = self.dynamics.row
-        steps = max(map(len, episodes))
-        at = [np.minimum(np.arange(steps + 1), len(each)) for each in episodes]
-        self.rows = np.stack([e.thetas[k] for e, k in zip(episodes, at, strict=True)], axis=1)
-        last = [np.minimum(k[:-1], len(e) - 1) for e, k in zip(episodes, at, strict=True)]
-        self.inputs = np.stack([e.actions[k] for e, k in zip(episodes, last, strict=True)], axis=1)
-        self.alive = np.arange(steps)[:, None] < [len(each) for each in episodes]
+        self.rows = padded([each.thetas for each in episodes])
+        self.inputs = padded([each.actions for each in episodes])
+        self.alive = np.arange(len(self.inputs))[:, None] < [len(each) for each in episodes]
+        alive = self.alive[:, None, :, None]
         rows, inputs = (
             np.repeat(each[:, None], self.members, axis=1) for each in (self.rows[:-1], self.inputs)
         )
         predicted = np.stack([self._step(r, u) for r, u in zip(rows, inputs, strict=True)])
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
-        self.errors = np.where(self.alive[:, None, :, None], errors, 0.0)  # (T, members, N, n)
+        self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
         self.weights = None
         if remembers:
-            basis = np.stack(
-                [self._regressors(t, r, inputs, self.errors) for t, r in enumerate(rows)]
-            )
+            made = [self._regressors(t, r, inputs, self.errors) for t, r in enumerate(rows)]
+            basis = np.stack(made)
             self.weights = self._memory(basis)
         if self.weights is not None:
             remembered = np.einsum("tmnk,mkj->tmnj", basis, self.weights)
-            self.errors = np.where(self.alive[:, None, :, None], self.errors - remembered, 0.0)
+            self.errors = np.where(alive, self.errors - remembered, 0.0)
         number = np.arange(len(episodes))
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
         sizes = np.log(np.sum(unseen**2, axis=-1) + TINY_SQUARE)
@@ -137,8 +134,8 @@ class _Replays:
         (T, N * some, p), is as logged by default.
         """
         problem = self.dynamics.problem
+        own = problem.deviations
         row = self.dynamics.row
-        limits = problem.deviations.u_min, problem.deviations.u_max
         count, some, size = starts.shape
         steps, _, m = self.inputs.shape
         like = np.repeat(np.arange(count), some)
@@ -147,7 +144,7 @@ class _Replays:
 
         def inputs_at(t: int, rows: Array) -> Array:
             u = act(np.nan_to_num(row.shown(rows).reshape(-1, problem.n_theta)))
-            return np.clip(u, *limits).reshape(*rows.shape[:2], m)
+            return np.clip(u, own.u_min, own.u_max).reshape(*rows.shape[:2], m)
 
         def step(t: int, rows: Array, inputs: Array) -> Array:
             if self.weights is not None:
@@ -167,11 +164,10 @@ class _Replays:
         return np.asarray(found.reshape(self.members, count, some))
 
     def _regressors(self, t: int, rows: Array, inputs: Array, missed: Array) -> Array:
-        past = [inputs[t - lag] if t >= lag else 0 * inputs[0] for lag in range(1, MEMORY + 1)]
-        before = [missed[t - lag] if t >= lag else 0 * missed[0] for lag in range(1, MEMORY + 1)]
+        past = (of[t - lag] if t >= lag else 0 * of[0] for of in (inputs, missed) for lag in AGO)
         one = np.ones((*rows.shape[:-1], 1))
         x = rows[..., self.dynamics.row.state]
-        return np.concatenate([one, x, inputs[t], *past, *before], axis=-1)
+        return np.concatenate([one, x, inputs[t], *past], axis=-1)
 
     def _memory(self, basis: Array) -> Array | None:
         """Return weights (members, k, n) of a memory; None where there are few rows.
@@ -184,18 +180,17 @@ class _Replays:
         if self.alive.sum() < STEPS_PER_WEIGHT * basis.shape[-1] or count < 2:
             return None
         known = self.alive.copy()
-        known[:MEMORY] = False
+        known[: max(AGO)] = False
         weights = []
         left = np.zeros(2)
         for k in range(self.members):
             unseen = np.arange(count) % self.members == k
-            fit = known & ~unseen if np.any(known & ~unseen) else known
+            fit, test = (known & of if np.any(known & of) else known for of in (~unseen, unseen))
             z = basis[:, k]
             e = self.errors[:, k]
             weights.append(_ridge(z[fit], e[fit]))
             short = _ridge(z[fit][:, :plain], e[fit])
             rests = e - z @ weights[-1], e - z[..., :plain] @ short
-            test = known & unseen if np.any(known & unseen) else known
             left += [np.sum((each[test] / self.units) ** 2) for each in rests]
         self.explains = bool(left[0] < (1 - LESS) * left[1])
         return np.array(weights)
@@ -220,14 +215,14 @@ def forecast(
     """Return what a policy changes on the plant: 90 % of true changes shall lie inside.
 
     It is the union of the judges' intervals, of runs from the log's own starts, and of others from
-    the box of all starts at new set-points and loads, which no policy was fitted to. Of each, the
-    standard error is that over the episodes, of fewer than five independent ones over runs from new
-    starts, with that of a fit without each fold of them (the jackknife). Where its errors follow
-    earlier inputs and errors, the judge is asked again with a memory of them. The first judge is
-    the twin's own: there new starts must keep the rule for the worst ones, too. ``loosest`` is the
-    input that follows the MPC most closely.
+    the box of all starts at new set-points and loads, which no policy was fitted to. Where its
+    errors follow earlier inputs and errors, a judge is asked again with a memory of them. The first
+    judge is the twin's own: there new starts must keep the rule for the worst ones, too.
+    ``loosest`` is the input that follows the MPC most closely.
     """
-    independent = sum(len(each[::2]) for each in records(judges[0].dynamics.problem, episodes))
+    problem = judges[0].dynamics.problem
+    law = law_of(problem)
+    independent = sum(len(each[::2]) for each in records(problem, episodes))
     count = len(episodes)
     rng = np.random.default_rng(0)
     some = -(-MIN_RUNS // count)
@@ -239,7 +234,6 @@ def forecast(
     lost: list[float] = []
     objections: list[str] = []
     for judge in bar("forecasts by models of the log", judges, timed=True):
-        law = law_of(judge.dynamics.problem)
         for remembers in (False, True):
             if (judge.refuted and not remembers) or (remembers and not own.explains):
                 continue
@@ -257,13 +251,11 @@ def forecast(
                 with np.errstate(all="ignore"):
                     most = np.max(policy - mpc) / np.abs(mpc).mean()
                 lost.append(float(np.nan_to_num(most, nan=np.inf)))
-    low = [each[1] for each in found]
-    high = [each[2] for each in found]
     change = (found[0][0] + found[1][0]) / 2
-    widest = found[int(np.argmax(high))]
-    more = partial(more_of, judges[0].dynamics.problem, episodes)
-    cure = _cure(*widest, independent, loosest, more)
-    return Forecast(change, min(low), max(high), cure, max(lost), objections[0])
+    widest = max(found, key=lambda each: each[2])
+    cure = _cure(*widest, independent, loosest, partial(more_of, problem, episodes))
+    low = min(each[1] for each in found)
+    return Forecast(change, low, widest[2], cure, max(lost), objections[0])
 
 
 def _objection(mpc: Array, policy: Array) -> str:
@@ -298,8 +290,8 @@ def _changed(
         runs = mpc, policy
     with np.errstate(all="ignore"):
         ratios = (policy - mpc).mean(axis=1) / np.abs(mpc).mean(axis=1)  # (members,)
-        changes = runs[1] - runs[0]
         size = np.abs(runs[0])
+        changes = runs[1] - runs[0]
         about = (changes.mean(axis=1) / size.mean(axis=1)).mean()
     if not np.isfinite([*ratios, about]).all() or independent < 2:
         return 0.0, -np.inf, np.inf
@@ -317,10 +309,9 @@ def _changed(
     cost = np.maximum(weights @ size.mean(axis=0), 1e-300)
     drawn = weights @ changes.mean(axis=0) / cost - about
     out = stats.norm.cdf(likely[0] * np.sqrt((1 + 1 / independent) / (1 - 1 / count)))
-    down, up = np.abs(np.quantile(drawn, (1 - out, out)))
     fits = likely[1] * np.sqrt((len(ratios) - 1) * ratios.var())
-    down, up = (float(np.hypot(each, fits)) + room for each in (down, up))
-    return mean, mean - down, mean + up
+    down, up = np.hypot(np.quantile(drawn, (1 - out, out)), fits) + room
+    return mean, mean - float(down), mean + float(up)
 
 
 def _cure(

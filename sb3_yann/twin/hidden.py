@@ -21,13 +21,9 @@ from sb3_yann.twin.selection import Setting, basis, shrinkage_of
 SHOOTING_STEPS = (5, 15, 60)  # steps of the windows: long ones begin where short ones have led
 CORRECTIONS = 15  # of a search, at most
 LEAST_SAVED = 1e-3  # a search is done when a correction saves less than this part of its errors
-GUESS = 1e-5
-KNOWN = 1e-2
-"""Weight of the given states where windows begin, beside the outputs'; of those that another fit
-found: what is hidden has the same coordinates then."""
-FARTHEST = (
-    3.0  # times the largest magnitude in the log: a residual goes no farther while it is fitted
-)
+GUESS = 1e-5  # weight of the given states where windows begin, beside the outputs'
+KNOWN = 1e-2  # of those that another fit found: what is hidden has the same coordinates then
+FARTHEST = 3.0  # times the largest magnitude in the log, of a residual while it is fitted
 Run = Callable[[Array, Array], tuple[Array, Array]]
 
 
@@ -83,8 +79,7 @@ def _run(
     row = coordinates.row
     units = coordinates.units
     n = len(units)
-    linear = row.linear[row.state]
-    step = np.hstack([linear[:, row.state], linear[:, row.size :]])
+    step = row.linear[row.state][:, row.inputs]
     constant = row.problem.layout.has_constants
     residual = Residual.of_basis(weights * units, len(coordinates.scale), constant)
     x = begin * units
@@ -135,8 +130,7 @@ def _descended(
     damping = 1e-2
     cost, e, J = judged(weights, begin)
     for _ in range(CORRECTIONS):
-        of_begin = J[:, :, :n]
-        of_weights = J[:, :, n:]
+        of_begin, of_weights = np.split(J, [n], axis=2)
         own = of_begin.swapaxes(1, 2) @ of_begin + trust * np.eye(n)
         cross = of_weights.swapaxes(1, 2) @ of_begin
         flat = of_weights.reshape(-1, of_weights.shape[-1])

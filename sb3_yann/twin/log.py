@@ -60,18 +60,20 @@ def as_episodes(
     beyond their bounds are a ValueError.
     """
     layout = problem.layout
-    pairs = [tuple(map(_as_columns, each)) for each in as_pairs(episodes)]
-    states, actions = map(list, zip(*pairs, strict=True))
-    states = as_matrices("states", states)
-    actions = as_matrices("actions", actions)
+    pairs = zip(*as_pairs(episodes), strict=True)
+    # A list of numbers is one column.
+    states, actions = (
+        as_matrices(name, [np.reshape(x, (-1, 1)) if np.ndim(x) == 1 else x for x in parts])
+        for name, parts in zip(("states", "actions"), pairs, strict=True)
+    )
     require_one_state_more("actions", actions, states)
     given = {"references": references, "disturbances": disturbances}
     beside = {name: values for name, values in given.items() if values is not None}
     for name, values in beside.items():
         if not hasattr(values, "__len__"):
             raise TypeError(f"{name} must be a list with an entry for each episode.")
-        if len(values) != len(pairs):
-            raise ValueError(f"{name} has {len(values)} entries for {len(pairs)} episodes.")
+        if len(values) != len(states):
+            raise ValueError(f"{name} has {len(values)} entries for {len(states)} episodes.")
     if states[0].shape[1] not in (layout.n_states, layout.size):
         raise ValueError(
             f"states have {states[0].shape[1]} columns, the problem {layout.n_states} states, and "
@@ -133,8 +135,7 @@ def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
     for episode in episodes:
         count = min(-(-least // len(episodes)), max(1, len(episode) // (4 * SHORTEST)))
         for first, last in pairwise(np.linspace(0, len(episode), count + 1).astype(int)):
-            rows = episode.thetas[first : last + 1], episode.actions[first:last]
-            found.append(Episode(*rows))
+            found.append(Episode(episode.thetas[first : last + 1], episode.actions[first:last]))
     return tuple(found)
 
 
@@ -175,23 +176,16 @@ def as_pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
     return [(states, actions) for states, actions in pairs]
 
 
-def _as_columns(values: ArrayLike) -> ArrayLike:
-    """Return a list of numbers as one column, and anything else as it is."""
-    return np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values
-
-
 def _within_bounds(problem: LinearMPC, i: int, u: Array) -> Array:
     """Return inputs (T, m) of episode i in deviations, with their rounding cut off."""
     room = 1e-3 * problem.u_half
     beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
-    if beyond.any():
-        row, k = np.argwhere(beyond)[0]
-        low = problem.u_min[k]
-        high = problem.u_max[k]
+    for row, k in np.argwhere(beyond):
         raise ValueError(
-            f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds {low:g} and "
-            f"{high:g} of the problem. A log is in plant units where the model has an operating "
-            "point, and in the model's own where it has none."
+            f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds "
+            f"{problem.u_min[k]:g} and {problem.u_max[k]:g} of the problem. A log is in plant "
+            "units where the model has an operating point, and in the model's own where it has "
+            "none."
         )
     return problem.units.input_to_deviations(np.clip(u, problem.u_min, problem.u_max))
 
@@ -240,8 +234,8 @@ def observer_of(env: Any) -> StateEstimator | None:
     An id, a class or a function that makes an env has none.
     """
     found = None
-    if is_vec_env(env):
-        found = env.get_attr("observer", 0)[0] if env.has_attr("observer") else None
+    if is_vec_env(env) and env.has_attr("observer"):
+        found = env.get_attr("observer", 0)[0]
     elif isinstance(env, gym.Env) and env.has_wrapper_attr("observer"):
         found = env.get_wrapper_attr("observer")
     return found if isinstance(found, StateEstimator) else None
@@ -253,10 +247,10 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
     An observer moves its estimate by a fixed matrix times what the model does not predict.
     """
     parts = problem.layout
-    inside = (problem.deviations.theta_min, problem.deviations.theta_max)
+    own = problem.deviations
     if not parts.n_disturbances:
         return
-    d_min, d_max = (each[parts.disturbance] for each in inside)
+    d_min, d_max = (each[parts.disturbance] for each in (own.theta_min, own.theta_max))
     room = ROUNDED * (d_max - d_min)
     errors = []
     moves = []
@@ -264,7 +258,7 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
         d = each.thetas[:, parts.disturbance]
         free = np.all((d > d_min + room) & (d < d_max - room), axis=1)
         free = free[1:] & free[:-1]
-        left = each.thetas[1:] - problem.deviations.predict(each.thetas[:-1], each.actions)
+        left = each.thetas[1:] - own.predict(each.thetas[:-1], each.actions)
         errors.append(left[free, parts.state])
         moves.append(np.diff(d, axis=0)[free])
     e = np.concatenate(errors)

@@ -60,10 +60,8 @@ BLOCKS = 40  # pieces of a log of few episodes that its members are fitted to so
 WINDOW_STEPS = 20  # steps of the windows that networks are fitted to
 HIDDEN_SETTINGS = Setting(1, 1e-4, 1.0), Setting(2, 1e-4, 1.0), Setting(2, 1e-6, 1.0)
 """How the residuals of states that nothing shows are fitted, the least free first."""
-LONG_LOG = 100
-LACKS = 0.01
-"""Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
-episodes err by so much of the mean."""
+LONG_LOG = 100  # steps of a log that networks are tried on
+LACKS = 0.01  # error of all else's predicted costs, relative to their mean, where they are
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,9 +72,7 @@ class PlantTwin(LearntModel):
     towards the given model, or small networks, by free runs over episodes that its fit has not
     seen. Several members, fitted to episodes drawn with replacement, tell how much is not known.
     Outside the data the residual stays what it is at their edge. Where an observer *estimates* d,
-    it is a part of the twin.
-
-    Make one with :meth:`fit`.
+    it is a part of the twin. Make one with :meth:`fit`.
 
     Attributes
     ----------
@@ -117,11 +113,8 @@ class PlantTwin(LearntModel):
 
     def __repr__(self) -> str:
         """Name the sizes, and whether to trust it."""
-        verdict = "trusted" if self.trusted else "not trusted"
-        members = len(self.dynamics.members)
-        return (
-            f"PlantTwin({self.kind}, {len(self.episodes)} episodes, {members} members, {verdict})"
-        )
+        sizes = f"{len(self.episodes)} episodes, {len(self.dynamics.members)} members"
+        return f"PlantTwin({self.kind}, {sizes}, {'' if self.trusted else 'not '}trusted)"
 
     @classmethod
     def fit(  # noqa: PLR0913 (what a log consists of, by name)
@@ -165,11 +158,9 @@ class PlantTwin(LearntModel):
             Of the draws of episodes, and of the weights that networks start from.
         units_confirmed : bool, default False
             Whether somebody has checked the log's units. A plant whose gain is below 0.6 or above
-            1.7 times the model's looks like an input in other units, and a controller that is a
-            multiple of the law like another zero or scale, where the model predicts better with
-            that: such a log is not trusted unless you say so. A header with another unit than the
-            model's is an error. Where the MPC made the log its inputs are proven, and nothing needs
-            saying.
+            1.7 times the model's, or a controller that is a multiple of the law, looks like another
+            unit or zero: such a log is not trusted unless you say so. A header with another unit
+            than the model's is an error. Inputs of the MPC's own are proven: nothing needs saying.
         progress_bar : bool, default True
             Whether to show what takes more than three seconds.
 
@@ -220,8 +211,8 @@ class PlantTwin(LearntModel):
             found = _fitted(row, log, *settings)
             hidden = RowLayout(problem, observer, hidden=True)
             if found.trust.lacks_alone and row.observer is None and hidden.observer is not None:
-                again = [Episode(*hidden.recovered(each.thetas, each.actions)) for each in log]
-                other = _fitted(hidden, tuple(again), *settings)
+                log = tuple(Episode(*hidden.recovered(each.thetas, each.actions)) for each in log)
+                other = _fitted(hidden, log, *settings)
                 found = other if other.trusted else found
         return found
 
@@ -252,10 +243,8 @@ class PlantTwin(LearntModel):
 
         Its A, B and E are fitted to the log, and shrunk towards the given ones as far as held-out
         free runs ask for it. It is :attr:`problem` itself where no linear model predicts better.
-
-        With references or disturbances its operating point is where the plant rests today. Bounds
-        and boxes are the same. The terminal cost is solved anew, and a terminal set is the new
-        model's invariant one.
+        With references or disturbances its operating point is where the plant rests today. The
+        terminal cost is solved anew, and a terminal set is the new model's invariant one.
 
         Raises
         ------
@@ -322,9 +311,10 @@ def _fitted(
     # The model as it is comes first, to compare with, whether it may be chosen or not.
     choices = candidates(coordinates, parts, residuals if not row.hidden else ())
     if row.hidden:
-        for each in (each for each in HIDDEN_SETTINGS if each.kind in residuals):
-            by_fold = [shoot(coordinates, fold, each)[0] for fold in kept]
-            choices.append(Candidate(str(each), tuple(by_fold), each))
+        for each in HIDDEN_SETTINGS:
+            if KINDS[each.degree] in residuals:
+                by_fold = tuple(shoot(coordinates, fold, each)[0] for fold in kept)
+                choices.append(Candidate(str(each), by_fold, each))
     first = int("none" not in residuals)
     alone = first == len(choices)
     runs = held_out(coordinates, parts, choices)
@@ -333,9 +323,8 @@ def _fitted(
     long = sum(map(len, parts)) >= LONG_LOG and len(parts) > 1 and not row.hidden
     members: list[Residual] = []
     if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
-        networks = fit_ensemble(
-            coordinates, [*kept, *drawn], seed, ahead=WINDOW_STEPS, updates=updates
-        )
+        ahead = WINDOW_STEPS
+        networks = fit_ensemble(coordinates, [*kept, *drawn], seed, ahead=ahead, updates=updates)
         choices.append(Candidate("network", tuple(networks[: len(kept)])))
         runs = held_out(coordinates, parts, choices)
         chosen = runs.choose(first) if len(parts) > 1 else first

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, check_type
 from sb3_yann.control import DisturbanceObserver, LinearMPC, StateEstimator
@@ -20,16 +21,16 @@ SINGULAR = 1e10  # condition number from which on a matrix is not inverted
 class RowLayout:
     """What a row of a twin holds: theta, and behind it what the law does not see.
 
-    Without an observer a row is theta. With one the x and d of theta are *estimates*: behind theta
-    stands the plant's own state (n,). The plant does not know d. The observer steps its estimate
+    Without an observer a row is theta. With one the x and d of theta are *estimates*, and behind
+    theta stands the plant's own state (n,), which does not know d. The observer steps its estimate
     from what it measures: ``z+ = (I - L C) (A z + B u) + L C x+`` with ``z = [x_hat; d_hat]``, and
     clips d_hat to its bounds.
 
     Where the measurements do not tell the plant's state, a row is theta, and the estimate itself is
-    what is learnt: ``x_hat+ = A x_hat + B u + E d_hat + residual(x_hat, d_hat, u)``. This residual
-    is ``L_x e``, of the innovations e. So it moves d_hat by ``L_d L_x^+ residual``. Or it is
-    ``hidden``: behind theta stands the plant's own state all the same, as a guess of what no
-    measurement shows, which `sb3_yann.twin.hidden` finds.
+    what is learnt: ``x_hat+ = A x_hat + B u + E d_hat + residual(x_hat, d_hat, u)``. The residual
+    is ``L_x e``, of the innovations e, and moves d_hat by ``L_d L_x^+ residual``. Or it is
+    ``hidden``: behind theta stands a guess of the plant's own state, which `sb3_yann.twin.hidden`
+    finds.
     """
 
     problem: LinearMPC
@@ -58,17 +59,12 @@ class RowLayout:
         """The estimator where it determines the plant's state and all disturbances, else None."""
         found = self.estimator
         n = self.problem.model.n_states
-        if self.hidden and found is not None and found.n_estimated == self._n_disturbances:
-            return found if np.linalg.cond(found.gain[:n]) < SINGULAR else None
-        if not isinstance(found, DisturbanceObserver):
+        if found is None or found.n_estimated != self.problem.layout.n_disturbances:
             return None
-        square = found.C.shape == (n, n) and found.n_estimated == self._n_disturbances
-        determined = square and max(map(np.linalg.cond, (found.C, found.gain[:n]))) < SINGULAR
+        told = self.hidden or (isinstance(found, DisturbanceObserver) and found.C.shape == (n, n))
+        matrices = [found.gain[:n], *[found.C] * (not self.hidden)]
+        determined = told and max(map(np.linalg.cond, matrices)) < SINGULAR
         return found if determined else None
-
-    @property
-    def _n_disturbances(self) -> int:
-        return self.problem.layout.n_disturbances
 
     @property
     def is_estimate(self) -> bool:
@@ -77,11 +73,17 @@ class RowLayout:
 
     @cached_property
     def _estimated(self) -> slice:
-        """The entries of disturbances that the estimator moves, where it is the plant's memory."""
+        """The entries of disturbances that an estimator moves."""
         part = self.problem.layout.disturbance
-        if self.estimator is None or self.observer is not None:
-            return slice(part.stop, part.stop)
-        return slice(part.stop - self.estimator.n_estimated, part.stop)
+        if self.observer is not None:
+            return part
+        count = 0 if self.estimator is None else self.estimator.n_estimated
+        return slice(part.stop - count, part.stop)
+
+    @cached_property
+    def _shown(self) -> NDArray[np.intp]:
+        """The entries of an observer's estimate ``[x_hat; d_hat]``."""
+        return np.asarray(np.r_[self.problem.layout.state, self.problem.layout.disturbance])
 
     @cached_property
     def size(self) -> int:
@@ -113,12 +115,6 @@ class RowLayout:
         return np.asarray(np.linalg.pinv(self.observer.C) @ self.observer.C)
 
     @cached_property
-    def _d(self) -> tuple[Array, Array]:
-        """The bounds (d,) of the disturbance."""
-        part = self.problem.layout.disturbance
-        return self.problem.deviations.theta_min[part], self.problem.deviations.theta_max[part]
-
-    @cached_property
     def inputs(self) -> Any:
         """Where in ``[row, u]`` stands what the plant's next state depends on, (k,)."""
         number = np.arange(self.size + self.problem.model.n_inputs)
@@ -129,44 +125,34 @@ class RowLayout:
     @cached_property
     def linear(self) -> Array:
         """The step without residual and bounds of d, (size, size + m): ``row+ = . [row; u]``."""
-        parts = self.problem.layout
         model = self.problem.model
         theta = np.concatenate(self.problem.prediction, axis=1)
-        if self.observer is None:
-            return np.ascontiguousarray(theta)
-        size = parts.size
-        n = parts.n_states
         observer = self.observer
+        if observer is None:
+            return np.ascontiguousarray(theta)
+        size = self.problem.n_theta
         found = np.zeros((self.size, self.size + model.n_inputs))
         found[:size, :size], found[:size, self.size :] = np.split(theta, [size], axis=1)
-        found[: parts.n_states] = found[parts.disturbance] = 0.0
         found[self.state, self.state] = model.A
         found[self.state, self.size :] = model.B
         blind = np.eye(len(observer.gain)) - observer.gain @ observer.C_aug
-        z = np.zeros((len(blind), found.shape[1]))
-        before = blind @ observer.A
-        z[:, parts.state] = before[:, :n]
-        z[:, parts.disturbance] = before[:, n:]
-        z[:, self.size :] = blind @ observer.B
-        z += observer.gain @ observer.C @ found[self.state]
-        found[parts.state] = z[:n]
-        found[parts.disturbance] = z[n:]
+        z = observer.gain @ observer.C @ found[self.state]
+        z[:, self._shown] += blind @ observer.A
+        z[:, self.size :] += blind @ observer.B
+        found[self._shown] = z
         return found
 
     @cached_property
     def spread(self) -> Array:
         """What a residual of the plant's state adds to a row, (size, n)."""
-        parts = self.problem.layout
-        found = np.zeros((self.size, parts.n_states))
-        found[self.state] = np.eye(parts.n_states)
-        if self.observer is None and self.estimator is not None:
-            gain = self.estimator.gain
-            n = parts.n_states
-            found[self._estimated] = gain[n:] @ np.linalg.pinv(gain[:n])
+        n = self.problem.model.n_states
+        found = np.zeros((self.size, n))
+        found[self.state] = np.eye(n)
         if self.observer is not None:
-            moved = self.observer.gain @ self.observer.C
-            found[parts.state] = moved[: parts.n_states]
-            found[parts.disturbance] = moved[parts.n_states :]
+            found[self._shown] = self.observer.gain @ self.observer.C
+        elif self.estimator is not None:
+            gain = self.estimator.gain
+            found[self._estimated] = gain[n:] @ np.linalg.pinv(gain[:n])
         return found
 
     @property
@@ -184,22 +170,20 @@ class RowLayout:
 
     def clip(self, rows: Array) -> Array:
         """Clip the estimate of d to its bounds, in place; return which is inside of them."""
-        part = self._estimated if self.observer is None else self.problem.layout.disturbance
-        low = self.problem.deviations.theta_min[part]
-        high = self.problem.deviations.theta_max[part]
-        d = rows[..., part]
+        own = self.problem.deviations
+        low, high = (each[self._estimated] for each in (own.theta_min, own.theta_max))
+        d = rows[..., self._estimated]
         inside = (d > low) & (d < high)
         if d.size:
-            rows[..., part] = np.clip(d, low, high)
+            rows[..., self._estimated] = np.clip(d, low, high)
         return np.asarray(inside)
 
     def begin(self, thetas: Array) -> Array:
         """Return rows (..., size) of thetas (..., n_theta), or of rows: what is shown is so."""
         shown = self.shown(thetas)
-        parts = self.problem.layout
         if self.observer is None:
             return shown.copy()
-        x = shown[..., parts.state]
+        x = shown[..., self.problem.layout.state]
         if self.hidden and thetas.shape[-1] == self.size:  # what is not measured stays
             own = thetas[..., self.state]
             x = own + (x - own) @ self.measured.T
@@ -213,14 +197,11 @@ class RowLayout:
         if self.observer is None:
             return theta.copy()
         observer = self.observer
-        parts = self.problem.layout
-        n = self.problem.layout.n_states
-        z = observer.A @ np.concatenate([row[parts.state], row[parts.disturbance]])
-        z += observer.B @ u
-        seen = np.linalg.pinv(observer.gain[:n]) @ (theta[parts.state] - z[:n])
-        shows = np.linalg.pinv(observer.C) @ seen + self.measured @ z[:n]
-        x = shows + theta[parts.state] - self.measured @ theta[parts.state]
-        return np.concatenate([theta, x])
+        x_hat = theta[self.problem.layout.state]
+        before = (observer.A @ row[self._shown] + observer.B @ u)[: len(x_hat)]
+        seen = np.linalg.pinv(observer.gain[: len(x_hat)]) @ (x_hat - before)
+        shows = np.linalg.pinv(observer.C) @ seen + self.measured @ before
+        return np.concatenate([theta, shows + x_hat - self.measured @ x_hat])
 
     def recovered(self, thetas: Array, actions: Array) -> tuple[Array, Array]:
         """Return the rows (T + 1, size) and inputs (T, m) of an episode of thetas.
@@ -230,11 +211,12 @@ class RowLayout:
         """
         if self.observer is None:
             return thetas, actions
-        parts = self.problem.layout
         rows = [self.begin(thetas[0])]
         for theta, u in zip(thetas[1:], actions, strict=True):
             rows.append(self.after(rows[-1], u, theta))
-        if np.allclose(thetas[0, parts.disturbance], np.clip(0.0, *self._d), atol=1e-12):
+        first: Array = np.zeros(self.size)
+        self.clip(first)
+        if np.allclose(thetas[0, self._estimated], first[self._estimated], atol=1e-12):
             return np.array(rows), actions
         return np.array(rows[1:]), actions[1:]
 
@@ -252,40 +234,34 @@ class RowLayout:
         disturbances = []
         for i, (outputs, inputs) in enumerate(pairs):
             y = np.asarray(outputs, np.float64).reshape(len(outputs), -1)
-            known: Array = np.zeros((len(y), 0))
-            if loads is not None:
-                given = np.asarray(loads[i], np.float64)
-                known = np.broadcast_to(
-                    given.reshape(-1, given.shape[-1]), (len(y), given.shape[-1])
-                )
+            given = np.zeros(0) if loads is None else np.asarray(loads[i], np.float64)
+            known = np.broadcast_to(given, (len(y), given.shape[-1]))
             x_hat, d_hat = self.run(y, inputs, known)
             found.append((x_hat, inputs))
             disturbances.append(np.hstack([known, d_hat]))
-        return found, disturbances if self._n_disturbances else None
+        return found, disturbances if self.problem.layout.n_disturbances else None
 
-    def run(self, outputs: Array, inputs: Array, loads: Array | None = None) -> tuple[Array, Array]:
+    def run(self, outputs: Array, inputs: Array, loads: Array) -> tuple[Array, Array]:
         """Return what the estimator makes of outputs (T + 1, q), inputs (T, m) and measured d.
 
         States (T + 1, n) and estimated disturbances (T + 1, d) within their bounds, all of it in
         plant units. A reading that is NaN is left out.
         """
-        estimator = self.estimator
+        estimator = copy.deepcopy(self.estimator)
         assert estimator is not None
         model = estimator.model
         y = np.asarray(outputs, np.float64) - estimator.C @ model.x_ss
         u = np.asarray(inputs, np.float64).reshape(len(y) - 1, -1) - model.u_ss
         k = estimator.n_known
-        d = None if loads is None or not k else loads[:, :k] - model.d_ss[:k]
-        estimator = copy.deepcopy(estimator)
+        d = loads[:, :k] - model.d_ss[:k]
         estimator.reset(y[0])
-        known = self._n_disturbances - estimator.n_estimated
         bounds = self.problem.deviations.disturbances
-        low = bounds.d_min[known:]
-        high = bounds.d_max[known:]
+        first = self.problem.layout.n_disturbances - estimator.n_estimated
         found = [estimator.estimate]
         for t in range(len(u)):
-            x_hat, d_hat = estimator.update(y[t + 1], u[t], None if d is None else d[t])
-            estimator.estimate = np.concatenate([x_hat, np.clip(d_hat, low, high)])
+            x_hat, d_hat = estimator.update(y[t + 1], u[t], d[t] if k else None)
+            d_hat = np.clip(d_hat, bounds.d_min[first:], bounds.d_max[first:])
+            estimator.estimate = np.concatenate([x_hat, d_hat])
             found.append(estimator.estimate)
         x_hat, d_hat = np.split(np.array(found), [model.n_states], axis=1)
         return x_hat + model.x_ss, d_hat + model.d_ss[k:]

@@ -36,7 +36,6 @@ FIT_RATE = 1e-3  # of Adam at first; it falls to zero
 FAMILY_UPDATES = 1000  # iterations of the fit of a family
 CONSTANTS = 2  # numbers that a fit of a family takes to differ from seed to seed
 UNSEEN = 0.1  # size of the hidden constants that a fit begins with, in standard deviations
-
 RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
 
 
@@ -50,20 +49,17 @@ def fit_ensemble(
 ) -> list[Residual]:
     """Return one network for each log, all fitted at once.
 
-    A linear part is fitted by least squares, the networks to what it leaves of single steps. With
-    ``ahead`` above 1 all of it is then fitted to windows of so many steps, along which the model
-    goes on from its own predictions: a fit to single steps takes noise of the sensors for dynamics.
-    A tenth of ``updates`` are iterations of L-BFGS for single steps; before windows half as many,
-    and a fifth are steps of Adam for them.
+    A linear part is fitted by least squares, the networks to what it leaves of single steps, in a
+    tenth of ``updates`` iterations of L-BFGS. With ``ahead`` above 1 these are half as many, and in
+    a fifth of ``updates`` steps of Adam all of it is fitted to windows of so many steps, along
+    which the model goes on from its own predictions: single steps take sensors' noise for dynamics.
 
-    Where an estimator's memory stands for the plant's state, what a step leaves is of loads as
-    well, which theta tells and the MPC answers: a fit would take their answer for their cause. So
-    networks are fitted to what episodes of one seed, whose loads are the same, leave differently;
-    the logs of all members are the same then.
+    Where an estimator's memory stands for the plant's state, a step leaves loads as well, which
+    the MPC answers: a fit would take the answer for the cause. So networks are fitted to what
+    episodes of one seed, of the same loads, leave differently, by the same log for each member.
     """
     generator = th.Generator().manual_seed(seed)
-    rows = [[coordinates.regression(each) for each in log] for log in logs]
-    pairs = [[np.concatenate(part) for part in zip(*each, strict=True)] for each in rows]
+    pairs = [_pair(coordinates, log) for log in logs]
     # Single steps of a simulator are known to many digits, those of a log are not.
     dtype = th.float64 if ahead == 1 else th.float32
     alike = _of_one_seed(logs[0]) if coordinates.row.is_estimate else None
@@ -83,8 +79,7 @@ def fit_family(coordinates: Coordinates, log: Sequence[Episode], seed: int) -> l
     names = [e.seed if e.seed is not None else -1 - i for i, e in enumerate(log)]
     number = np.unique(names, return_inverse=True)[1]
     of_row = np.repeat(number, [*map(len, log)])
-    parts = zip(*(coordinates.regression(each) for each in log), strict=True)
-    pairs = [[np.concatenate(part) for part in parts]]
+    pairs = [_pair(coordinates, log)]
     generator = th.Generator().manual_seed(seed)
     least = FLOAT32_ROUNDING * coordinates.units
     networks = _Networks(pairs, None, least, generator, th.float64, of_row)
@@ -92,12 +87,17 @@ def fit_family(coordinates: Coordinates, log: Sequence[Episode], seed: int) -> l
     return networks.residuals()
 
 
+def _pair(coordinates: Coordinates, log: Sequence[Episode]) -> list[Array]:
+    """Return z (rows, k) and y (rows, n) of all episodes: see `Coordinates.regression`."""
+    return [*map(np.concatenate, zip(*map(coordinates.regression, log), strict=True))]
+
+
 class _Networks:
     """The networks while they are fitted, in standardized coordinates.
 
-    Each member is fitted to a pair z (rows, k), y (rows, n), or to the differences of rows that are
-    ``alike`` (pairs, 2); what is smaller in y than ``least`` (n,) is rounding. ``of_row`` (rows,)
-    says which hidden constants act in a row: a single network then makes a member for each.
+    Each member is fitted to a pair z, y, or to the differences of rows that are ``alike`` (pairs,
+    2); what is smaller in y than ``least`` (n,) is rounding. ``of_row`` (rows,) says which hidden
+    constants act in a row: a single network then makes a member for each.
     """
 
     def __init__(
@@ -118,9 +118,7 @@ class _Networks:
         n = pairs[0][1].shape[1]
         self.center = self.tensor([z.mean(0, keepdims=True) for z, _ in pairs])
         self.width = self.tensor([np.maximum(z.std(0, keepdims=True), 1e-9) for z, _ in pairs])
-        compared = pairs
-        if alike is not None:
-            compared = [[a[alike[:, 0]] - a[alike[:, 1]] for a in each] for each in pairs]
+        compared = [[self._compared(each) for each in pair] for pair in pairs]
         linear, units = zip(*(_least_squares(*each) for each in compared), strict=True)
         self.unit = self.tensor(np.maximum(units, least))
 
@@ -147,6 +145,10 @@ class _Networks:
     def tensor(self, parts: Any) -> th.Tensor:
         """Return arrays as one tensor."""
         return th.as_tensor(np.asarray(parts), dtype=self.dtype)
+
+    def _compared(self, rows: Any) -> Any:
+        """Return rows, or the differences of those that are alike."""
+        return rows if self.alike is None else rows[self.alike[:, 0]] - rows[self.alike[:, 1]]
 
     def fit_steps(self, pairs: list[list[Array]], iterations: int) -> None:
         """Fit them to single steps: each by itself, side by side, on all rows, by L-BFGS."""
@@ -181,9 +183,7 @@ class _Networks:
             vector_to_parameters(self.tensor(flat), weights)
             constants = [] if self.of_row is None else [weights[7][self.of_row]]
             errors = _network(weights[:7], th.cat([rows, *constants], dim=1)) - wanted
-            if self.alike is not None:
-                errors = errors[self.alike[:, 0]] - errors[self.alike[:, 1]]
-            value = (errors**2).mean()
+            value = (self._compared(errors) ** 2).mean()
             slopes = th.autograd.grad(value, weights)
             return value.item(), parameters_to_vector(slopes).double().numpy()
 
@@ -211,12 +211,11 @@ class _Networks:
         for log in logs:
             whole = [each for each in log if len(each) >= ahead]
             parts = [row.features(e.thetas, np.vstack([e.actions, e.actions[-1:]])) for e in whole]
-            windows.append(
-                np.concatenate([sliding_window_view(p, ahead + 1, axis=0) for p in parts])
-            )
+            views = [sliding_window_view(each, ahead + 1, axis=0) for each in parts]
+            windows.append(np.concatenate(views))
         longest = max(map(len, windows))  # short ones are repeated
-        whole_windows = [each[np.arange(longest) % len(each)] for each in windows]
-        data = self.tensor(whole_windows)  # (members, windows, k, ahead + 1)
+        windows = [each[np.arange(longest) % len(each)] for each in windows]
+        data = self.tensor(windows)  # (members, windows, k, ahead + 1)
         linear = self.tensor(row.linear[row.state][:, row.inputs].T)
         low, high, scale, units = (
             self.tensor(each)
@@ -294,27 +293,22 @@ def _of_one_seed(log: Sequence[Episode]) -> NDArray[np.intp] | None:
     return np.concatenate(found, axis=1).T if found else None
 
 
-DEGREES = {"linear": 1, "quadratic": 2}
-KINDS = ("none", *DEGREES, "network")
+KINDS = ("none", "linear", "quadratic", "network")  # of polynomials the degree is the number
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-INPUT_FACTORS = (1.0, 30.0)
-"""How many times as strongly inputs are shrunk: the log of a closed loop shows little of them."""
+INPUT_FACTORS = (1.0, 30.0)  # times as strongly inputs are shrunk: closed loops show little of them
 LONGEST_RUN = 100  # steps of a free run, at most
 RUNS = 20  # free runs in an episode
-
 GAINS = (0.6, 1.7)  # times the model's: an input may act so, unless the log refutes it
-LOOSE = 1e-3
-FIRM = 1e3
-"""Shrinkage of what fits a log around such a gain, and times as much of its inputs."""
+LOOSE = 1e-3  # shrinkage of what fits a log around such a gain
+FIRM = 1e3  # times as much of its inputs
 
 
 class Setting(NamedTuple):
     """How a polynomial is fitted.
 
     ``shrinkage`` is the weight of its squared coefficients, times the number of samples; terms with
-    an input are shrunk ``factor`` times as strongly. ``gain`` is an input, and how many times as
-    the model says it acts where it is shrunk to. One that ``drifts`` has a constant term, which is
-    not shrunk, whatever theta holds.
+    an input are shrunk ``factor`` times as strongly, to an effect that is, of one input, the
+    ``gain`` times the model's. One that ``drifts`` has a constant term, whatever theta holds.
     """
 
     degree: int
@@ -328,15 +322,10 @@ class Setting(NamedTuple):
         """How far it may leave the given model."""
         return float(self.degree - 2 * np.log10(self.shrinkage) - np.log10(self.factor))
 
-    @property
-    def kind(self) -> str:
-        """The name of its degree."""
-        return next(name for name, degree in DEGREES.items() if degree == self.degree)
-
     def __str__(self) -> str:
         """Name the kind and the shrinkage."""
         strongest = self.shrinkage * self.factor
-        return f"{self.kind}, shrinkage {self.shrinkage:g} ({strongest:g} of inputs)"
+        return f"{KINDS[self.degree]}, shrinkage {self.shrinkage:g} ({strongest:g} of inputs)"
 
 
 @dataclass(frozen=True)
@@ -362,7 +351,7 @@ def ridge(
     Where theta holds set-points or disturbances they have a constant term, which is not shrunk:
     else the equilibrium stays where it is.
     """
-    z, y = map(np.concatenate, zip(*map(coordinates.regression, episodes), strict=True))
+    z, y = _pair(coordinates, episodes)
     problem = coordinates.row.problem
     (count, k) = z.shape
     n = y.shape[1]
@@ -396,8 +385,9 @@ def shrinkage_of(setting: Setting, problem: LinearMPC, k: int) -> Array:
     """Return the weight (f,) of each squared coefficient of a basis of k features."""
     inputs = np.arange(k) >= k - problem.model.n_inputs
     products = inputs[np.triu_indices(k)[1]] if setting.degree > 1 else inputs[:0]
-    each = (setting.shrinkage * np.where(of, setting.factor, 1.0) for of in (inputs, products))
-    first, second = each
+    first, second = (
+        setting.shrinkage * np.where(of, setting.factor, 1.0) for of in (inputs, products)
+    )
     constant = [1e-9] * int(problem.layout.has_constants or setting.drifts)
     return np.concatenate([first, constant, second]) + 1e-12
 
@@ -407,14 +397,13 @@ def candidates(
 ) -> list[Candidate]:
     """Return the model as it is, and polynomials of some kinds, the least free first."""
     kept = without_each_fold(parts)
-    n = coordinates.row.problem.model.n_states
-    k = len(coordinates.scale)
-    degrees = [degree for kind, degree in DEGREES.items() if kind in kinds]
+    degrees = [degree for degree in (1, 2) if KINDS[degree] in kinds]
     choices = product(degrees, SHRINKAGES, INPUT_FACTORS)
     settings = [Setting(*each, drifts=drifts) for each in choices]
     settings.sort(key=lambda each: each.freedom)
     fits = [ridge(coordinates, each, settings) for each in kept if settings]
-    found = [Candidate("none", (Residual.zero(k, n),) * len(kept))]
+    zero = Residual.zero(len(coordinates.scale), coordinates.row.problem.model.n_states)
+    found = [Candidate("none", (zero,) * len(kept))]
     for number, each in enumerate(settings):
         found.append(Candidate(str(each), tuple(fit[number] for fit in fits), each))
     return found
@@ -499,9 +488,8 @@ def judges(
 ) -> tuple[Judge, ...]:
     """Return the twins that a log may not refute: the chosen one, and those with other gains.
 
-    In a closed loop a log may not tell the gain of an input, since the states follow it in many
-    ways. The others are shrunk little: what the chosen one owes to its shrinkage shows as well.
-    ``scores`` (episodes,) are those of the chosen one's free runs.
+    In a closed loop a log may not tell the gain of an input. The others are shrunk little: what the
+    chosen one owes to its shrinkage shows as well. ``scores`` (episodes,) are those of its runs.
     """
     problem = coordinates.row.problem
     degree = 1 if chosen.setting is None else chosen.setting.degree
@@ -535,25 +523,18 @@ def reidentified(
     (residual,) = ridge(coordinates, log, [choice.setting])
     middle = np.zeros((1, len(coordinates.scale)))
     model = problem.model
-    n = model.n_states
-    m = model.n_inputs
-    d = len(middle[0]) - model.n_states - model.n_inputs
     slopes = residual.jacobian(middle)[0] / coordinates.scale
-    A, E, B = np.split(slopes, [n, n + d], axis=1)
-    A = model.A + A
-    B = model.B + B
-    E = model.E + (E if d else 0.0)
-    x: Array = np.zeros(n)
-    u: Array = np.zeros(m)
+    A, E, B = np.split(slopes, [model.n_states, slopes.shape[1] - model.n_inputs], axis=1)
+    own: dict[str, Any] = {"A": model.A + A, "B": model.B + B}
+    own["E"] = model.E + (E if E.size else 0.0)
     if problem.layout.has_constants:  # else the operating point is where it is to be held
         # What drifts acts as a constant disturbance does: at rest ``C x = 0`` despite it.
-        drifting = LinearModel(A, B, model.dt, E=residual.predict(middle)[0][:, None])
+        drift = residual.predict(middle)[0][:, None]
+        drifting = LinearModel(own["A"], own["B"], model.dt, E=drift)
         weights = problem.Q, problem.R, problem.theta_half[problem.layout.state], problem.u_half
         rest = steady_states(drifting, problem.tracking.C, *weights)
-        x = rest.x[:, -1]
-        u = rest.u[:, -1]
+        own |= {"x_ss": model.x_ss + rest.x[:, -1], "u_ss": model.u_ss + rest.u[:, -1]}
     note = f"Re-identified from {len(log)} episodes: {choice.name}."
-    own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
     own |= {"notes": [note], "drift": None, "gains": None}  # what was said of the given one
     found = LinearModel(**{**vars(model), **own})
     terminal = Terminal(set="invariant" if len(problem.terminal.set[1]) else None)

@@ -18,15 +18,12 @@ from sb3_yann.twin.log import Episode, more_of, records
 from sb3_yann.twin.selection import FreeRuns
 from sb3_yann.units import FLOAT32_ROUNDING
 
-COST_ERROR = 0.25
-"""The largest error of a predicted episode cost, relative to the mean cost, that is trusted."""
+COST_ERROR = 0.25  # of predicted episode costs, relative to their mean: the largest that is trusted
 STILL = 1e-4  # an input that moves by less, in half-widths, does not move
 FOREIGN = 10.0  # A model that errs by so many times what moves describes another plant
 OUTSIDE = 0.05  # share of logged rows beyond the box of theta from which on units are doubted
 PREVIOUS = 0.01  # how far theta's previous input may be from the one before it, in half-widths
-
-ALONE = 0.02
-"""An input's gain is known from the data where at least this share of its variance is its own."""
+ALONE = 0.02  # share of an input's variance that is its own, from which on its gain is known
 
 
 class UntrustedTwinError(ValueError):
@@ -112,18 +109,6 @@ def costs_of_each(
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 
 
-def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[str]:
-    """Return what speaks against a log whose theta does not hold the input before it."""
-    if not problem.layout.n_previous:
-        return []
-    held = np.concatenate([each.thetas[1:, problem.layout.previous] for each in episodes])
-    apart = np.abs(held - np.concatenate([each.actions for each in episodes])) / problem.u_half
-    share = float(np.mean(np.any(apart > PREVIOUS, axis=1)))
-    if share <= OUTSIDE:
-        return []
-    return [f"In {100 * share:.3g} % of the rows theta does not hold the input before it."]
-
-
 def judge(
     runs: FreeRuns,
     standing: Array,
@@ -141,46 +126,48 @@ def judge(
     of each is its own, and how much it moves (m,). ``beyond`` is the largest share of logged rows
     beyond the box of theta, and of which entry; ``more`` names an amount of log.
     """
-    found: list[tuple[str, str]] = []  # what speaks against it, and what would help
+    problems = []
+    advice = []
     share, moves = inputs
     several = n_episodes > 1
     if not several:
-        found.append(
-            (
-                "There is one episode: nothing is left to test the twin on.",
-                "Log at least one episode more; five are a good number. A long record may be cut "
-                "into three consecutive pieces or more: log.cut(200) makes some of 200 steps.",
-            )
+        problems.append("There is one episode: nothing is left to test the twin on.")
+        advice.append(
+            "Log at least one episode more; five are a good number. A long record may be cut "
+            "into three consecutive pieces or more: log.cut(200) makes some of 200 steps."
         )
     named = [*names] or [f"u[{k}]" for k in range(len(moves))]
     for name, own, moved in zip(named, share, moves, strict=True):
         if moved < STILL:
-            step = f"Make a small step test on {name}, or log another set-point."
-            found.append((f"{name} never moves: what it does is not in the log.", step))
+            problems.append(f"{name} never moves: what it does is not in the log.")
+            advice.append(f"Make a small step test on {name}, or log another set-point.")
         elif own < ALONE:
-            text = f"{name} follows the MPC ({100 * own:.2f} % of its variance is its own), so its "
-            found.append(("", f"{text}gain rests on the given B. A small step test would tell."))
-    worse = runs.errors[0][0] / max(standing[0], 1e-300) if several else 0.0
+            advice.append(
+                f"{name} follows the MPC ({100 * own:.2f} % of its variance is its own), so its "
+                "gain rests on the given B. A small step test would tell."
+            )
     units = "Compare units, operating point and sampling time of the log and the model."
-    if worse > FOREIGN:
-        text = f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing "
-        text += f"moves' ({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
-        found.append((text, units))
+    if several and runs.errors[0][0] / max(standing[0], 1e-300) > FOREIGN:
+        problems.append(
+            f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing "
+            f"moves' ({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
+        )
+        advice.append(units)
     if beyond[0] > OUTSIDE:
         rows = f"{100 * beyond[0]:.3g} % of the logged {beyond[1]}"
-        wider = f"Widen the box (theta_min, theta_max; r_min, r_max of Tracking), or c{units[1:]}"
-        found.append((f"{rows} lie beyond the problem's box of theta.", wider))
+        problems.append(f"{rows} lie beyond the problem's box of theta.")
+        wider = "Widen the box (theta_min, theta_max; r_min, r_max of Tracking)"
+        advice.append(f"{wider}, or c{units[1:]}")
     error = relative_error(*costs)
     if several and not error <= COST_ERROR:
-        found.append(
-            (
-                f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
-                f"mean; {100 * COST_ERROR:.0f} % are the most.",
-                f"Log {more(max(3, n_episodes))} more. If that is no help, the sensors are too "
-                "noisy, or what moves the plant is not in the log: a load, a state, a lag.",
-            )
+        problems.append(
+            f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
+            f"mean; {100 * COST_ERROR:.0f} % are the most."
         )
-    problems, advice = ([each[i] for each in found if each[i]] for i in range(2))
+        advice.append(
+            f"Log {more(max(3, n_episodes))} more. If that is no help, the sensors are too "
+            "noisy, or what moves the plant is not in the log: a load, a state, a lag."
+        )
     return problems, advice
 
 
@@ -192,8 +179,7 @@ def evidence(
 ) -> Trust:
     """Return the evidence for a twin; each episode of the log is left out once.
 
-    ``found`` are free runs of the candidates, which was chosen, and its predicted costs beside the
-    actual.
+    ``found`` are free runs of the candidates, the chosen one, and its predicted and actual costs.
     """
     runs, chosen, costs = found
     problem = dynamics.problem
@@ -211,17 +197,21 @@ def evidence(
     high = problem.deviations.theta_max + room
     shares = np.mean((theta < low) | (theta > high), axis=0) * (not logged.made_by_law.all())
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
-    names = problem.model.input_names
+    names, input_names = labels_of(problem.model)
     independent = sum(len(each[::2]) for each in records(problem, log))
     more = partial(more_of, problem, log)
     still = np.array(standing)
-    problems, advice = judge(runs, still, costs, inputs, independent, beyond, names, more)
-    problems += foreign_previous(problem, log)
+    problems, advice = judge(runs, still, costs, inputs, independent, beyond, input_names, more)
+    if problem.layout.n_previous:
+        held = np.concatenate([each.thetas[1:, problem.layout.previous] for each in log])
+        apart = np.abs(held - logged.inputs) / problem.u_half
+        share = float(np.mean(np.any(apart > PREVIOUS, axis=1)))
+        wrong = f"In {100 * share:.3g} % of the rows theta does not hold the input before it."
+        problems += [wrong] * (share > OUTSIDE)
     problems += objections(logged)
-    n = problem.model.n_states
-    driven = [dynamics.row.features(e.thetas[:-1], e.actions)[:, n:] for e in log]
+    driven = [dynamics.row.features(e.thetas[:-1], e.actions)[:, len(names) :] for e in log]
     shown = [*map(problem.units.to_plant, states)]
-    problems += words_for(frozen_rows(states, driven), labels_of(problem.model)[0], shown)
+    problems += words_for(frozen_rows(states, driven), names, shown)
     return Trust(runs, chosen, still, *costs, *inputs, tuple(problems), tuple(advice))
 
 
@@ -241,16 +231,15 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
         lines.append(f"{one}: elsewhere the MPC will act.")
     lines.append(f"Residual beside the linear model: {kind}.")
     if len(trust.actual):
-        lines.append(
-            "Error of free runs over held-out episodes, in standard deviations of the states:"
-        )
-        rows = {
+        units = "in standard deviations of the states"
+        lines.append(f"Error of free runs over held-out episodes, {units}:")
+        errors_by_name = {
             "steps ahead": trust.runs.horizons,
             "twin": trust.runs.errors[trust.chosen],
             "linear model": trust.runs.errors[0],
             "nothing moves": trust.standing,
         }
-        for name, errors in rows.items():
+        for name, errors in errors_by_name.items():
             real = np.where(errors <= FLOAT32_ROUNDING, 0.0, errors)
             lines.append(f"  {name:<17}" + "".join(f"{each:>9.3g}" for each in real))
         lines.append("Cost of held-out episodes (or pieces of them), predicted and actual:")
@@ -261,8 +250,8 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
         lines.append(f"  error {100 * min(trust.cost_error, 1e6):.3g} % of the mean cost")
     unexplained = "neither states nor the MPC at held set-points tell"
     lines.append(f"Inputs: how much they move, and what share of it {unexplained}:")
-    inputs = labels_of(problem.model)[1]
-    for name, own, moves in zip(inputs, trust.excitation, trust.moves, strict=True):
+    inputs = zip(labels_of(problem.model)[1], trust.excitation, trust.moves, strict=True)
+    for name, own, moves in inputs:
         rests = "rests on the given B" if own < ALONE else "is known from the log"
         half = f"{100 * moves:.3g} % of half the range"
         lines.append(f"  {name}: {half}, {100 * own:.2f} %: its gain {rests}")
