@@ -561,13 +561,18 @@ class _Work:
             if passes(1.0):
                 return improvement(True)
             scenarios = self.hard
-        if self.checks[-1].interval is None:  # else a forecast is not sure: of a part neither
-            whole = self.weights()
-            for share in RETREATS:
-                self.scale(share, whole)
-                if passes(share):
-                    return improvement(True)
-        return improvement(False)
+        return improvement(self._retreat(passes))
+
+    def _retreat(self, passes: Callable[[float], bool]) -> bool:
+        """Return whether a part of a correction passes, unless a forecast was not sure of it all."""
+        if self.checks[-1].interval is not None:
+            return False
+        whole = self.weights()
+        for share in RETREATS:
+            self.scale(share, whole)
+            if passes(share):
+                return True
+        return False
 
     def _of_estimates(self, scenarios: Scenarios, episodes: list[Episode], seed: int) -> Scenarios:
         """Return scenarios of a twin of hidden states in a model of what the policy sees.
