@@ -6,7 +6,7 @@ import copy
 import hashlib
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import Any
@@ -564,7 +564,7 @@ class _Work:
         return improvement(self._retreat(passes))
 
     def _retreat(self, passes: Callable[[float], bool]) -> bool:
-        """Return whether a part of a correction passes, unless a forecast was not sure of it all."""
+        """Return whether a part of a correction passes; not where a forecast doubts all of it."""
         if self.checks[-1].interval is not None:
             return False
         whole = self.weights()
