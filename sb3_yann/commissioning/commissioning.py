@@ -44,8 +44,7 @@ from sb3_yann.twin.plant_twin import PlantTwin
 PAIRS_TO_GIVE_UP = 10  # so many that show no gain end a trial
 MOST_ABOVE_MPC = 0.05  # of the MPC's cost: what a policy may cost more in any case
 SAME_REWARD = 0.95  # share of the episodes' rewards that the same stage cost explains
-ALARMS = 0.25
-"""Share of a policy's episodes with an alarm from which on it is taken back, two at least."""
+ALARMS = 0.25  # share of a policy's episodes, two at least, with an alarm: it is taken back
 
 Whole = tuple[dict[str, Any], list[Any]]  # weights and optimizers: see `whole_policy`
 
@@ -55,15 +54,14 @@ class Commissioning:
 
     The first batch is the MPC's. After each one the twin is fitted to all that the plant has shown,
     and a policy is improved in it (:func:`improve`). One that was accepted there takes turns with
-    the MPC from the next batch on, and only these pairs decide: it is kept where it surely costs
-    less, with an error of 5 % over all looks, and taken back where it surely costs more, shows no
-    gain, violates or alarms. It acts at first within a small ``max_correction``, which doubles with
-    each one that is kept. Nothing else ever acts; ``docs/improve.md`` has the rules.
+    the MPC, and only these pairs decide: it is kept where it surely costs less, with an error of
+    5 % over all looks, and taken back where it surely costs more, shows no gain, violates or
+    alarms. It acts at first within a small ``max_correction``, which doubles with each one that is
+    kept. Nothing else ever acts; ``docs/improve.md`` has the rules.
 
     What counts is the stage cost, or the plant's own reward where that is another one. At an alarm
-    of the watchdog the MPC has the plant within the same sample, for the rest of the episode and
-    until it has played a quiet one. Two episodes in a row with an alarm are taken for a changed
-    plant: the log begins anew.
+    of the watchdog the MPC has the plant within the same sample, until it has played a quiet
+    episode. Two in a row with an alarm are taken for a changed plant: the log begins anew.
 
     Each episode and each decision is on the disk before the next begins: after a kill the same
     script repeats nothing but the episode that was cut off. When :meth:`run` returns, the model
@@ -160,10 +158,12 @@ class Commissioning:
         bound = 1.0 if self.policy.max_correction is None else self.policy.max_correction
         # A model that was saved meanwhile has the bound of then.
         self.largest: float = record.events[0].get("largest", bound) if record.events else bound
+        self._first_bound = min(self.smallest, self.largest)
         begin = {**self._settings, "largest": self.largest}
         self.journal = Journal(record, begin, CommissioningState(self._first_bound))
-        with shown(self.progress_bar):
-            self._restore(self.journal.state)
+        if self.journal.batches:
+            with shown(self.progress_bar):
+                self._restore(self.journal.state)
 
     @property
     def batches(self) -> list[Batch]:
@@ -200,7 +200,7 @@ class Commissioning:
                     size = self._size_of_batch()
                     played = bar(f"batch {len(self.batches) + 1}: episodes", total=size)
                     played.update(len(self.journal.batch))
-                    while not self._batch_is_over():
+                    while len(self.journal.batch) < size and not self._changed:
                         self._play(plant)
                         played.update()
                     played.close()
@@ -212,32 +212,32 @@ class Commissioning:
     def report(self) -> str:
         """Return the batches as a table, and what the pairs of the policy on trial show."""
         journal = self.journal
-        state = self.journal.state
+        state = journal.state
         verdict = "The MPC acts."
         rows = {}
         if journal.accepted:
             verdict = f"The policy of {state.policy} is on trial."
             if state.is_kept:
                 verdict = f"The policy of {state.policy} surely costs less than the MPC, and acts."
-            elif (kept := state.kept.policy) != "MPC":
-                verdict += f" That of {kept} surely costs less than the MPC, and is kept."
+            elif self.kept != "MPC":
+                verdict += f" That of {self.kept} surely costs less than the MPC, and is kept."
             rows = rows_of_pairs(journal, self.policy.problem)
             verdict += " Costs above are means of each one's own episodes; only pairs compare them."
-        ours = [each for each, by in zip(journal.episodes, journal.by_policy, strict=True) if by]
-        every = sum(len(each.actions) for each in journal.episodes)
-        violations = sum(each.violations for each in journal.episodes)
+        played = journal.episodes
+        ours = [each for each, by in zip(played, journal.by_policy, strict=True) if by]
         of_policies = sum(each.violations for each in ours)
-        more = self._size_of_batch() - len(journal.batch)
-        moved = sum(each.excited for each in journal.episodes)
+        of_mpc = sum(each.violations for each in played) - of_policies
+        moved = sum(each.excited for each in played)
         aside = f"; {moved} moved at random do not count in costs" if moved else ""
         aside += f"; {journal.unended} that never ended are left out" if journal.unended else ""
         return summary_lines(
             f"{journal.report()}\n{verdict}",
             **rows,
-            violations=f"{of_policies} steps of policies, {violations - of_policies} of the MPC",
-            steps=f"{every:,} of the plant in {len(journal.episodes)} episodes, {len(ours)} begun "
-            f"by policies{aside}",
-            next=f"run(batches={len(self.batches) + 1}) plays {more} episodes more",
+            violations=f"{of_policies} steps of policies, {of_mpc} of the MPC",
+            steps=f"{sum(len(each.actions) for each in played):,} of the plant in {len(played)} "
+            f"episodes, {len(ours)} begun by policies{aside}",
+            next=f"run(batches={len(self.batches) + 1}) plays "
+            f"{self._size_of_batch() - len(journal.batch)} episodes more",
         )
 
     def _play(self, plant: Plant) -> None:
@@ -265,9 +265,6 @@ class Commissioning:
             journal.interrupt()
             raise
         journal.add(played, acts)
-
-    def _batch_is_over(self) -> bool:
-        return len(self.journal.batch) >= self._size_of_batch() or self._changed
 
     def _size_of_batch(self) -> int:
         return int(self.batch * 2 ** (len(self.batches) - self.journal.state.anew))
@@ -309,12 +306,11 @@ class Commissioning:
         elif verdict != "stays":
             self._become(self._mpc, state.max_correction)
             state = replace(state, acting=ACCEPTED_MPC, kept=ACCEPTED_MPC, since=0)
-        shown = costs.actual, costs.predicted, costs.mpc
         sizes = number, len(journal.batch), alarms
         acts = whole_policy(self.policy)
-        journal.close(
-            Batch(*sizes, who, within, *shown, costs.difference.pairs, verdict, reason), state
-        )
+        shown = costs.actual, costs.predicted, costs.mpc
+        pairs = costs.difference.pairs
+        journal.close(Batch(*sizes, who, within, *shown, pairs, verdict, reason), state)
         # All of it holds from here on: an error or Ctrl-C before has changed nothing.
         known = {before.kept: self._kept, before.acting: self._acting}
         self._kept = known.get(state.kept, self._mpc)
@@ -375,30 +371,19 @@ class Commissioning:
     def _show(self) -> None:
         """Give the model what the plant has confirmed, else the MPC, while nothing is played."""
         state = self.journal.state
-        confirmed = state.kept.policy != "MPC"
-        self._become(self._kept, state.kept.bound if confirmed else state.max_correction)
+        self._become(self._kept, state.max_correction if self.kept == "MPC" else state.kept.bound)
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
         units = self.policy.problem.units
-        log = [
-            (units.to_plant(each.thetas), units.input_to_plant(each.actions)) for each in episodes
-        ]
+        log = [(units.to_plant(e.thetas), units.input_to_plant(e.actions)) for e in episodes]
         return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
-
-    @property
-    def _first_bound(self) -> float:
-        return min(self.smallest, self.largest)
 
     @property
     def _settings(self) -> dict[str, Any]:
         problem = self.policy.problem
-        parts = (
-            *problem.prediction,
-            problem.stage_matrix,
-            problem.deviations.u_min,
-            problem.deviations.u_max,
-        )
+        own = problem.deviations
+        parts = *problem.prediction, problem.stage_matrix, own.u_min, own.u_max
         numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
         names = "batch", "excite", "shadow", "rounds", "updates", "seed"
         return {
@@ -410,8 +395,6 @@ class Commissioning:
 
     def _restore(self, state: CommissioningState) -> None:
         """Restore the accepted policies, the twin and its watchdog as a record left them."""
-        if not self.journal.batches:
-            return
         self._kept, self._acting = (self._loaded(each) for each in (state.kept, state.acting))
         if state.tried:
             self.candidate = None
@@ -431,9 +414,8 @@ class Costs(NamedTuple):
 
     ``actual`` is the mean cost of the episodes of the one that acted in the batch, those with an
     alarm included, ``predicted`` what the twin had predicted of them, ``mpc`` what the MPC cost in
-    turns with the policy. ``difference`` is of all pairs since the policy is on trial, in the order
-    in which they were played; ``look`` counts the looks at it. With ``own_reward`` costs
-    are minus the rewards, which are not the stage cost: no twin knows them. ``longer`` says by how
+    turns with the policy. ``difference`` is of all pairs of the trial, ``look`` counts the looks at
+    it. With ``own_reward`` costs are minus the rewards, which no twin knows. ``longer`` says by how
     much more than the MPC the policy exceeds hard bounds, summed over an episode.
     """
 
@@ -457,30 +439,29 @@ def compare(
     twin ``before`` was in force, ``now`` is the one that has learnt from the batch.
     """
     problem = plant.problem
-    by_policy = any(each for _, each in journal.batch)
+    ours = [each for each, own in journal.batch if own]
     quiet = [each for each, own in journal.batch if not own and not each.alarm and not each.excited]
-    acted = [each for each, own in journal.batch if own] if by_policy else quiet
+    acted = ours or quiet
     if not acted:
         return Costs()
     pays_own = pays_its_own(problem, journal.episodes)
     predicted = np.nan
     actual = float(_costs(problem, acted, pays_own).mean())
     if before is not None and not pays_own:
-        act = plant.policy if by_policy else plant.mpc
+        act = plant.policy if ours else plant.mpc
         predicted = float(predicted_costs(before, acted, act).mean())
     mpc = float(_costs(problem, quiet, pays_own).mean()) if quiet else np.nan
-    if not by_policy:
-        return Costs(actual, predicted, mpc, own_reward=pays_own)
-    found = Costs(actual, predicted, mpc, look=len(journal.trial), own_reward=pays_own)
-    found = found._replace(longer=_longer(journal, problem, acted))
-    pairs = journal.pairs
-    if not pairs:
+    found = Costs(actual, predicted, mpc, own_reward=pays_own)
+    if not ours:
         return found
-    ours, its = zip(*pairs, strict=True)
-    more = _costs(problem, ours, pays_own) - _costs(problem, its, pays_own)
+    found = found._replace(look=len(journal.trial), longer=_longer(journal, problem, ours))
+    if not journal.pairs:
+        return found
+    both = [*zip(*journal.pairs, strict=True)]
+    more = np.subtract(*(_costs(problem, each, pays_own) for each in both))
     if now is not None and not pays_own:
-        starts = [predicted_costs(now, each, plant.mpc) for each in (ours, its)]
-        varied = more - (starts[0] - starts[1])
+        starts = np.subtract(*(predicted_costs(now, each, plant.mpc) for each in both))
+        varied = more - starts
         more = varied if np.isfinite(varied).all() and varied.std() < more.std() else more
     return found._replace(difference=Difference.of(more, in_turns=True))
 
@@ -518,7 +499,9 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     if not more <= min(room, MOST_ABOVE_MPC * abs(costs.mpc)):  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
-    return f"{costs.difference.pairs} pairs show no gain" if is_hopeless(costs) else ""
+    hopeless = costs.difference.is_hopeless(RULE.least_gain * abs(costs.mpc))
+    enough = costs.difference.pairs >= PAIRS_TO_GIVE_UP
+    return f"{costs.difference.pairs} pairs show no gain" if enough and hopeless else ""
 
 
 def rows_of_pairs(journal: Journal, problem: LinearMPC) -> dict[str, str]:
@@ -539,20 +522,11 @@ def is_kept(costs: Costs) -> bool:
     return costs.difference.is_below_zero(level_of_look(RULE.significance, costs.look))
 
 
-def is_hopeless(costs: Costs) -> bool:
-    """Return whether more pairs would hardly show a gain that counts."""
-    least = RULE.least_gain * abs(costs.mpc)
-    more = costs.difference
-    return more.pairs >= PAIRS_TO_GIVE_UP and more.is_hopeless(least)
-
-
 def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
     """Return the excess over the bounds of the MPC's own episodes in the log, one 0 without any."""
     own = [journal.episodes[i] for i in journal.log if not journal.by_policy[i]]
-    own = [each for each in own if not each.excited]
-    if not own:
-        return BoundExcess(*np.zeros((5, 1)))
-    return excess_of_episodes(problem, ((each.thetas, each.actions) for each in own))
+    pairs = [(each.thetas, each.actions) for each in own if not each.excited]
+    return excess_of_episodes(problem, pairs) if pairs else BoundExcess(*np.zeros((5, 1)))
 
 
 def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]) -> str:
@@ -563,7 +537,7 @@ def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]
     if summed <= allowed_excess(before) + mpc.largest.max():
         return ""
     most = int(np.argmax(ours.largest))
-    words = BoundNames.of(problem).in_words(np.asarray(ours.worst)[most], ours.largest[most])
+    words = BoundNames.of(problem).in_words(ours.worst[most], ours.largest[most])
     return (
         f"it exceeded hard bounds by {summed:.3g} half-widths, summed over an episode, the MPC by "
         f"{before:.3g}: {words}"
@@ -582,11 +556,11 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Feed
     References and measured disturbances are those of the episodes.
     """
     row = twin.dynamics.row
-    members = np.arange(len(twin.dynamics.members))
+    count = len(twin.dynamics.members)
     found = []
     for each in episodes:
-        starts = row.begin(np.tile(each.thetas[0], (len(members), 1)))
-        given = np.repeat(each.thetas[:-1, None, row.given], len(members), axis=1)
-        played = Scenarios(twin, members, starts, given).play(controller_of(act))
+        starts = row.begin(np.tile(each.thetas[0], (count, 1)))
+        given = np.repeat(each.thetas[:-1, None, row.given], count, axis=1)
+        played = Scenarios(twin, np.arange(count), starts, given).play(controller_of(act))
         found.append(played.costs.mean())
     return np.array(found)

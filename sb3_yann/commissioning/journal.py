@@ -31,7 +31,7 @@ class Record:
     """Events in their order, in a file if there is a path; ``events`` are those that it held.
 
     In a folder, a path without a suffix, it is ``commissioning.jsonl``. A last line that a kill cut
-    off is left out, and overwritten by the next event.
+    off is overwritten by the next event.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -110,13 +110,13 @@ def _checksum(event: Event) -> int:
 
 def _as_event(data: Any) -> Event:
     """Return a dataclass as JSON has it, where NaN is null."""
-    return {name: _plain(each) for name, each in asdict(data).items()}
-
-
-def _plain(each: Any) -> Any:
-    if isinstance(each, float) and not math.isfinite(each):
-        return None
-    return each.tolist() if isinstance(each, np.ndarray) else each
+    event = asdict(data)
+    for name, each in event.items():
+        if isinstance(each, np.ndarray):
+            event[name] = each.tolist()
+        elif isinstance(each, float) and not math.isfinite(each):
+            event[name] = None
+    return event
 
 
 def _named(kind: type, event: Event) -> Event:
@@ -134,9 +134,7 @@ def _as_episode(event: Event) -> PlantEpisode:
 
 
 Verdict = Literal["accepted", "stays", "the MPC acts", "begins anew"]
-
-NOT_DYNAMICS = ("not a number", "violation")
-"""Alarms that say nothing of how the plant moves."""
+NOT_DYNAMICS = ("not a number", "violation")  # alarms that say nothing of how the plant moves
 
 
 @dataclass(frozen=True)
@@ -153,9 +151,8 @@ class Batch:
         How far it could leave the MPC, in input ranges.
     cost, predicted, mpc : float
         Mean stage cost of the quiet episodes of the one that acted; what the twin had predicted
-        for it from these starts; and what the MPC cost, which took turns with it on the plant. NaN
-        where it did not, or where there was no twin. Minus the plant's rewards where these are not
-        the stage cost.
+        from these starts; what the MPC cost in turns with it. NaN where it took none, or there was
+        no twin. Minus the plant's rewards where these are not the stage cost.
     pairs : int
         Of the policy and the MPC, since it is on trial.
     verdict : str
@@ -199,10 +196,10 @@ ACCEPTED_MPC = Accepted()
 class CommissioningState:
     """What holds after a batch.
 
-    One accepted policy is ``acting``, on trial ``since`` a batch; another, or the same, is
-    ``kept``: the plant has confirmed it. The log begins with the episode ``first``, everything
-    began anew after ``anew`` batches. ``twin`` are the episodes that the twin in force was fitted
-    to. ``tried`` says whether what the model had learnt before has been tried.
+    One accepted policy is ``acting``, on trial ``since`` a batch; the plant has confirmed the one
+    that is ``kept``. The log begins with the episode ``first``, everything began anew after
+    ``anew`` batches. The twin in force was fitted to the episodes ``twin``. ``tried`` is whether
+    what the model had learnt before has been.
     """
 
     max_correction: float
@@ -240,7 +237,7 @@ class Journal:
         self.batches: list[Batch] = []
         self._first_of_batch = 0
         self._cut_off = 0
-        self._open = ""
+        self._open = ""  # who acts in the episode that has begun
         self.unended = 0  # episodes of the record that began and never ended
         begin: Event = {"event": "begin", **settings}
         if not record.events:
@@ -284,30 +281,22 @@ class Journal:
         """An episode of the policy that is on trial and one of the MPC, played in turns."""
         found = []
         for batch in self.trial:
-            for first, second in zip(batch[::2], batch[1::2], strict=False):
-                both = sorted((first, second), key=lambda i: not self.by_policy[i])
-                ours, its = (self.episodes[i] for i in both)
-                if self.by_policy[first] != self.by_policy[second] and its.alarm is None:
-                    found.append((ours, its))
+            for both in zip(batch[::2], batch[1::2], strict=False):
+                ours, its = sorted(both, key=lambda i: not self.by_policy[i])
+                if self.by_policy[ours] > self.by_policy[its] and not self.episodes[its].alarm:
+                    found.append((self.episodes[ours], self.episodes[its]))
         return found
 
     @property
     def log(self) -> list[int]:
         """The numbers of the episodes that show the plant as it is now."""
-        return [
-            number
-            for number, each in enumerate(self.episodes)
-            if number >= self.state.first
-            and each.usable_for_fitting
-            and len(each.actions) >= SHORTEST
-        ]
+        numbers = range(self.state.first, len(self.episodes))
+        usable = [i for i in numbers if self.episodes[i].usable_for_fitting]
+        return [i for i in usable if len(self.episodes[i].actions) >= SHORTEST]
 
     @property
     def doubted(self) -> bool:
-        """Whether the last episode's alarm has not been answered by a quiet one.
-
-        An episode that began and never ended counts as one.
-        """
+        """Whether no quiet episode has answered an alarm, or one that began and never ended."""
         return bool(self._open) or not all(e.usable_for_fitting for e in self.episodes[-1:])
 
     @property
@@ -372,8 +361,8 @@ class Journal:
 
     def report(self) -> str:
         """Return the batches as a table."""
-        costs = "      cost  predicted  the MPC's"
-        lines = [f"batch  episodes  alarms  acted     within {costs}  pairs  then"]
+        header = "batch  episodes  alarms  acted     within       cost  predicted  the MPC's  pairs"
+        lines = [f"{header}  then"]
         for each in self.batches:
             numbers = "".join(f"{v:>11.5g}" for v in (each.cost, each.predicted, each.mpc))
             then = each.verdict + (f": {each.reason}" if each.reason else "")

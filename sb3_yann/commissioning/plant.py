@@ -37,8 +37,8 @@ class PlantEpisode:
     ``info["violation"]`` or beyond a hard bound, and an end that is no time limit; ``unsafe``
     those of them that were not allowed, see :meth:`Plant.play`. After ``step`` the MPC took over
     because of ``alarm``, -1 where it did not. ``apart`` is the largest distance of the policy's
-    inputs from the MPC's, in input ranges, whichever of them acted. Where it was ``excited`` random
-    steps were added to the MPC's inputs: its cost is not the MPC's.
+    inputs from the MPC's, in input ranges. Where it was ``excited`` random steps were added to the
+    MPC's inputs.
     """
 
     thetas: Array
@@ -109,18 +109,16 @@ class Plant:
     ) -> PlantEpisode:
         """Play an episode from :meth:`begin`; after an alarm the MPC acts, from the very sample on.
 
-        Until then it is ``act``: :meth:`policy`, :meth:`mpc` or :meth:`excited_mpc`. Without a
-        watchdog only violations and readings that are not finite are seen. The policy may exceed a
-        hard bound by the ``allowed`` half-widths, the MPC by any: what the plant reports alarms
-        nobody where its size is known, and allowed.
+        Until then it is ``act``: :meth:`policy`, `mpc` or :meth:`excited_mpc`. The policy may
+        exceed a hard bound by the ``allowed`` half-widths, the MPC by any: what the plant reports
+        alarms nobody where its size is known, and allowed.
         """
         if watchdog is not None:
             watchdog.start(known)
         thetas = [known]
         actions = list[Array]()
         reward = 0.0
-        violations = 0
-        unsafe = 0
+        violations = unsafe = 0
         apart = 0.0
         excited = act not in (self.policy, self.mpc)
         alarm = None
@@ -135,27 +133,27 @@ class Plant:
             apart = max(apart, float(np.max(np.abs(wanted - law) / self.range)))
             action = u if self.as_is else self.yann.action_units.action(u).astype(np.float32)
             action = np.clip(action, space.low, space.high).astype(space.dtype)  # to the last bit
-            observation, gained, terminated, over, info = self.env.step(action)
-            over = over or terminated
+            observation, gained, terminated, truncated, info = self.env.step(action)
+            over = terminated or truncated
             read = self._theta(observation)
-            after = self._known(known, u, read)
+            predicted = self.problem.deviations.predict(known, u.astype(np.float64))
+            after = np.where(np.isfinite(read), read, predicted)
             beyond = bound_excess(self.problem, np.array([known, after]), u[None])
             excess = beyond.largest
             limit = allowed if act == self.policy else np.inf
             sized = EXCESS_ROOM < excess <= limit
             violated = bool(info.get("violation", False)) or terminated
             forbidden = terminated or bool(excess > limit) or (violated and not sized)
-            reward = reward + float(gained)
-            violations = violations + (violated or bool(excess > EXCESS_ROOM))
-            unsafe = unsafe + forbidden
+            reward += float(gained)
+            violations += violated or bool(excess > EXCESS_ROOM)
+            unsafe += forbidden
             if alarm is None:
                 why = "The plant reports a violation, or ends the episode." if forbidden else ""
                 if excess > limit:
                     names = BoundNames.of(self.problem)
                     why = f"On the plant {names.in_words(float(beyond.worst), float(excess))}."
-                found = self._look(watchdog, known, u, read, why)
-                if found is not None:
-                    alarm = found
+                alarm = self._look(watchdog, known, u, read, why)
+                if alarm is not None:
                     step = len(actions)
                     act = self.mpc
             known = after
@@ -178,13 +176,6 @@ class Plant:
         both[:, lost] = [[0.0], [1.0]]
         one, other = self.yann.theta(both).double().cpu().numpy()
         return np.where(one == other, one, np.nan)
-
-    def _known(self, before: Array, u: Array, read: Array) -> Array:
-        """Return a reading, with the model's prediction in place of what is not finite."""
-        if np.isfinite(read).all():
-            return read
-        predicted = np.asarray(self.problem.deviations.predict(before, u.astype(np.float64)))
-        return np.where(np.isfinite(read), read, predicted)
 
     def _look(
         self, watchdog: Watchdog | None, known: Array, u: Array, read: Array, why: str

@@ -14,22 +14,15 @@ from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.log import pieces
 from sb3_yann.twin.plant_twin import PlantTwin
 
-CHART_GAINS = np.array([1.0, 0.2, 0.05, 0.02])
-"""Of the charts: one without a memory, others with one of 5, 20 and 50 samples."""
-FACTOR = 2.0
-FACTOR_OF_FEW = 7.5
-"""A band is so many times the largest held-out ratio: 2 + 7.5 / episodes."""
-LEAST_RATIO = 0.5
-"""The largest ratio is taken to be at least this, however well the log is predicted."""
-LEAST_ERROR = 0.1
-"""The residual is taken to be at least so large, in standard deviations of one-step errors."""
-NORMAL_MEDIAN = 0.6745
-"""Median of what is normally distributed, without its sign, in standard deviations."""
-NOISE_CORRELATION = 0.3
-"""Correlation of successive errors below which they are noise; those of a model change slowly."""
+CHART_GAINS = np.array([1.0, 0.2, 0.05, 0.02])  # without a memory; with 5, 20 and 50 samples
+FACTOR = 2.0  # times the largest held-out ratio a band is: this,
+FACTOR_OF_FEW = 7.5  # and so much more, divided by the number of episodes
+LEAST_RATIO = 0.5  # the largest ratio is taken to be at least this
+LEAST_ERROR = 0.1  # that the residual is taken to be, in standard deviations of one-step errors
+NORMAL_MEDIAN = 0.6745  # of the normal distribution, without its sign, in standard deviations
+NOISE_CORRELATION = 0.3  # of successive errors, below which they are noise: a model's change slowly
 FROZEN = 3  # repeats of a reading from which on it may be frozen
-PREDICTED_MOVE = 3.0
-"""Standard deviations that the twin's prediction moves in a sample while a reading stands."""
+PREDICTED_MOVE = 3.0  # standard deviations that the twin moves in a sample while a reading stands
 
 
 @dataclass(frozen=True)
@@ -43,9 +36,8 @@ class Alarm:
     message: str
 
 
-@dataclass(frozen=True)
 class Bands:
-    """How far charts may go while all is well, from episodes that a fit has not seen.
+    """How far charts may go while all is well, from episodes of a log that a fit has not seen.
 
     ``unseen`` are fits without each fold of the episodes, ``low`` and ``high`` (k,) the box of
     logged features ``[x, d, u]``. Of each state (n,) ``size`` is what the residual explains,
@@ -55,82 +47,65 @@ class Bands:
     ``repeats`` itself so often in a row in the log.
     """
 
-    unseen: Dynamics
-    low: Array
-    high: Array
-    size: Array
-    error: Array
-    spread: Array
-    most: Array
-    noisy: NDArray[np.bool_]
-    repeats: NDArray[np.int64]
-    factor: float
-
-    @classmethod
-    def of(cls, twin: PlantTwin) -> Bands:
-        """Return those of a twin's own log."""
+    def __init__(self, twin: PlantTwin) -> None:
         if not twin.judges:
             raise ValueError(
                 "The twin's log is one episode: nothing is left to calibrate a watchdog on. Log "
                 "at least one episode more; four are a good number."
             )
-        unseen = twin.judges[0].dynamics
+        self.unseen = twin.judges[0].dynamics
         log = pieces(twin.episodes, FOLDS)
-        row = unseen.row
-        units = unseen.coordinates.units
+        row = self.unseen.row
+        units = self.unseen.coordinates.units
         left = []
         for i, each in enumerate(log):
-            one = Dynamics(unseen.problem, unseen.coordinates, (unseen.members[i % FOLDS],))
+            fit = self.unseen.members[i % FOLDS]
+            one = Dynamics(self.unseen.problem, self.unseen.coordinates, (fit,))
             after = one.step(each.thetas[None, :-1], each.actions[None])[0]
             left.append((each.thetas[1:] - after)[:, row.state])
         squares = np.sum([np.sum(each**2, axis=0) for each in left], axis=0)
         products = np.sum([np.sum(each[1:] * each[:-1], axis=0) for each in left], axis=0)
-        lag = products / np.maximum(squares, 1e-300)
-        error = np.maximum(np.sqrt(squares / sum(map(len, left))), 1e-9 * units)
+        self.noisy = products / np.maximum(squares, 1e-300) < NOISE_CORRELATION
+        self.error = np.maximum(np.sqrt(squares / sum(map(len, left))), 1e-9 * units)
         explained = [twin.dynamics.residual(e.thetas[None, :-1], e.actions[None])[0] for e in log]
-        size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST_ERROR * error) ** 2)
+        least = (LEAST_ERROR * self.error) ** 2
+        self.size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + least)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log])
-        box = seen.min(axis=0), seen.max(axis=0)
+        self.low = seen.min(axis=0)
+        self.high = seen.max(axis=0)
         charted = []
         for each, errors in zip(log, left, strict=True):
             charts: Array = np.zeros((2, len(CHART_GAINS), len(units)))
-            doubts = _doubt(unseen, *box, size, each.thetas[:-1], each.actions)
-            for step in zip(errors, doubts, strict=True):
+            for step in zip(errors, self.doubt(each.thetas[:-1], each.actions), strict=True):
                 charts = charted_with(charts, *step)
                 charted.append(charts)
         means, doubted = np.moveaxis(np.array(charted), 1, 0)
         # A median: where an episode leaves what the others show, the doubt explains its errors.
-        spread = np.median(np.abs(means), axis=0) / NORMAL_MEDIAN + 1e-9 * error
-        most = np.max(np.abs(means) / np.hypot(spread, doubted), axis=0)
-        repeats = np.max([_repeats(e.thetas[:, row.state]) for e in twin.episodes], axis=0)
-        factor = FACTOR + FACTOR_OF_FEW / len(twin.episodes)
-        most = np.maximum(most, LEAST_RATIO)
-        noisy = lag < NOISE_CORRELATION
-        return cls(unseen, *box, size, error, spread, most, noisy, repeats, factor)
+        self.spread = np.median(np.abs(means), axis=0) / NORMAL_MEDIAN + 1e-9 * self.error
+        most = np.max(np.abs(means) / np.hypot(self.spread, doubted), axis=0)
+        self.most = np.maximum(most, LEAST_RATIO)
+        self.repeats = np.max([_repeats(e.thetas[:, row.state]) for e in twin.episodes], axis=0)
+        self.factor = FACTOR + FACTOR_OF_FEW / len(twin.episodes)
 
     def doubt(self, rows: Array, u: Array) -> Array:
-        """Return how far the twin may be wrong, (..., n), at rows (..., size) and u (..., m)."""
-        return _doubt(self.unseen, self.low, self.high, self.size, rows, u)
+        """Return how far the twin may be wrong, (..., n), at rows (..., size) and u (..., m).
+
+        It is the standard deviation of the fits, and beyond the box also the ``size`` of what the
+        residual explains, times the distance in widths.
+        """
+        z = self.unseen.row.features(rows, u)
+        width = np.maximum(self.high - self.low, 1e-6 * self.unseen.coordinates.scale)
+        beyond = np.maximum(np.maximum(z - self.high, self.low - z), 0.0)
+        far = (beyond / width).sum(axis=-1, keepdims=True)
+        far = far + far**2  # a twin of a narrow log underrates what is far away
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (rows, u))
+        apart = self.unseen.residual(*flat).std(axis=0).reshape(*far.shape[:-1], -1)
+        return np.asarray(np.hypot(apart, far * self.size))
 
     def ratios(self, charts: Array) -> Array:
         """Return charts (2, gains, n) in units of their bands: beyond 1 something is wrong."""
         means, doubts = charts
         return np.asarray(means / (self.factor * self.most * np.hypot(self.spread, doubts)))
-
-
-def _doubt(unseen: Dynamics, low: Array, high: Array, size: Array, rows: Array, u: Array) -> Array:
-    """Return the standard deviation of the fits, and beyond the box more: see :class:`Bands`.
-
-    There it is also the ``size`` of what the residual explains, times the distance in widths.
-    """
-    z = unseen.row.features(rows, u)
-    width = np.maximum(high - low, 1e-6 * unseen.coordinates.scale)
-    beyond = np.maximum(np.maximum(z - high, low - z), 0.0)
-    far = (beyond / width).sum(axis=-1, keepdims=True)
-    far = far + far**2  # a twin of a narrow log underrates what is far away
-    flat = (each.reshape(1, -1, each.shape[-1]) for each in (rows, u))
-    apart = unseen.residual(*flat).std(axis=0).reshape(*far.shape[:-1], -1)
-    return np.asarray(np.hypot(apart, far * size))
 
 
 def charted_with(charts: Array, innovation: Array, doubt: Array) -> Array:
@@ -185,12 +160,9 @@ class Watchdog:
 
     @classmethod
     def of(cls, twin: PlantTwin) -> Watchdog:
-        """Return the watchdog of a twin, calibrated on its log: ValueError if that is one episode.
-
-        TypeError if it is no PlantTwin.
-        """
+        """Return a twin's watchdog, calibrated on its log: ValueError if that is one episode."""
         check_type("twin", twin, PlantTwin, "a PlantTwin")
-        return cls(twin.dynamics, Bands.of(twin))
+        return cls(twin.dynamics, Bands(twin))
 
     def start(self, theta: Array) -> None:
         """Begin an episode at theta (n_theta,); ValueError for another shape, or NaN."""
@@ -206,7 +178,7 @@ class Watchdog:
         self._moved = np.zeros(n)  # how far the twin would have moved it meanwhile
 
     def watch(self, theta: Array, u: Array, after: Array) -> Alarm | None:
-        """Return an alarm, or None: after one the episode's alarm stays as it is.
+        """Return the episode's first alarm, or None.
 
         theta and what comes after it (n_theta,) are as read before and after a sample, u (m,) is
         what was commanded. RuntimeError before :meth:`start`.
@@ -226,7 +198,7 @@ class Watchdog:
         """Return what is wrong with a transition: the kind, and what is said."""
         for name, values in (("theta", theta), ("the input", u), ("the reading", after)):
             if not np.isfinite(values).all():
-                return "not a number", f"{name} is {np.asarray(values).tolist()}"
+                return "not a number", f"{name} is {values.tolist()}"
         layout = self.dynamics.row
         before = self._row
         if before is None or not np.array_equal(layout.shown(before), theta):
@@ -254,12 +226,11 @@ class Watchdog:
         moving = np.abs(self._moved) > PREDICTED_MOVE * stands * unsure
         problem = self.dynamics.problem
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
-            name = problem.model.state_names
-            shown = problem.units.to_plant(reading)[i]
-            return "frozen sensor", (
-                f"{name[i] if name else f'reading {i}'} has been {shown:.6g} for {stands[i]} "
-                "samples; the twin moves or the sensor is noisy"
+            name = problem.model.state_names[i] if problem.model.state_names else f"reading {i}"
+            text = (
+                f"{name} has been {problem.units.to_plant(reading)[i]:.6g} for {stands[i]} samples"
             )
+            return "frozen sensor", f"{text}; the twin moves or the sensor is noisy"
         return None
 
     def _beyond(self) -> tuple[str, str] | None:
