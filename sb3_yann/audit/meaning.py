@@ -29,8 +29,7 @@ SIGN_STEPS = 10  # steps for which it is pushed where outputs are read
 UNLIKE = 0.7  # cosine of answers to pushes and the model's, below which they are others
 ALIKE = 0.95  # the same, above which they are the model's in another order
 LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
-EXPLAINED_REWARD = 0.95
-"""Share of the rewards' variance from which on they are taken for minus the stage cost."""
+EXPLAINED_REWARD = 0.95  # of the rewards' variance: they are taken for minus the stage cost
 FEWEST_REWARDS = 10  # steps that must be seen
 
 
@@ -53,16 +52,15 @@ def warn_of_order(problem: LinearMPC, theta: Array, u: Array, following: Array) 
 
 def warn_of_box(problem: LinearMPC, theta: Array) -> None:
     """Warn of a state that reads beyond theta's box where episodes begin (starts, n_theta)."""
-    n = problem.model.n_states
-    low = problem.deviations.theta_min[:n]
-    high = problem.deviations.theta_max[:n]
-    share = np.mean((theta[:, :n] < low) | (theta[:, :n] > high), axis=0)
+    own = problem.deviations
+    names = labels_of(problem.model)[0]
+    share = np.mean((theta < own.theta_min) | (theta > own.theta_max), axis=0)[: len(names)]
     i = int(np.argmax(share))
     if share[i] > MOSTLY:
         warn(
-            f"{labels_of(problem.model)[0][i]} reads beyond theta's box, for which the MPC is "
-            f"made, where {share[i]:.0%} of the episodes begin: does the env show it in another "
-            "unit, or in another order? Else widen theta_min and theta_max."
+            f"{names[i]} reads beyond theta's box, for which the MPC is made, where "
+            f"{share[i]:.0%} of the episodes begin: does the env show it in another unit, or in "
+            "another order? Else widen theta_min and theta_max."
         )
 
 
@@ -78,11 +76,10 @@ def warn_of_signs(
     """Warn where an input moves the states against the model or far otherwise, in the first step.
 
     Two steps from one start differ by that input alone: neither noise that the seed repeats, nor
-    what is not linear in the states, gets in. The steps that this takes are returned.
-    Estimates go at first where their model goes: where an estimator stands between, its readings
-    count, and inputs are held for `SIGN_STEPS`, since outputs may answer late. ``played`` are the
-    MPC's episodes from the seeds; ``theta`` and ``inputs`` map what the env shows and takes to the
-    problem's.
+    what is not linear in the states, gets in. The steps that this takes are returned. Estimates go
+    at first where their model goes: of an estimator the readings count, and inputs are held for
+    `SIGN_STEPS`, since outputs may answer late. ``played`` are the MPC's episodes from the seeds;
+    ``theta`` and ``inputs`` map what the env shows and takes to the problem's.
     """
     model = problem.model
     names = labels_of(model)[1]
@@ -95,8 +92,6 @@ def warn_of_signs(
     weight = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 0)
     response = np.cumsum([np.linalg.matrix_power(model.A, k) @ model.B for k in range(steps)], 0)
     starts = [i for i in range(len(seeds)) if len(played.actions[i])][:SIGN_STARTS]
-    when = "a step" if steps == 1 else f"{steps} steps"
-
     taken = 0
 
     def hold(i: int, action: Array) -> Array:
@@ -136,8 +131,9 @@ def warn_of_signs(
                 gains.append(float(np.sum(effect * expected)) / size)
         if not starts or len(gains) < len(starts):
             continue
-        starts_in_words = f"{len(gains)} start{'s' * (len(gains) > 1)}"
-        found = f"{np.median(gains):.2g} times as far in {when}, from {starts_in_words}"
+        when = "a step" if steps == 1 else f"{steps} steps"
+        found = f"{np.median(gains):.2g} times as far in {when}, from {len(gains)} start"
+        found += "s" * (len(gains) > 1)
         if max(gains) < 0:
             warnings.append(
                 f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "
@@ -180,18 +176,17 @@ def _swapped(modelled: Array, answers: Array) -> str:
 def _push(env: gym.Env[Any, Any], action: Array, j: int) -> Array:
     """Return an action whose entry j is half the way to the bound that is farther away."""
     space: Any = env.action_space
-    low, high = np.clip([space.low[j], space.high[j]], action[j] - 1e3, action[j] + 1e3)
-    far = high if high - action[j] > action[j] - low else low
+    ends = np.clip([space.low[j], space.high[j]], action[j] - 1e3, action[j] + 1e3)
     pushed = np.array(action, dtype=space.dtype)
-    pushed[j] = (action[j] + far) / 2
+    pushed[j] = (action[j] + max(ends, key=lambda end: abs(end - action[j]))) / 2
     return pushed
 
 
 def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:
     """Warn where rewards are not minus the stage cost, times a constant and up to one.
 
-    The constant may be each episode's own: it ranks no controllers. The cost may be that of the
-    state before the step or after it. Rewards that are all zero are none.
+    The latter may be each episode's own: it ranks no controllers. The cost may be that of the state
+    before the step or after it. Rewards that are all zero are none.
     """
     thetas, inputs, rewards = played.padded()
     costs = [problem.deviations.stage_cost(at, inputs) for at in (thetas[:-1], thetas[1:])]
@@ -216,18 +211,15 @@ def explained(gain: Array, rewards: Array, known: Mask) -> float:
 
     It is 1 where the gain does not vary, which says nothing, and 0 where rewards fall as it rises.
     """
-    x, y = (_centered(each, known) for each in (gain, rewards))
+    count = np.maximum(known.sum(axis=0), 1)  # of each episode, a column
+    x, y = (
+        (each - np.where(known, each, 0.0).sum(axis=0) / count)[known] for each in (gain, rewards)
+    )
     size = np.sqrt(np.sum(x**2) * np.sum(y**2))
     if np.abs(x).max() <= 1e-9 * np.abs(gain[known]).max():
         return 1.0
     correlation = float(x @ y / size) if size > 0 else 0.0
     return max(correlation, 0.0) ** 2
-
-
-def _centered(values: Array, known: Mask) -> Array:
-    """Return the known values (steps,) less the mean of their episodes, the columns."""
-    mean = np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.asarray((values - mean)[known])
 
 
 Map = Callable[[Array], Array]  # from an observation to theta
@@ -310,8 +302,8 @@ def require_theta_shown(problem: LinearMPC, theta: Array, starts: Array) -> None
     """
     shown = problem.units.to_plant(theta)
     begins = problem.units.to_plant(starts)
-    others = slice(problem.model.n_states, None)  # which may be read later
-    begins[:, others] = problem.theta_ss[others]
+    n = problem.model.n_states
+    begins[:, n:] = problem.theta_ss[n:]  # what may be read later
     for rows in (shown, begins):
         if words := problem.shown_as_deviation(rows):
             raise ValueError(f"The env is not that of the MPC. {words}")
@@ -319,7 +311,7 @@ def require_theta_shown(problem: LinearMPC, theta: Array, starts: Array) -> None
     most = 0.9  # share of the rows that must speak for it
     beyond = (shown < problem.theta_min - room) | (shown > problem.theta_max + room)
     for i in np.flatnonzero(np.mean(beyond, axis=0) >= most):
-        if problem.model.n_states <= i < problem.layout.disturbance.stop:
+        if n <= i < problem.layout.disturbance.stop:
             raise ValueError(
                 f"{problem.labels()[i]} is {shown[0, i]:.6g}, and the MPC was solved for "
                 f"{problem.theta_min[i]:.6g} to {problem.theta_max[i]:.6g}: give the wrapper that "

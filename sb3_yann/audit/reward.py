@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,8 +16,7 @@ from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.rollout import may_change_reward
 
-EXACT = 1e-5
-"""What rounding to float32 leaves of an agreement, relative to the spread of the rewards."""
+EXACT = 1e-5  # what rounding to float32 leaves of an agreement, relative to the rewards' spread
 MIN_STEPS = 10  # steps that must be compared
 
 
@@ -113,10 +111,7 @@ class Rewards(NamedTuple):
         return bool(np.all(np.abs(self.implied - self.cost) <= allowed + at_rest))
 
     def agree(self, costs: Array, predicted: Array, tolerance: float) -> bool:
-        """Tell whether nearly all costs (steps,) are those predicted.
-
-        Errors are relative to how much these vary: a large constant explains nothing.
-        """
+        """Tell whether nearly all costs (steps,) are those predicted, relative to their spread."""
         spread = np.abs(predicted - np.median(predicted))
         allowed = tolerance * np.maximum(spread, spread.mean()) + self.rounded
         return bool(np.mean(np.abs(costs - predicted) <= allowed) >= 0.98)
@@ -128,8 +123,8 @@ class Rewards(NamedTuple):
         """
         if np.ptp(self.rewards) <= 1e-9 * np.abs(self.rewards).max():
             return "constant", f"every reward is {self.rewards[0]:g}, whatever happens."
-        of_line = (line.offset - self.rewards) / line.scale if line.scale else self.rewards
         for width in (EXACT, tolerance):
+            of_line = (line.offset - self.rewards) / (line.scale or 1.0)
             if line.scale != 0 and self.agree(of_line, self.cost, width):
                 return line.cause
             if self.agree(self.implied, self.after, width):
@@ -226,25 +221,18 @@ class CostAudit(BaseCallback):
             self._records.append((*seen, action, float(rewards[i]), counted))
 
     def _judge(self) -> None:
-        before, after, actions, rewards, counted = map(np.array, zip(*self._records, strict=True))
-        finite = np.isfinite(rewards)
-        for each in (before, after):
-            finite &= np.isfinite(each.reshape(len(finite), -1)).all(axis=1)
+        columns = [*map(np.array, zip(*self._records, strict=True))]
+        flat = [each.reshape(len(each), -1) for each in columns[:2]]
+        finite = np.isfinite(np.hstack([*flat, columns[3][:, None]])).all(axis=1)
         if not finite.any():
             return
+        before, after, actions, rewards, counted = (each[finite] for each in columns)
         theta, following = (
-            np.asarray(self.policy.theta(each[finite]).double().cpu().numpy())
-            for each in (before, after)
+            np.asarray(self.policy.theta(each).double().cpu().numpy()) for each in (before, after)
         )
-        u = self.policy.inputs(actions[finite])
-        counted = counted[finite]
-        compared = self._compared(
-            theta[counted],
-            following[counted],
-            u[counted],
-            rewards[finite][counted],
-            self._rounding(before[finite][counted]),
-        )
+        u = self.policy.inputs(actions)
+        seen = theta, following, u, rewards, self._rounding(before)
+        compared = self._compared(*(each[counted] for each in seen))
         count = len(compared.rewards)
         if count < MIN_STEPS:  # what is not finite has had its own warning
             return
@@ -256,8 +244,7 @@ class CostAudit(BaseCallback):
         if not cause and not compared.match(self.tolerance):
             cause, explanation = compared.likely_cause(line, self.tolerance)
         message = f"The reward is the cost of the problem in all of {count} steps."
-        if cause:
-            message = self._in_words(compared, line, explanation)
+        message = self._in_words(compared, line, explanation) if cause else message
         self._records = []
         self.finding = CostFinding(not cause, cause, message, *line, count)
         if not cause:
@@ -306,8 +293,7 @@ class CostAudit(BaseCallback):
     def _rounding(self, observations: Array) -> Array:
         """Return by how much theta may err, (steps, n_theta); see AffineObservation."""
         digits = observations.dtype if observations.dtype.kind == "f" else np.float64
-        size = np.abs(observations).astype(np.float64)
-        size = size.reshape(len(size), math.prod(size.shape[1:]))
+        size = np.abs(observations).astype(np.float64).reshape(len(observations), -1)
         if (seen := self.policy.to_theta) is not None:
             # What a normalization hides of its size is in the offset.
             size = size @ np.abs(seen.matrix).T + np.abs(seen.offset)

@@ -59,25 +59,21 @@ class Logged:
         self.inputs = np.concatenate([each.actions for each in episodes])
         self.after = np.concatenate([each.thetas[1:, self.row.state] for each in episodes])
         self.names = labels_of(self.problem.model)
-
-    @cached_property
-    def law(self) -> Array:
-        """What the MPC gives in each row, (N, m)."""
-        return law_of(self.problem)(self.row.shown(self.rows))
+        self.act = law_of(self.problem)
 
     @cached_property
     def made_by_law(self) -> NDArray[np.bool_]:
         """Which inputs (m,) are the MPC's own in enough rows, in which it moves: in its units."""
         room = LAW * self.problem.u_half
         own = self.problem.deviations
-        inside = (self.law > own.u_min + room) & (self.law < own.u_max - room)
-        same = inside & (np.abs(self.inputs - self.law) <= room)
-        enough = same.sum(axis=0) >= np.maximum(LEAST_ROWS, PROVING * inside.sum(axis=0))
-        found = np.zeros(len(room), dtype=bool)
-        for j in np.flatnonzero(enough):
-            moves = np.std(self.law[same[:, j], j])
-            found[j] = moves > max(10 * room[j], 0.5 * np.std(self.law[inside[:, j], j]))
-        return found
+        law = self.act(self.row.shown(self.rows))
+        inside = (law > own.u_min + room) & (law < own.u_max - room)
+        same = inside & (np.abs(self.inputs - law) <= room)
+        found = same.sum(axis=0) >= np.maximum(LEAST_ROWS, PROVING * inside.sum(axis=0))
+        for j in np.flatnonzero(found):
+            moves = np.std(law[same[:, j], j])
+            found[j] = moves > max(10 * room[j], 0.5 * np.std(law[inside[:, j], j]))
+        return np.asarray(found)
 
     @cached_property
     def excitation(self) -> Array:
@@ -87,7 +83,7 @@ class Logged:
         given = np.r_[layout.reference, layout.limits]
         theta[:, given] = theta[:, given].mean(axis=0)  # what set-points move is excitation
         known = np.delete(theta, layout.previous, axis=1)  # a test that is held follows itself
-        columns = np.column_stack([np.ones(len(theta)), known, law_of(self.problem)(theta)])
+        columns = np.column_stack([np.ones(len(theta)), known, self.act(theta)])
         left = self.inputs - columns @ np.linalg.lstsq(columns, self.inputs, rcond=None)[0]
         variance = np.var(self.inputs, axis=0)
         return np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
@@ -170,7 +166,7 @@ def _on_law(log: Logged, shift: int, change: tuple[Array, Array] | None = None) 
     if change is not None:
         state = log.problem.layout.state
         theta[:, state] = theta[:, state] @ change[0].T + change[1]
-    answer = law_of(log.problem)(theta)
+    answer = log.act(theta)
     known = np.isfinite(answer).all(axis=1)
     theta, u, answer = (each[known] for each in (theta, u, answer))
     slope, offset, offset_error = np.zeros((3, m, m))
@@ -288,18 +284,16 @@ def _other_units(log: Logged, logged: _OnLaw, proven: NDArray[np.bool_]) -> Iter
             read[:, j] = (log.inputs[:, j] - away) / slope
     if of_inputs:
         found = [(left_by_model(np.eye(n), np.zeros(n), read), " and ".join(of_inputs))]
-    law = law_of(log.problem)
     theta, u = log.on_law()
     some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
-    theta = theta[some]
-    u = u[some]
+    theta, u = (each[some] for each in (theta, u))
     scale = np.maximum(np.std(u, axis=0), 1e-6 * log.problem.u_half)
     for i in range(n) if not proven.all() else ():
 
         def left(p: Array, i: int = i) -> Array:
             rows = theta.copy()
             rows[:, i] = p[0] * rows[:, i] + p[1] * log.unit[i]
-            return np.asarray(np.nan_to_num((u - law(rows)) / scale).ravel())
+            return np.asarray(np.nan_to_num((u - log.act(rows)) / scale).ravel())
 
         before = np.mean(left(np.array([1.0, 0.0])) ** 2)
         fit = least_squares(left, [1.0, 0.0], diff_step=1e-4, max_nfev=20)
@@ -379,17 +373,16 @@ def _by_innovations(log: Logged) -> str:
     Its innovations are those of the log, less what a linear filter makes of the inputs' change.
     """
     estimator = log.row.estimator
-    state = log.problem.layout.state
     if estimator is None or np.any(estimator.every > 1):
         return ""
-    seen = estimator.gain[: log.problem.model.n_states]
+    seen = estimator.gain[: log.unit.size]
     if np.linalg.matrix_rank(seen) < len(estimator.C):
         return ""
     errors = []
     for each in log.episodes:
         theta = log.row.shown(each.thetas)
         left = theta[1:] - log.problem.deviations.predict(theta[:-1], each.actions)
-        errors.append(left[1:-1, state] @ np.linalg.pinv(seen).T)
+        errors.append(left[1:-1, log.problem.layout.state] @ np.linalg.pinv(seen).T)
     e = np.concatenate(errors)
 
     def shown(changes: list[Array]) -> Array:  # what so much more input adds to innovations (N, q)
@@ -484,17 +477,14 @@ def _resting(log: Logged, fit: _Effects) -> Iterator[str]:
     """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
     if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
         return
-    model = log.problem.model
     rest = _rest_of(log)
     away = np.abs(rest / log.unit)
-    if not np.max(away) <= 5:  # beyond the log: a state that hardly returns, or noise
-        return
     shown = log.problem.units.to_plant(rest)
     elsewhere = [
-        f"{log.names[0][i]} = {shown[i]:.4g}, the problem's at {model.x_ss[i]:.4g}"
+        f"{log.names[0][i]} = {shown[i]:.4g}, the problem's at {log.problem.model.x_ss[i]:.4g}"
         for i in np.flatnonzero(away > 0.5)
     ]
-    if elsewhere:
+    if elsewhere and np.max(away) <= 5:  # beyond the log: a state that hardly returns, or noise
         there = ", ".join(f"{each:.5g}" for each in shown)
         yield (
             f"With inputs at u_ss the logged plant rests at {'; '.join(elsewhere)}: compare units "

@@ -231,8 +231,8 @@ def forecast(
     logged = np.stack([each.thetas[:1] for each in episodes]), None
     new = drawn.reshape(count, some, -1), plain.new_given(some, rng)
     found: list[tuple[float, float, float, str]] = []
-    lost: list[float] = []
-    objections: list[str] = []
+    worst = -np.inf
+    objection = ""
     for judge in bar("forecasts by models of the log", judges, timed=True):
         for remembers in (False, True):
             if (judge.refuted and not remembers) or (remembers and not own.explains):
@@ -244,18 +244,18 @@ def forecast(
             played = [[replays.costs(each, *of) for each in (law, act)] for of in (logged, new)]
             runs = [each.reshape(len(each), -1) for each in played[1]]
             with np.errstate(all="ignore"):
-                objections.append(_objection(*runs))
+                objection = objection if found else _objection(*runs)
             for mpc, policy in played:
                 means = mpc.mean(axis=2), policy.mean(axis=2)
                 found.append((*_changed(*means, independent, runs), says))
                 with np.errstate(all="ignore"):
                     most = np.max(policy - mpc) / np.abs(mpc).mean()
-                lost.append(float(np.nan_to_num(most, nan=np.inf)))
+                worst = max(worst, float(np.nan_to_num(most, nan=np.inf)))
     change = (found[0][0] + found[1][0]) / 2
     widest = max(found, key=lambda each: each[2])
     cure = _cure(*widest, independent, loosest, partial(more_of, problem, episodes))
     low = min(each[1] for each in found)
-    return Forecast(change, low, widest[2], cure, max(lost), objections[0])
+    return Forecast(change, low, widest[2], cure, worst, objection)
 
 
 def _objection(mpc: Array, policy: Array) -> str:

@@ -89,10 +89,19 @@ def as_episodes(
     if whole and beside:
         raise ValueError(f"{[*beside]} is given, but states are all of theta: leave it out.")
     found = []
-    for i, (x, action) in enumerate(zip(states, actions, strict=True)):
-        if len(action) < SHORTEST:
-            raise ValueError(f"episode {i} has {len(action)} steps; {SHORTEST} are the least.")
-        u = _within_bounds(problem, i, action)
+    room = 1e-3 * problem.u_half
+    for i, (x, u) in enumerate(zip(states, actions, strict=True)):
+        if len(u) < SHORTEST:
+            raise ValueError(f"episode {i} has {len(u)} steps; {SHORTEST} are the least.")
+        for row, k in np.argwhere((u < problem.u_min - room) | (u > problem.u_max + room)):
+            low = problem.u_min[k]
+            high = problem.u_max[k]
+            raise ValueError(
+                f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds {low:g} "
+                f"and {high:g} of the problem. A log is in plant units where the model has an "
+                "operating point, and in the model's own where it has none."
+            )
+        u = problem.units.input_to_deviations(np.clip(u, problem.u_min, problem.u_max))
         x = problem.units.to_deviations(x)
         own = {name: values[i] for name, values in beside.items()}
         found.append(Episode(x if whole else _theta(problem, i, x, u, own), u))
@@ -174,20 +183,6 @@ def as_pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
         if not (isinstance(pair, tuple | list) and len(pair) == 2):
             raise TypeError(f"episode {i} must be a pair (states, actions), got {type(pair)}.")
     return [(states, actions) for states, actions in pairs]
-
-
-def _within_bounds(problem: LinearMPC, i: int, u: Array) -> Array:
-    """Return inputs (T, m) of episode i in deviations, with their rounding cut off."""
-    room = 1e-3 * problem.u_half
-    beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
-    for row, k in np.argwhere(beyond):
-        raise ValueError(
-            f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds "
-            f"{problem.u_min[k]:g} and {problem.u_max[k]:g} of the problem. A log is in plant "
-            "units where the model has an operating point, and in the model's own where it has "
-            "none."
-        )
-    return problem.units.input_to_deviations(np.clip(u, problem.u_min, problem.u_max))
 
 
 def _theta(problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any]) -> Array:

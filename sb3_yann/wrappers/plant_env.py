@@ -211,10 +211,8 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
             )
         box = mpc.theta_min[layout.state], mpc.theta_max[layout.state]
         half = (box[1] - box[0]) / 4
-        low = np.maximum(x_ss - half, box[0])
-        high = np.minimum(x_ss + half, box[1])
-        lowest = low if start_low is None else start_low
-        highest = high if start_high is None else start_high
+        lowest = np.maximum(x_ss - half, box[0]) if start_low is None else start_low
+        highest = np.minimum(x_ss + half, box[1]) if start_high is None else start_high
         start = check_bounds("start_", lowest, highest, n, equal=True)
         if not np.all(np.isfinite(start)):
             raise ValueError(
@@ -266,9 +264,8 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
 def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) -> float | None:
     """Return by what a unit of time explains that f and the model differ; None where none does.
 
-    Compared are the effects of state and input on the next state, in half-widths of their boxes. A
-    plant that is not its model is no reason: the model must be far off, by five times at least, and
-    nearly right with another unit.
+    Compared are the effects of state and input on the next state, in half-widths of their boxes:
+    the model must be far off, and nearly right with another unit.
     """
     model = mpc.model
     n = mpc.model.n_states
@@ -340,9 +337,15 @@ class Equations(gym.Env[Array, Array]):
         box: Any = self.action_space
         u = np.clip(np.asarray(action, np.float64), box.low, box.high)
         self.fault = ""
+        x = self.state
+        h = self.dt / self.substeps
         with np.errstate(all="ignore"):
-            reached = self._advance(u)
-        lost = not np.all(np.isfinite(reached))
+            for _ in range(self.substeps):
+                k1 = self.slope(x, u)
+                k2 = self.slope(x + h / 2 * k1, u)
+                k3 = self.slope(x + h / 2 * k2, u)
+                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.slope(x + h * k3, u))
+        lost = not np.all(np.isfinite(x))
         if self.fault:
             key = getattr(self.f, "__code__", self.plant_name)
             self.lost[key] += 1
@@ -351,21 +354,10 @@ class Equations(gym.Env[Array, Array]):
                 often = f" So did {self.lost[key]} episodes." if self.lost[key] > 1 else ""
                 ends = "the episode ends there, as a violation."
                 warn(f"{self.fault}, {when}: {ends}{often}", NonFiniteWarning)
-        if not lost:
-            self.state = reached
+        self.state = self.state if lost else x
         self.time += self.dt
         info = {"state": self.state.copy(), **({"violation": True} if lost else {})}
         return self.C @ self.state, 0.0, lost, False, info
-
-    def _advance(self, u: Array) -> Array:
-        x = self.state
-        h = self.dt / self.substeps
-        for _ in range(self.substeps):
-            k1 = self.slope(x, u)
-            k2 = self.slope(x + h / 2 * k1, u)
-            k3 = self.slope(x + h / 2 * k2, u)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.slope(x + h * k3, u))
-        return x
 
     def slope(self, x: Array, u: Array) -> Array:
         """Return dx/dt; `fault` says where it was not finite first."""

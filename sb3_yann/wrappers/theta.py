@@ -33,12 +33,11 @@ def require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:
 
 
 class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
-    """Appends a vector between ``low`` and ``high`` to the observation.
+    """Appends a vector between ``low`` and ``high`` (p,), for each of so many ``rows``.
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
     It is float64 where the env's is. What lies on a bound is shown inside it, where float32 would
-    round it beyond: some laws are zero outside their box. ``low`` and ``high`` (p,) are repeated
-    for each of so many ``rows``. ``appends`` are parts of `ThetaLayout` that it may hold.
+    round it beyond: some laws are zero outside their box. ``appends`` are parts of `ThetaLayout`.
     """
 
     appends: tuple[str, ...] = ()
@@ -69,13 +68,13 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
             )
         free = np.full(n_new, np.inf)
         kind: Any = np.result_type(inner.dtype, np.float32)
-        self.observation_space: Any = spaces.Box(
-            np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(kind),
-            np.concatenate([free, inner.high[n_replaced:], self.high]).astype(kind),
-            dtype=kind,
-        )
         self._rounded = self.low.astype(kind), self.high.astype(kind)
         low, high = self._rounded
+        self.observation_space: Any = spaces.Box(
+            np.concatenate([-free, inner.low[n_replaced:], low]).astype(kind),
+            np.concatenate([free, inner.high[n_replaced:], high]).astype(kind),
+            dtype=kind,
+        )
         self._inside = (
             np.where(low < self.low, np.nextafter(low, np.inf), low),
             np.where(high > self.high, np.nextafter(high, -np.inf), high),
@@ -261,8 +260,8 @@ class SetPoint(Appending):
                 "r is held by SetPoint(env, low, high, schedule=[r])."
             )
         observation, info = self.env.reset(**kwargs)
-        seed = kwargs.get("seed")
-        if seed is not None:  # an env that does not seed its own generator lends none
+        if (seed := kwargs.get("seed")) is not None:
+            # An env that does not seed its own generator lends none.
             seeded = self.unwrapped.np_random_seed == seed
             self._own = None if seeded else seeding.np_random(seed)[0]
         return self._shown(observation, None, info), info
@@ -282,8 +281,7 @@ class SetPoint(Appending):
         low = self.low[:p]
         high = self.high[:p]
         if self.schedule is None:
-            generator = self.np_random if self._own is None else self._own
-            return np.asarray(generator.uniform(low, high))
+            return np.asarray((self._own or self.np_random).uniform(low, high))
         try:
             r = np.atleast_1d(np.array(self.schedule(step), np.float64))
         except IndexError as error:
@@ -378,7 +376,7 @@ class MeasuredDisturbance(Appending):
     def _with_preview(self, given: Array, begins: bool) -> Array:
         """Return d with its preview, (preview + 1) n_loads; the last row stays in an episode."""
         size = self.n_loads
-        rows = len(self.low) // self.n_loads
+        rows = len(self.low) // size
         d = given.reshape(-1, size) if given.ndim == 1 and len(given) % size == 0 else given
         if d.ndim != 2 or d.shape[1] != size or not (rows if begins else 1) <= len(d) <= rows:
             expected = (size,) if rows == 1 else (rows, size)
@@ -401,7 +399,6 @@ def below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
 def _require_known(observer: StateEstimator, measured: MeasuredDisturbance | None) -> None:
     """Raise unless an observer knows which disturbances the env measures, and comes after them."""
     shown = 0 if measured is None else measured.n_loads
-    model = observer.model
     n_known = observer.n_known
     if shown != n_known:
         raise ValueError(
@@ -411,10 +408,11 @@ def _require_known(observer: StateEstimator, measured: MeasuredDisturbance | Non
             "with E of all disturbances, the measured ones first: LinearModel(A, B, dt, E=E, "
             "estimated=[...])."
         )
-    if n_known and model.estimated and model.estimated[0] < n_known:
+    estimated = [*observer.model.estimated]
+    if n_known and estimated and estimated[0] < n_known:
         raise ValueError(
-            f"estimated = {[*model.estimated]}: theta holds the measured disturbances before the "
-            "estimated ones. Sort the columns of E so."
+            f"estimated = {estimated}: theta holds the measured disturbances before the estimated "
+            "ones. Sort the columns of E so."
         )
 
 
@@ -476,11 +474,10 @@ class EstimateState(Appending):
             )
         self.observer = copy.deepcopy(observer)
         model = observer.model
-        known = [*range(observer.n_known)]
-        estimated = [*range(observer.n_known, model.n_disturbances)]
+        known, estimated = np.split(model.d_ss, [observer.n_known])
         # The observer computes with deviations: what counts from where.
-        self.inner = Units(np.concatenate([observer.C @ model.x_ss, model.d_ss[known]]), model.u_ss)
-        self.outer = Units(np.concatenate([model.x_ss, model.d_ss[estimated]]), model.u_ss)
+        self.inner = Units(np.concatenate([observer.C @ model.x_ss, known]), model.u_ss)
+        self.outer = Units(np.concatenate([model.x_ss, estimated]), model.u_ss)
         self.load: Array | None = None
         self.clipped: NDArray[np.intp] = np.zeros(observer.n_estimated, dtype=np.intp)
         self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
