@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -91,6 +92,13 @@ class Trajectories:
         """Observations (steps + 1, n) and actions (steps, m) of each episode."""
         return [*zip(self.observations, self.actions, strict=True)]
 
+    def mapped(
+        self, theta: Callable[[Array], Array], inputs: Callable[[Array], Array]
+    ) -> Trajectories:
+        """Return the same episodes with other observations and actions."""
+        shown = tuple(map(theta, self.observations))
+        return replace(self, observations=shown, actions=tuple(map(inputs, self.actions)))
+
     def padded(self) -> tuple[Array, Array, Array]:
         """Return observations (T + 1, k, n), actions (T, k, m) and own rewards (T, k).
 
@@ -113,8 +121,8 @@ class Trajectories:
         ``far`` (episodes,) counts steps in which an input moves too far.
         """
         assert self.excess is not None
-        finite = [bool(np.all(np.isfinite(each))) for each in self.observations]
-        lost = ~(np.isfinite(self.costs) & np.array(finite, dtype=bool))
+        finite = np.array([np.all(np.isfinite(each)) for each in self.observations], dtype=bool)
+        lost = ~(np.isfinite(self.costs) & finite)
         ended = np.where(self.succeeded, -1, self.terminated)
         return unsafe_columns(self.violations, ended, lost, self.excess, far, self.lengths)
 
@@ -163,13 +171,7 @@ def evaluate(
     >>> bool(evaluate(law, "CSTR-v0", seeds=[0]).costs[0] > 0)
     True
     """
-
-    def check(env: Any) -> None:
-        _require_same_spaces(policy, env)
-        _require_same_inputs(policy, getattr(env, "single_action_space", env.action_space))
-        if not isinstance(env, VectorEnv):
-            _require_state_shown(policy, env)
-
+    check = partial(_require_fit, policy)
     return rollout(as_controller(policy), env, seeds, starts, check=check)
 
 
@@ -190,15 +192,16 @@ def rollout(
     with the first env, and raises if it does not fit.
     """
     seeds = as_seeds(seeds)
-    options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]
-    resets = [*zip(seeds, options, strict=True)]
     pool = plant if isinstance(plant, EnvPool) else EnvPool(plant)
     source = pool.source
     if isinstance(source, str) and (vector_env := vector_env_of(source, len(seeds))) is not None:
         with closing(vector_env):
             check(vector_env)
-            played = _play(controller, _Copies(vector_env, seeds, starts))
+            options = None if starts is None else {"state": starts}
+            played = _play(controller, _Copies([vector_env], seeds, options))
     else:
+        given = [None] * len(seeds) if starts is None else [{"state": each} for each in starts]
+        resets = [*zip(seeds, given, strict=True)]
         most = min(pool.most or len(seeds), len(seeds))
         with pool.acquire(most) as envs:
             for each in envs[:1]:
@@ -251,7 +254,7 @@ def of_episode(controller: Controller, number: int) -> Controller:
 
 
 class _Step(NamedTuple):
-    """What one step of some episodes brings, (r,) each."""
+    """What one step of some episodes brings, (r,) each; a violation may have changed the reward."""
 
     observations: NDArray[Any]
     rewards: Array
@@ -260,7 +263,6 @@ class _Step(NamedTuple):
     violated: NDArray[np.bool_]
     succeeded: NDArray[np.bool_]
     changed: NDArray[np.bool_]
-    """Whether a violation may have changed the reward."""
     penalty: Array
 
 
@@ -293,12 +295,10 @@ class _Envs:
         if self.problem is not None:
             action = action.astype(self.envs[i].action_space.dtype)
         observation, reward, terminated, truncated, info = self._asked(i, self.envs[i].step, action)
-        violated = bool(info.get("violation", False))
-        success = bool(info.get("is_success", False))
-        ends = bool(terminated), bool(truncated)
+        told = bool(info.get("violation", False)), bool(info.get("is_success", False))
         paid = float(info["penalty"]) if "excess" in info else 0.0  # as StageCost tells it
-        told = violated, success, may_change_reward(info), paid
-        return np.array(observation), as_reward(reward), *ends, *told
+        flags = bool(terminated), bool(truncated), *told, may_change_reward(info)
+        return np.array(observation), as_reward(reward), *flags, paid
 
     def _asked(self, i: int, call: Callable[..., Any], *given: Any, **named: Any) -> Any:
         """Call an env; an error says in which episode, and where in it."""
@@ -310,37 +310,27 @@ class _Envs:
             raise
 
 
+@dataclass
 class _Copies:
-    """Copies of an env that step as one array; those that are over begin another, unused."""
+    """Copies in one env that step as one array; those that are over begin another, unused."""
 
+    envs: Sequence[VectorEnv[Any, Any, Any]]
+    seeds: Any
+    options: dict[str, Any] | None
     steps_all = True
-
-    def __init__(
-        self,
-        env: VectorEnv[Any, Any, Any],
-        seeds: Sequence[int],
-        starts: Sequence[ArrayLike] | None,
-    ) -> None:
-        self.envs = [env]
-        self.env = env
-        self.seeds = seeds
-        self.options = None if starts is None else {"state": starts}
 
     def reset(self) -> NDArray[Any]:
         """Return the first observations (k, n)."""
-        shown = self.env.reset(seed=self.seeds, options=self.options)[0]  # type: ignore[arg-type]
-        return np.array(shown)
+        return np.array(self.envs[0].reset(seed=self.seeds, options=self.options)[0])
 
     def step(self, actions: Any, rows: Rows) -> _Step:
         """Step all copies with actions (k, m)."""
-        observations, rewards, terminated, truncated, info = self.env.step(actions)
-        none = np.zeros(len(rows), dtype=bool)
-        violated = np.array(info.get("violation", none), dtype=bool)
-        success = np.array(info.get("is_success", none), dtype=bool)
+        observations, rewards, *ends, info = self.envs[0].step(actions)
+        none = np.zeros(len(rows))
+        told = [info.get(name, none) for name in ("violation", "is_success", "violation")]
         earned = np.array(rewards, dtype=np.float64)
-        ends = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
-        paid = np.zeros(len(rows))
-        return _Step(np.array(observations), earned, *ends, violated, success, violated, paid)
+        flags = (np.array(each, dtype=bool) for each in (*ends, *told))
+        return _Step._make([np.array(observations), earned, *flags, none])
 
 
 def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
@@ -442,6 +432,18 @@ def as_seeds(seeds: Iterable[int]) -> list[int]:
     return [check_int("seeds", each, 0) for each in seeds]
 
 
+def require_repeated(env: str, seed: int, cost: float, again: float) -> None:
+    """Raise ValueError unless an env repeats an MPC's episode: its cost, where that is finite."""
+    if np.isfinite(cost) and not np.isclose(cost, again, rtol=1e-6, atol=0):
+        raise ValueError(
+            f"The MPC played two episodes of {env} from the seed {seed}, at costs of {cost:.6g} "
+            f"and {again:.6g}: {env} does not repeat it. Episodes are compared in pairs: all that "
+            "is random in the env must come from self.np_random, and no wrapper may remember "
+            "earlier episodes, as NormalizeReward does. If it draws from numpy's global "
+            "generator, wrap it in sb3_yann.wrappers.SeededGlobals."
+        )
+
+
 def as_reward(value: Any) -> float:
     """Return a reward as a number, NaN where it is none."""
     try:
@@ -483,16 +485,11 @@ def as_played(name: str, value: Trajectories) -> Trajectories:
     return check_type(name, value, Trajectories, "the Trajectories that evaluate returns")
 
 
-def _require_state_shown(policy: Any, env: gym.Env[Any, Any]) -> None:
-    """Raise if an env does not show a law the state; other policies may take anything."""
-    acts = getattr(policy, "policy", policy)  # a model's
-    owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
-    if isinstance(owner, PiecewiseAffine | OnlineLaw) or hasattr(owner, "observation_given"):
-        require_state_shown(env, getattr(owner, "observation_given", False))
+def _require_fit(policy: Any, env: Any) -> None:
+    """Raise where a model's shapes are not the env's, or a law does not see the state.
 
-
-def _require_same_spaces(policy: Any, env: Any) -> None:
-    """Raise unless a model sees and gives as many numbers as an env shows and takes."""
+    Or where the env takes deviations, and the law's plant has an operating point.
+    """
     for name in ("observation_space", "action_space"):
         own = getattr(getattr(policy, name, None), "shape", None)
         its = getattr(env, f"single_{name}", getattr(env, name)).shape
@@ -501,10 +498,12 @@ def _require_same_spaces(policy: Any, env: Any) -> None:
                 f"The model's {name} has the shape {own}, the env's {its}: the env is of another "
                 "problem, or lacks the model's wrappers."
             )
-
-
-def _require_same_inputs(policy: Any, space: Any) -> None:
-    """Raise if an env takes deviations, and a law has a plant with an operating point."""
+    acts = getattr(policy, "policy", policy)  # a model's
+    owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
+    is_law = isinstance(owner, PiecewiseAffine | OnlineLaw)
+    if isinstance(env, gym.Env) and (is_law or hasattr(owner, "observation_given")):
+        require_state_shown(env, getattr(owner, "observation_given", False))
+    space = getattr(env, "single_action_space", env.action_space)
     model = getattr(policy, "model", None)
     if not isinstance(policy, PiecewiseAffine | OnlineLaw) or not isinstance(model, LinearModel):
         return

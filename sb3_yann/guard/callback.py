@@ -25,8 +25,7 @@ from sb3_yann.guard.decide import GuardSettings, Player, decide, decide_at_end
 from sb3_yann.guard.start import (
     InterruptHandler,
     all_callbacks,
-    check_alone,
-    check_not_nested,
+    check_place,
     check_twin,
     first_evidence,
     still_holds,
@@ -37,7 +36,6 @@ from sb3_yann.guard.state import (
     Decision,
     GuardState,
     Record,
-    relative_change,
     restore_accepted,
     summary_of,
 )
@@ -256,7 +254,7 @@ class ImprovementGuard(BaseCallback):
         return plot_decisions(self.decisions, axes)
 
     def _init_callback(self) -> None:
-        check_not_nested(self)
+        check_place(self)
         policy = require_yann_policy(self.model.policy, "ImprovementGuard")
         if self.twin is not None:
             check_twin(policy, self.twin.problem)
@@ -269,8 +267,7 @@ class ImprovementGuard(BaseCallback):
         self._final: ActorCheckpoint | None = None
 
     def _on_training_start(self) -> None:
-        check_not_nested(self)
-        check_alone(self)
+        check_place(self)
         require_same_statistics(self.model)
         warn_of_place(self, sys._getframe())
         warn_of_rare_trials(self.model, self.settings.eval_freq)
@@ -302,7 +299,7 @@ class ImprovementGuard(BaseCallback):
                 state.episodes = known.episodes
             self.model.guard_state = state  # type: ignore[attr-defined]
             leading.restore(player.policy)
-        self._handler = InterruptHandler.install(self.model, self._leave_accepted, sys._getframe())
+        self._handler = InterruptHandler(self.model, self._leave_accepted, sys._getframe())
         player.policy.actor_step = self.state.step
         player.policy.guarded = True
         self._has_begun = True
@@ -381,8 +378,7 @@ class ImprovementGuard(BaseCallback):
         state.decisions.append(decision)
         names = ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step")
         shown = {name: getattr(decision, name) for name in names}
-        for who in ("candidate", "accepted"):
-            change = relative_change(shown[f"{who}_cost"], decision.mpc_cost)
+        for who, change in zip(("candidate", "accepted"), decision.changes, strict=True):
             shown[f"{who}_change_percent"] = 100 * change
         for name, value in shown.items():
             if math.isfinite(value):  # that of a candidate that could not be played is not

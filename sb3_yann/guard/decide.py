@@ -112,7 +112,7 @@ def decide(
                 break  # a smaller part gains less
     after = replace(after, rejections=0 if restored else rejections)
     regions = _accepted_regions(before, candidate, after.accepted) if reason else []
-    return after, _decision(after, tried.cost, tried.played, reason, restored, regions, share)
+    return after, _decision(after, tried.mean, reason, restored, regions, share)
 
 
 def decide_at_end(
@@ -140,8 +140,7 @@ def decide_at_end(
     if scores is not None and verdict.accepted:
         return replace(evidence, confirmed=(trial.starts, scores)), None
 
-    cost = evidence.mean_cost(evidence.scores)
-    played = evidence.n_played(evidence.scores)
+    mean = evidence.mean_of(evidence.scores)
     after = evidence.without_passed(tried)
     if not is_known_to_lose:
         after, _ = _with_hard_starts(after, trial.starts, scores)
@@ -151,7 +150,7 @@ def decide_at_end(
     for policy in (*parts, *reversed(mpc.passed)):
         known, its_scores, found = try_on_known(mpc, policy, play, settings)
         if its_scores is not None and found.accepted:
-            others.append((known.mean_cost(its_scores), known.with_visited(policy, its_scores)))
+            others.append((known.mean_of(its_scores)[0], known.with_visited(policy, its_scores)))
     others.sort(key=lambda each: each[0])
     for number, (_, other) in enumerate(others, start=2):
         part, found = _on_all_known(other, play)
@@ -165,7 +164,7 @@ def decide_at_end(
     after = replace(after, next_seed=seeds.next)
     regions = _accepted_regions(evidence.mpc, tried, after.accepted)
     reason = f"at the end, {verdict.reason}; {_what_acts(after, tried)}"
-    return after, _decision(after, cost, played, reason, True, regions)
+    return after, _decision(after, mean, reason, True, regions)
 
 
 def _on_all_known(evidence: Evidence, play: Play) -> tuple[Evidence, Verdict]:
@@ -179,9 +178,8 @@ def _on_all_known(evidence: Evidence, play: Play) -> tuple[Evidence, Verdict]:
         evidence = evidence.known_up_to(len(starts.seeds), play)
     except Unplayable as error:
         return evidence, Verdict(str(error), breaks_limit=True)
-    scores = evidence.scores
     return evidence, no_worse(
-        scores, mpc, mpc, starts.tolerance, names=starts.seeds, n_hard=starts.n_hard
+        evidence.scores, mpc, mpc, starts.tolerance, names=starts.seeds, n_hard=starts.n_hard
     )
 
 
@@ -192,9 +190,8 @@ def try_before_training(
     evidence, scores, verdict = try_on_known(evidence, candidate, play, settings)
     if scores is not None and verdict.accepted:
         return evidence.with_visited(candidate, scores), None
-    cost = evidence.mean_cost(scores)
-    played = evidence.n_played(scores)
-    return evidence, _decision(evidence, cost, played, f"before training, {verdict.reason}", True)
+    reason = f"before training, {verdict.reason}"
+    return evidence, _decision(evidence, evidence.mean_of(scores), reason, True)
 
 
 def try_on_known(
@@ -230,15 +227,14 @@ def try_on_known(
 
 
 class _Tried(NamedTuple):
-    """What came of a candidate: its mean cost over the known starts that it has played.
+    """What came of a candidate: its mean cost, over how many known starts.
 
     Then its scores there and on new starts, and those that it was compared with.
     """
 
     evidence: Evidence
     verdict: Verdict
-    cost: float
-    played: int
+    mean: tuple[float, int]
     scores: Scores | None = None
     others: Scores | None = None
 
@@ -248,28 +244,28 @@ def _accept(
 ) -> _Tried:
     """Accept a candidate that is no worse on the known starts, and confirmed on new ones."""
     evidence, scores, verdict = try_on_known(evidence, candidate, play, settings)
-    cost = evidence.mean_cost(scores)
-    played = evidence.n_played(scores)
+    tried = _Tried(evidence, verdict, evidence.mean_of(scores))
     if scores is None:
-        return _Tried(evidence, verdict, cost, played)
+        return tried
     others = evidence.scores.at(slice(len(scores.costs)))
+    tried = tried._replace(scores=scores, others=others)
     if not verdict.accepted:
-        return _Tried(evidence, verdict, cost, played, scores, others)
+        return tried
     after = evidence.with_visited(candidate, scores)
     if settings.n_new_starts == 0 or not after.accepted.has_learned():
-        return _Tried(after, verdict, cost, played, scores, others)
+        return tried._replace(evidence=after)
     seeds = NewSeeds(evidence.next_seed)
     trial = _new_trial(evidence, play, seeds)
     new, verdict = _confirm(trial, after.accepted, settings)
     if verdict.accepted:
         after = replace(after, next_seed=seeds.next, new=trial.starts)
-        return _Tried(after.with_passed(after.accepted), verdict, cost, played, scores, others)
+        return tried._replace(evidence=after.with_passed(after.accepted), verdict=verdict)
     if new is not None:
         scores = scores.extended_by(new)
         others = others.extended_by(trial.mpc_scores)
     evidence = replace(evidence, next_seed=seeds.next)
     after = _after_loss(evidence, trial.starts, new, play)
-    return _Tried(after, verdict, cost, played, scores, others)
+    return _Tried(after, verdict, tried.mean, scores, others)
 
 
 def _new_trial(
@@ -298,22 +294,20 @@ def _confirm(
     large enough, but for a strict rule.
     """
     rule = settings.rule
-    at_end = significance is not None
-    strict = not rule.cvar_alpha
+    strict = significance is not None and not rule.cvar_alpha
+    level = INTERIM_LEVEL
     counts = looks(FIRST_STARTS, settings.n_new_starts)
-    if at_end:
+    demands: dict[str, Any] = {}
+    if significance is not None:
         counts = looks(FIRST_FINAL_LOOK, settings.n_final_starts)
+        demands = {"least_gain": settings.least_gain, "tail_errors": rule.standard_errors}
+        demands["must_gain"] = not strict
     verdict = Verdict()
     try:
         for look in trial.stages(policy, counts):
-            verdict = trial.verdict(
-                INTERIM_LEVEL if significance is None else level_of_look(significance, look),
-                least_gain=settings.least_gain if at_end else 0.0,
-                must_gain=at_end and not strict,
-                tail_errors=rule.standard_errors if at_end else 0.0,
-            )
-            sure = verdict.is_sure and not (at_end and strict)
-            if verdict.is_hopeless or (verdict.accepted and sure):
+            level = level if significance is None else level_of_look(significance, look)
+            verdict = trial.verdict(level, **demands)
+            if verdict.is_hopeless or (verdict.accepted and verdict.is_sure and not strict):
                 break
     except Unplayable as error:
         return None, Verdict(f"on new starts, {error}")
@@ -386,8 +380,7 @@ def _parts(
 
 def _decision(
     evidence: Evidence,
-    candidate_cost: float,
-    played: int,
+    of_candidate: tuple[float, int],
     reason: str,
     restored: bool,
     regions: Sequence[int] = (),
@@ -399,14 +392,16 @@ def _decision(
     if reason:
         verdict = "accepted in part" if regions or share else "rejected"
     more = (costs - starts.mpc.costs[: len(costs)])[starts.n_hard :]
+    of_accepted = evidence.mean_of(evidence.scores)
+    of_mpc = evidence.mean_of(starts.mpc)
     return Decision(
         verdict=verdict,
         reason=reason,
         restored=restored,
-        candidate_cost=candidate_cost,
-        accepted_cost=evidence.mean_cost(evidence.scores),
-        mpc_cost=evidence.mean_cost(starts.mpc),
-        played=(played, evidence.n_played(evidence.scores), evidence.n_played(starts.mpc)),
+        candidate_cost=of_candidate[0],
+        accepted_cost=of_accepted[0],
+        mpc_cost=of_mpc[0],
+        played=(of_candidate[1], of_accepted[1], of_mpc[1]),
         worst_start=float(np.max(more, initial=-np.inf)),
         regions=tuple(regions),
         share=share,
@@ -418,7 +413,7 @@ def _accepted_regions(
 ) -> list[int]:
     """Return the regions in which the accepted networks are new, and the candidate's."""
     new = before.changed_networks(accepted) & ~candidate.changed_networks(accepted)
-    return [int(region) for region in np.flatnonzero(new)]
+    return list(map(int, np.flatnonzero(new)))
 
 
 def _what_acts(evidence: Evidence, tried: ActorCheckpoint) -> str:
@@ -486,17 +481,15 @@ class Player:
 
     def scores(self, played: Trajectories) -> Scores:
         """Return what the episodes cost and break, and the regions that they come through."""
-        policy = self.policy
         layer = self.policy.actor.mu
-        thetas = [self.theta(each) for each in played.observations]
-        inputs = [policy.inputs(each) for each in played.actions]
-        excess = excess_of_episodes(policy.problem, zip(thetas, inputs, strict=True))
+        own = played.mapped(self.theta, self.policy.inputs)
+        excess = excess_of_episodes(self.policy.problem, own.pairs)
         far: Any = 0
         if self.max_input_step is not None:
             moved = [np.abs(np.diff(each, axis=0)) for each in played.actions]
             far = [np.any(each > self.max_input_step, axis=1).sum() for each in moved]
         visits = np.zeros((len(played.costs), layer.n_networks), dtype=bool)
-        for visited, theta in zip(visits, thetas, strict=True):
+        for visited, theta in zip(visits, own.observations, strict=True):
             visited[layer.regions(th.as_tensor(theta[:-1]))] = True
         unsafe = replace(played, excess=excess).unsafe(far)
         return Scores(played.costs + excess.penalty, unsafe, visits)

@@ -24,7 +24,7 @@ from sb3_yann.guard.decide import GuardSettings, Player, Unplayable, try_before_
 from sb3_yann.guard.state import Decision, Evidence, GuardState
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import StartsAsMPC, require_problem_of_twin
-from sb3_yann.rollout import Trajectories, preserve_rng
+from sb3_yann.rollout import Trajectories, preserve_rng, require_repeated
 
 REPEATED = 2  # starts from which the MPC plays twice: a simulator repeats itself
 OTHER_REWARD = 0.01  # of the mean cost: a reward that differs by more is another one
@@ -80,25 +80,18 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
     """
     name = settings.env
     mpc = player.episodes(player.mpc, seeds)
-    for seed, cost in zip(seeds, mpc.costs, strict=True):
-        if not np.isfinite(cost):
-            raise ValueError(
-                f"The MPC's episode of the guard's env {name} from the seed {seed} costs {cost:g}. "
-                "Policies are compared by their costs: rewards must be finite numbers."
-            )
+    for i in np.flatnonzero(~np.isfinite(mpc.costs))[:1]:
+        raise ValueError(
+            f"The MPC's episode of the guard's env {name} from the seed {seeds[i]} costs "
+            f"{mpc.costs[i]:g}. Policies are compared by their costs: rewards must be finite "
+            "numbers."
+        )
     with preserve_rng():  # an env that draws from these would else repeat itself by accident
         random.random()
         np.random.random()  # noqa: NPY002
         again = player.episodes(player.mpc, seeds[:REPEATED])
     for seed, first, second in zip(seeds[:REPEATED], mpc.costs, again.costs, strict=False):
-        if not np.isclose(first, second, rtol=1e-6, atol=0):
-            raise ValueError(
-                f"The MPC played two episodes of the guard's env {name} from the seed {seed}, "
-                f"at costs of {first:g} and {second:g}. Episodes are compared in pairs: all that "
-                "is random in the env must come from self.np_random, and no wrapper may remember "
-                "earlier episodes, as NormalizeReward does. If it draws from numpy's global "
-                "generator, wrap it in sb3_yann.wrappers.SeededGlobals."
-            )
+        require_repeated(f"the guard's env {name}", seed, first, second)
     first = mpc.observations[0][0]
     alike = all(np.array_equal(each[0], first) for each in mpc.observations)
     if len(seeds) > 1 and alike and np.allclose(mpc.costs, mpc.costs[0], rtol=1e-6, atol=0):
@@ -136,19 +129,15 @@ def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories)
     Note whether it pays the problem's cost.
     """
     policy = player.policy
-    thetas = [player.theta(each) for each in mpc.observations]
-    inputs = [policy.inputs(each) for each in mpc.actions]
-    before = np.concatenate([each[:-1] for each in thetas])
-    after = np.concatenate([each[1:] for each in thetas])
-    warn_of_order(policy.problem, before, np.concatenate(inputs), after)
-    warn_of_box(policy.problem, np.array([each[0] for each in thetas]))
+    own = mpc.mapped(player.theta, policy.inputs)
+    warn_of_order(policy.problem, *own.steps())
+    thetas, inputs, rewards = own.padded()
+    warn_of_box(policy.problem, thetas[0])
     options = policy.critic_options
-    rewards = np.concatenate(mpc.own_rewards)
-    cost = policy.problem.deviations.stage_cost(before, np.concatenate(inputs))
-    error = np.abs(options.reward_scale * cost + rewards - options.reward_offset)
-    error = error[np.isfinite(error)]  # steps that violate may cost more
-    error = error if len(error) else np.zeros(1)
-    player.pays_cost = not np.mean(error) > OTHER_REWARD * options.reward_scale * np.mean(cost)
+    cost = options.reward_scale * policy.problem.deviations.stage_cost(thetas[:-1], inputs)
+    known = np.isfinite(rewards)  # steps that violate may cost more
+    error = np.abs(cost + rewards - options.reward_offset)[known]
+    player.pays_cost = not (known.any() and np.mean(error) > OTHER_REWARD * np.mean(cost[known]))
     with preserve_rng(), player.envs.acquire(1) as (env,):
         maps = {"theta": player.theta, "inputs": policy.inputs}
         player.steps += warn_of_signs(policy.problem, env, seeds, mpc, **maps)
@@ -173,10 +162,11 @@ def still_holds(evidence: Evidence, player: Player) -> bool:
     )
 
 
-def check_not_nested(guard: BaseCallback) -> None:
-    """Raise ValueError if a callback is within one that does not tell it of the end."""
+def check_place(guard: BaseCallback) -> None:
+    """Raise ValueError if a guard is not alone, or within what does not tell it of the end."""
     event = guard.parent if isinstance(guard.parent, EventCallback) else None
-    for each in all_callbacks(guard.locals.get("callback")):
+    callbacks = all_callbacks(guard.locals.get("callback"))
+    for each in callbacks:
         if isinstance(each, EventCallback) and guard in all_callbacks(each)[1:]:
             event = each
     if event is not None:
@@ -185,11 +175,6 @@ def check_not_nested(guard: BaseCallback) -> None:
             "tell it of each step and of the end: the final model might not be an accepted one. "
             "Pass the guard to learn itself; eval_freq=... makes trials rarer."
         )
-
-
-def check_alone(guard: BaseCallback) -> None:
-    """Raise ValueError if another guard is among what was passed to learn."""
-    callbacks = all_callbacks(guard.locals.get("callback"))
     count = sum(isinstance(each, type(guard)) for each in callbacks)
     if count > 1:
         raise ValueError(
@@ -253,29 +238,20 @@ class InterruptHandler:
     another exception has ended `learn`, it only passes on.
     """
 
-    def __init__(self, model: BaseAlgorithm, restore: Callable[[], None], before: Any) -> None:
-        self.before = before
-        self.run = model.start_time
-        self.model = weakref.ref(model)
-        self.restore = weakref.WeakMethod(restore, lambda _: self.remove())
-
-    @classmethod
-    def install(
-        cls, model: BaseAlgorithm, restore: Callable[[], None], frame: FrameType
-    ) -> InterruptHandler | None:
-        """Return the handler for a `learn` that begins; None where there can or need be none.
+    def __init__(self, model: BaseAlgorithm, restore: Callable[[], None], frame: FrameType) -> None:
+        """Take effect for a `learn` that begins, unless there can or need be no handler.
 
         ``restore`` is a bound method, held weakly; ``frame`` is the caller's. Handlers of runs
         that are over are passed by.
         """
-        before: Any = signal.getsignal(signal.SIGINT)
-        while isinstance(before, InterruptHandler) and not before.is_needed(frame):
-            before = before.before
-        if threading.current_thread() is not threading.main_thread() or not callable(before):
-            return None
-        handler = cls(model, restore, before)
-        signal.signal(signal.SIGINT, handler)
-        return handler
+        self.run = model.start_time
+        self.model = weakref.ref(model)
+        self.restore = weakref.WeakMethod(restore, lambda _: self.remove())
+        self.before: Any = signal.getsignal(signal.SIGINT)
+        while isinstance(self.before, InterruptHandler) and not self.before.is_needed(frame):
+            self.before = self.before.before
+        if threading.current_thread() is threading.main_thread() and callable(self.before):
+            signal.signal(signal.SIGINT, self)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Handle the signal."""

@@ -35,13 +35,13 @@ class Evidence:
     """What a candidate is compared with.
 
     ``accepted`` is the policy accepted last, ``mpc`` has the weights that it goes on to learn from.
-    ``scores`` are the accepted policy's on as many of the known ``starts`` as it has played, of
-    which hard ones come first. ``passed`` are accepted checkpoints that new starts have confirmed,
-    the latest last; ``rejections`` come in a row. ``confirmed`` are the final starts that the
-    accepted policy has passed, and its scores there. Policies are confirmed on ``new`` starts until
-    one loses there; the next one has the seed ``next_seed``. ``reference`` are the costs on all
-    known starts but the hard ones of the last accepted policy that has played them, else the MPC's.
-    The last policy that was tried on known starts ``lost`` some, of these seeds.
+    ``scores`` are the accepted policy's on as many of the known ``starts`` as it has played.
+    ``passed`` are accepted checkpoints that new starts have confirmed, the latest last;
+    ``rejections`` come in a row. ``confirmed`` are the final starts that the accepted policy has
+    passed, and its scores there. Policies are confirmed on ``new`` starts until one loses there;
+    the next one has the seed ``next_seed``. ``reference`` are the costs on all known starts but the
+    hard ones of the last accepted policy that has played them, else the MPC's. The last policy that
+    was tried on known starts ``lost`` those of these seeds.
     """
 
     accepted: ActorCheckpoint
@@ -61,27 +61,25 @@ class Evidence:
         """Seeds of starts that policies have lost: the hard ones, and those of the last one."""
         return tuple(dict.fromkeys((*self.starts.seeds[: self.starts.n_hard], *self.lost)))
 
-    def mean_cost(self, scores: Scores | None) -> float:
-        """Return a policy's mean cost over all known starts but the hard ones; nan without scores.
+    def mean_of(self, scores: Scores | None) -> tuple[float, int]:
+        """Return a policy's mean cost over all known starts but the hard ones, nan without scores.
 
-        From those that it has played: what the accepted policy costs on all, or the reference,
-        times what it costs of that there.
+        From those that it has played, whose number follows: what the accepted policy costs on all,
+        or the reference, times what it costs of that there.
         """
-        if scores is None or len(scores.costs) <= self.starts.n_hard:
-            return math.nan
-        mpc = self.starts.mpc.costs[self.starts.n_hard :]
-        known = self.scores.costs[self.starts.n_hard :]
-        if len(known) < len(mpc):
-            known = mpc if self.reference is None else self.reference
-        costs = scores.costs[self.starts.n_hard :]
+        usual = slice(self.starts.n_hard, None)
+        costs = np.empty(0) if scores is None else scores.costs[usual]
+        if not len(costs):
+            return math.nan, 0
+        known = self.scores.costs[usual]
+        if len(known) < len(self.starts.mpc.costs[usual]):
+            known = self.starts.mpc.costs[usual] if self.reference is None else self.reference
         own = known[: len(costs)]
-        if len(costs) == len(known) or not np.abs(own).sum():
-            return float(costs.mean())
-        return float(known.mean() + (costs - own).sum() / np.abs(own).sum() * np.abs(known).mean())
-
-    def n_played(self, scores: Scores | None) -> int:
-        """Return on how many known starts but the hard ones a policy has played."""
-        return 0 if scores is None else max(0, len(scores.costs) - self.starts.n_hard)
+        size = np.abs(own).sum()
+        if len(costs) == len(known) or not size:
+            return float(costs.mean()), len(costs)
+        mean = known.mean() + (costs - own).sum() / size * np.abs(known).mean()
+        return float(mean), len(costs)
 
     def known_up_to(self, count: int, play: Play) -> Evidence:
         """Return the evidence with the accepted policy's scores on so many starts at least."""
@@ -100,10 +98,10 @@ class Evidence:
         changed = self.accepted.changed_regions(candidate)
         if self.accepted.is_confined_as(candidate) and np.any(changed & ~visited):
             candidate = self.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
-        known = self.n_played(scores) == self.n_played(self.starts.mpc)
-        reference = scores.costs[self.starts.n_hard :] if known else self.reference
-        found = replace(self, accepted=candidate, scores=scores, reference=reference)
-        return replace(found, confirmed=None)
+        found = replace(self, accepted=candidate, scores=scores, confirmed=None)
+        if len(scores.costs) < len(self.starts.seeds):
+            return found
+        return replace(found, reference=scores.costs[self.starts.n_hard :])
 
     def earlier(self) -> Iterator[tuple[ActorCheckpoint, Scores]]:
         """Yield the accepted policy and earlier ones, the latest first, with their known scores."""
@@ -187,13 +185,19 @@ class Decision:
         shown = ", ".join(f"{who} {cost}" for who, cost in costs)
         return f"Episode {self.episode}: {self.verdict}{reason}; means of all starts: {shown}"
 
+    @property
+    def changes(self) -> tuple[float, float]:
+        """How much more the candidate and the accepted policy cost than the MPC, relative to it."""
+        size = abs(self.mpc_cost) or math.nan
+        more = self.candidate_cost - self.mpc_cost, self.accepted_cost - self.mpc_cost
+        return more[0] / size, more[1] / size
+
     def costs_in_words(self) -> list[str]:
         """Return the three costs; of how many starts where that is not all."""
         found = list[str]()
         costs = self.candidate_cost, self.accepted_cost, self.mpc_cost
-        for cost, played in zip(costs, self.played, strict=True):
-            change = relative_change(cost, self.mpc_cost)
-            details = [f"{100 * change:+.3g} %"] * (len(found) < 2 and math.isfinite(change))
+        for cost, played, change in zip(costs, self.played, (*self.changes, math.nan), strict=True):
+            details = [f"{100 * change:+.3g} %"] * math.isfinite(change)
             if 0 < played < self.played[-1]:
                 details.append(f"estimated from {played} of {self.played[-1]} starts")
             number = f"{cost:.6g}" if math.isfinite(cost) else "not known"
@@ -201,18 +205,13 @@ class Decision:
         return found
 
 
-def relative_change(cost: float, mpc_cost: float) -> float:
-    """Return how much more than the MPC's a cost is, relative to it; nan if the MPC's is 0."""
-    return (cost - mpc_cost) / abs(mpc_cost) if mpc_cost else math.nan
-
-
 @dataclass
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
 
-    ``settings`` are what the evidence depends on. Inputs may move by ``max_input_step`` (m,) from
-    one sample to the next. ``step`` is the factor of the actor's learning rate; ``episodes`` of
-    training are over, and so many were when the last candidate was tried. ``steps`` were simulated.
+    ``settings`` are what the evidence depends on, ``max_input_step`` (m,) and ``steps`` the
+    `Player`'s. ``step`` is the factor of the actor's learning rate; ``episodes`` of training are
+    over, and so many were when the last candidate was tried.
     """
 
     settings: dict[str, Any]
@@ -287,9 +286,8 @@ class Record:
                 return
             self.failed = True
             warn(
-                f"The guard's record {self.path} could not be written ({error}). Training goes on, "
-                "and guard.decisions has all decisions; the record is completed once there is "
-                "room.",
+                f"The guard's record {self.path} could not be written ({error}). Training goes on; "
+                "guard.decisions has all decisions, and the record is completed once there is room."
             )
 
 
@@ -329,11 +327,10 @@ def summary_of(state: GuardState, policy: StartsAsMPC, eval_freq: int = 1) -> st
     rows = paired_rows(ours.costs, mpc.costs)
     rows["change"] += " from the final starts" * (evidence.confirmed is not None)
     gains = bool(ours.costs.mean() < mpc.costs.mean() - 1e-3 * abs(mpc.costs.mean()))
-    verdict = "The policy accepted last is better than the MPC."
+    what = "better than the MPC" if gains else "not the MPC, and gains nothing"
     if state.accepted.has_networks_of(evidence.mpc):
-        verdict = "The policy accepted last is the MPC."
-    elif not gains:
-        verdict = "The policy accepted last is not the MPC, and gains nothing."
+        what = "the MPC"
+    verdict = f"The policy accepted last is {what}."
     if not state.accepted.is_actor_of(policy):
         verdict += (
             " The model's policy is another one, which no guard has accepted: "

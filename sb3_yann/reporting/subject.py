@@ -317,11 +317,7 @@ class Subject:
         seeds = self.seeds[: None if states is None else len(states)]
         for name, act in {OF_MPC: self.act_as_mpc, OF_POLICY: self.act_as_policy}.items():
             played = rollout(_as_controller(act), self.env, seeds, states)
-            played = replace(
-                played,
-                observations=tuple(map(self._theta, played.observations)),
-                actions=tuple(map(self.policy.inputs, played.actions)),
-            )
+            played = played.mapped(self._theta, self.policy.inputs)
             found[name] = replace(played, excess=excess_of_episodes(self.problem, played.pairs))
         if not is_rewarded(found):
             for name, played in found.items():
@@ -334,11 +330,7 @@ class Subject:
         """The same loops in plant units."""
         units = self.problem.units
         return {
-            name: replace(
-                each,
-                observations=tuple(map(units.to_plant, each.observations)),
-                actions=tuple(map(units.input_to_plant, each.actions)),
-            )
+            name: each.mapped(units.to_plant, units.input_to_plant)
             for name, each in (self.loops or {}).items()
         }
 
