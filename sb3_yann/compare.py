@@ -29,12 +29,12 @@ UNSAFE = (
 ENDED = 1
 INPUT_STEP = 3
 LARGEST_EXCESS = 4
+SUMMED_EXCESS = 5
 ANY_BOUND = 6
 MISSING = 7
 WORST = 8
 """Columns: how an episode ends; steps in which an input moves too far; the excess over hard bounds,
 and over soft ones too; minus the number of steps; which bound is exceeded most."""
-SUCCESS_HINT = 'where an end is a success, the env says so by info["is_success"]'
 EXCESS_ROOM = 1e-3  # half-widths of a bound by which an excess may be larger: less is noise
 EXCESS_SHARE = 0.1
 """Share of the MPC's own excess by which it may be larger: an MPC that rides a bound is no veto."""
@@ -132,9 +132,8 @@ class Verdict(NamedTuple):
 
     The reason is empty where it is accepted. ``breaks_limit``: it violates a limit of the env, or
     ends sooner, where the policy before does not, or is not finite: then there is no patience.
-    ``above_mpc``: its mean cost is above the MPC's, or its excess over a bound. ``is_sure``: its
-    mean cost is surely lower, at the level that was asked for. ``is_hopeless``: more starts would
-    hardly show a gain that counts.
+    ``above_mpc``: its mean cost is, or its excess over a bound. ``is_sure``: its mean cost is
+    surely lower, at a level. ``is_hopeless``: more starts would hardly show a gain that counts.
     """
 
     reason: str = ""
@@ -153,8 +152,7 @@ class Scores(NamedTuple):
     """What a policy's episodes cost and break, in the order of their seeds.
 
     ``costs`` (episodes,) hold the penalty of soft bounds, ``unsafe`` (episodes, 9) is that of
-    :func:`unsafe_columns`, and ``visits`` (episodes, regions) says which regions the episodes come
-    through: other networks have no effect on them.
+    :func:`unsafe_columns`, ``visits`` (episodes, regions) which regions the episodes come through.
     """
 
     costs: Array
@@ -177,9 +175,8 @@ class Tolerance:
     ``margin`` is in units of cost: what a start may cost more; with a CVaR, what the worst of them
     may on average, the share ``cvar_alpha``. Then a start that costs the MPC more than ``typical``,
     its median cost, may cost more in proportion, and so may all where the policy has ``saved`` more
-    than that on average; none may cost ``worst_start`` times as much as the average may.
-    ``excess_room`` is by how many half-widths an excess over the ``bounds`` may
-    be larger.
+    than that on average; none may cost ``worst_start`` times as much as the average may. An excess
+    over the ``bounds`` may be larger by ``excess_room`` half-widths.
     """
 
     margin: float
@@ -191,15 +188,14 @@ class Tolerance:
     saved: float = 0.0
 
     def exceeded(self, policy: Scores, episode: int, mpc: Scores | None = None) -> str:
-        """Return which bound an episode exceeds most, and by how much; empty where none is.
+        """Return which bound an episode exceeds most, a hard one if there is one, and by how much.
 
-        It is a hard one, if one is exceeded. With the MPC's scores it is empty where the MPC
-        exceeds a bound by as much.
+        It is empty where none is, or the MPC of these scores exceeds a bound by as much.
         """
         row = policy.unsafe[episode]
-        if mpc is not None:
-            if row[ANY_BOUND] <= allowed_excess(mpc.unsafe[episode, ANY_BOUND], self.excess_room):
-                return ""
+        its = -np.inf if mpc is None else mpc.unsafe[episode, ANY_BOUND]
+        if row[ANY_BOUND] <= allowed_excess(its, self.excess_room):
+            return ""
         return self.bounds.in_words(row[WORST], row[LARGEST_EXCESS] or row[ANY_BOUND])
 
     def allowed(self, mpc_costs: ArrayLike) -> Array:
@@ -211,10 +207,7 @@ class Tolerance:
         return np.asarray(np.maximum(margin, COST_ROUNDING * np.abs(mpc_costs)))
 
     def excess(self, mpc_costs: Array, costs: Array) -> Array:
-        """Return what each start costs more than with the MPC, in units of what it may.
-
-        A cost that is not a number is inf.
-        """
+        """Return what each start costs more than the MPC, in units of what it may; inf for NaN."""
         with np.errstate(divide="ignore", invalid="ignore"):
             more = (costs - mpc_costs) / self.allowed(mpc_costs)
         more = np.where(costs <= mpc_costs, np.fmin(more, 0.0), more)  # also without any margin
@@ -227,12 +220,11 @@ class Tolerance:
         here would be, in one of ten cases at most, among starts of which fewer do.
         """
         count = np.count_nonzero(excess > 1.0)
-        if not self.cvar_alpha or count == 0:
-            return not self.cvar_alpha
-        return bool(special.bdtrc(count - 1, len(excess), self.cvar_alpha) <= 0.1)
+        chance = special.bdtrc(count - 1, len(excess), self.cvar_alpha)
+        return not self.cvar_alpha or bool(chance <= 0.1)
 
     def objection(self, excess: Array, standard_errors: float = 0.0) -> str:
-        """Return what speaks against such an excess over the MPC (starts,), empty for nothing.
+        """Return what speaks against an excess over the MPC (starts,), empty for nothing.
 
         So many ``standard_errors`` of the tail's average count as well.
         """
@@ -269,8 +261,8 @@ class Difference(NamedTuple):
     def of(cls, differences: Array, in_turns: bool = False) -> Difference:
         """Return that of differences.
 
-        Pairs that were played ``in_turns`` on a plant, in an order that was drawn for each, may be
-        correlated: they are in the order in which they were played, and the error is widened.
+        Pairs that were played ``in_turns``, in an order that was drawn for each, may be correlated:
+        they are in the order in which they were played, and the error is widened.
         """
         n = len(differences)
         mean = float(differences.mean()) if n else np.nan
@@ -367,43 +359,37 @@ def no_worse(
     gain = Difference.of(relative_costs(costs - before, of_mpc))
     is_sure = gain.is_below_zero(level)
     hopeless = gain.is_hopeless(least_gain) and mean_change(costs - before, of_mpc) > -least_gain
-    reason = ""
+    reason = words = ""
     if less.any():
         column = int(np.argmax(less.any(axis=0)))
         which = np.flatnonzero(less[:, column])
-        words = tolerance.exceeded(policy, int(which[0]))
         reason = f"{len(which)} of {len(less)} starts with {UNSAFE[column]}, the first is "
         reason += f"start {names[which[0]]}"
         if column == ENDED:
-            reason = f"{reason}; {SUCCESS_HINT}"
-        elif column != INPUT_STEP and words:
-            reason = f"{reason}: {words}"
+            words = 'where an end is a success, the env says so by info["is_success"]'
+        elif column != INPUT_STEP:
+            words = tolerance.exceeded(policy, int(which[0]))
         hopeless = True
     elif costly := tolerance.objection(excess, tail_errors):
         worst = int(np.argmax(excess))
-        more = policy.costs[worst] - mpc.costs[worst]
-        share = 100 * mean_change(more, of_mpc)
+        share = 100 * mean_change(policy.costs[worst] - mpc.costs[worst], of_mpc)
         reason = f"{costly} costs {share:.3g} % of the mean cost more than with the MPC"
         reason = reason.replace(f"start {worst} ", f"start {names[worst]} ")
-        if words := tolerance.exceeded(policy, worst, mpc):
-            reason = f"{reason}: {words}"
+        words = tolerance.exceeded(policy, worst, mpc)
         hopeless |= not np.isfinite(excess[worst]) or tolerance.is_tail_lost(excess[n_hard:])
-    elif is_above(costs, before) and before is not of_mpc:
-        mean, other = format_distinct(costs.mean(), before.mean())
-        reason = f"mean cost {mean} from {len(costs)} starts, accepted {other}"
-    elif above:  # or by as much as rounding in many acceptances adds up to
-        mean, other = format_distinct(costs.mean(), of_mpc.mean())
-        reason = f"mean cost {mean} from {len(costs)} starts, MPC {other}"
+    elif above or is_above(costs, before):  # or by what rounding in many acceptances adds up to
+        beaten = before is not of_mpc and is_above(costs, before)
+        whose, other = ("accepted", before) if beaten else ("MPC", of_mpc)
+        mean, its = format_distinct(costs.mean(), other.mean())
+        reason = f"mean cost {mean} from {len(costs)} starts, {whose} {its}"
+    reason += f": {words}" * bool(words)
     above |= bool(less[:, LARGEST_EXCESS:].any())
     return Verdict(reason, breaks, above, is_sure, hopeless)
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Seeded starts, and what came of the MPC there.
-
-    The first ``n_hard`` are starts that a policy has lost.
-    """
+    """Seeded starts, and what came of the MPC there. A policy has lost the first ``n_hard``."""
 
     seeds: tuple[int, ...]
     mpc: Scores
@@ -446,6 +432,7 @@ class NewSeeds:
         return range(first, self.next)
 
 
+@dataclass
 class PairedTrial:
     """Policies beside the MPC from the same starts, in stages, until they decide.
 
@@ -456,20 +443,14 @@ class PairedTrial:
     more. ``scores`` are those of the policy that is on trial, from the first starts.
     """
 
-    def __init__(
-        self,
-        play: Callable[[Any, Sequence[int]], Scores],
-        mpc: Any,
-        starts: Starts,
-        new_seeds: Callable[[int], Sequence[int]],
-        tolerance: Callable[[Array], Tolerance] | None = None,
-    ) -> None:
-        self.play = play
-        self.mpc = mpc
-        self.starts = starts
-        self.new_seeds = new_seeds
-        self.tolerance = tolerance
-        self.scores = starts.mpc.at(slice(0))
+    play: Callable[[Any, Sequence[int]], Scores]
+    mpc: Any
+    starts: Starts
+    new_seeds: Callable[[int], Sequence[int]]
+    tolerance: Callable[[Array], Tolerance] | None = None
+
+    def __post_init__(self) -> None:
+        self.scores = self.starts.mpc.at(slice(0))
 
     def extend(self, count: int) -> None:
         """Let the MPC play more, until it has played so many starts."""
@@ -530,12 +511,10 @@ class PairedTrial:
             least_gain=least_gain,
             tail_errors=tail_errors,
         )
-        if found.reason or not must_gain:
-            return found
         more = scores.costs - mpc.costs
         change = mean_change(more, mpc.costs)
         enough = change <= -least_gain
-        if enough and found.is_sure:
+        if found.reason or not must_gain or (enough and found.is_sure):
             return found
         error = Difference.of(relative_costs(more, mpc.costs)).error
         measured = f"{100 * change:+.2g} % (± {100 * error:.1g}) in {len(more)} pairs"
@@ -568,10 +547,7 @@ def tail_average(values: Array, alpha: float) -> tuple[float, float]:
 
 
 def is_above(costs: Array, others: Array) -> bool:
-    """Return whether the mean of costs is above that of others beyond rounding.
-
-    A mean that is not a number is.
-    """
+    """Return whether the mean of costs is above that of others beyond rounding, or not a number."""
     return not costs.mean() - others.mean() <= COST_ROUNDING * np.abs(others).mean()
 
 
@@ -591,9 +567,8 @@ def unsafe_columns(
 ) -> Array:
     """Return what :func:`less_safe` compares, (episodes, 9).
 
-    It is steps in which the env reports a violation; whether the env ends an episode itself, -1
-    where its end is a success; whether its cost or an observation is not finite; steps in which an
-    input moves too far; the excess over the problem's bounds; all steps.
+    ``violations`` and ``far`` count steps; ``ended`` is whether the env ends an episode itself, -1
+    where its end is a success; ``lost`` whether its cost or an observation is not finite.
     """
     size = np.shape(excess.largest)
     columns = [violations, ended, lost, far, excess.largest, excess.summed, excess.any_bound]
@@ -621,12 +596,14 @@ def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[n
     more[:, 0] &= ~known
     shorter = (now[:, ENDED] >= 0) & (now[:, MISSING] > before[:, MISSING])
     more[:, ENDED] = shorter | (more[:, ENDED] & (now[:, ENDED] > 0))
-    more[:, 4] = larger[:, 4]
-    step = before[:, 4]  # one more of the largest
-    longer = ~(now[:, 5] <= allowed_excess(before[:, 5], room) + step)
-    mean = allowed_excess(before[:, 5].mean(), room) if len(now) else 0.0
-    least = mean + step.max(initial=0.0) / max(len(now), 1)
-    more[:, 5] = longer & (len(now) > 0 and not now[:, 5].mean() <= least)
+    more[:, LARGEST_EXCESS] = larger[:, LARGEST_EXCESS]
+    if len(now):
+        step = before[:, LARGEST_EXCESS]  # one more of the largest
+        summed = now[:, SUMMED_EXCESS]
+        its = before[:, SUMMED_EXCESS]
+        least = allowed_excess(its.mean(), room) + step.max() / len(now)
+        longer = ~(summed <= allowed_excess(its, room) + step)
+        more[:, SUMMED_EXCESS] = longer & ~(summed.mean() <= least)
     return np.asarray(more)
 
 
