@@ -41,19 +41,20 @@ class NoActionNoise(BaseCallback):
     model: OffPolicyAlgorithm
 
     def _init_callback(self) -> None:
-        if isinstance(self.model.policy, Explores):
+        explores = isinstance(self.model.policy, Explores)
+        kind = type(self.model).__name__
+        if explores:
             warn(
-                f"NoActionNoise turns nothing off here: {type(self.model).__name__} adds no noise, "
-                "its policy draws its actions. policy_kwargs={'initial_std': ...} says how far "
-                "from the MPC's, and predict(..., deterministic=True) draws none.",
+                f"NoActionNoise turns nothing off here: {kind} adds no noise, its policy draws its "
+                "actions. policy_kwargs={'initial_std': ...} says how far from the MPC's, and "
+                "predict(..., deterministic=True) draws none.",
             )
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
         if not hasattr(self.model, "replay_buffer"):
-            if isinstance(self.model.policy, Explores):
+            if explores:
                 return
             raise TypeError(
-                "NoActionNoise needs an off-policy algorithm, such as DDPG or TD3, not "
-                f"{type(self.model).__name__}."
+                f"NoActionNoise needs an off-policy algorithm, such as DDPG or TD3, not {kind}."
             )
         self.model.action_noise = None
         self.model.learning_starts = 0
@@ -96,11 +97,10 @@ class ControlDiagnostics(BaseCallback):
         self.policy = require_yann_policy(self.model.policy, "ControlDiagnostics")
         watch_buffer(self.model)
         self.violations = 0
-        self._distances: list[float] = []
-        self._regions: list[int] = []
+        self._distances = list[float]()
+        self._regions = list[int]()
         self._recorded = 0  # how many of them
-        n_envs = self.training_env.num_envs
-        self._episodes: list[list[tuple[Any, ...]]] = [[] for _ in range(n_envs)]
+        self._episodes = [list[tuple[Any, ...]]() for _ in range(self.training_env.num_envs)]
 
     def _on_step(self) -> bool:
         if "yann/violations" not in self.logger.name_to_value and self._recorded:
@@ -118,11 +118,8 @@ class ControlDiagnostics(BaseCallback):
             if dones[i]:
                 self._record_episode(episode, infos[i])
                 episode.clear()
-        if np.any(dones):
-            self._record()
-        return True
-
-    def _record(self) -> None:
+        if not np.any(dones):
+            return True
         if self._distances:
             self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
             self.logger.record("yann/distance_from_mpc_max", float(np.max(self._distances)))
@@ -130,6 +127,7 @@ class ControlDiagnostics(BaseCallback):
         self.logger.record("yann/regions_visited", len(set(self._regions)))
         self.logger.record("yann/violations", self.violations)
         self._recorded = len(self._distances)
+        return True
 
     def _record_episode(self, episode: list[tuple[Any, ...]], info: dict[str, Any]) -> None:
         observations, actions, rewards = (np.array(part) for part in zip(*episode, strict=True))
@@ -327,14 +325,13 @@ class SimulatedEpisodes(BaseCallback):
             buffer.add(obs, after, u, reward, done, infos)
 
 
+@dataclass
 class _Exploration:
     """What acts in one episode in the place of the policy's actions."""
 
-    def __init__(self, settings: SimulatedEpisodes, rng: np.random.Generator) -> None:
-        self.settings = settings
-        self.rng = rng
-        self.left = 0  # samples of a step test
-        self.held: Array = np.zeros(0)
+    settings: SimulatedEpisodes
+    rng: np.random.Generator
+    left: int = 0  # samples of a step test
 
     def __call__(self, action: Array) -> Array:
         """Return an action in [-1, 1], shape (m,)."""

@@ -19,6 +19,8 @@ from gymnasium.vector import VectorEnv
 from sb3_yann._validation import check_type
 from sb3_yann.control.simulator import require_makes
 
+MAX_KEPT_ENVS = 200  # of a pool
+
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
 
 
@@ -127,9 +129,6 @@ class EnvPool:
     that was given plays alone, and is never closed.
     """
 
-    MAX_KEPT = 200
-    """Envs that are kept."""
-
     def __init__(
         self, source: Source, most: int | None = None, each: Callable[..., Iterable[Any]] = map
     ) -> None:
@@ -149,7 +148,7 @@ class EnvPool:
         except BaseException:
             self.close()
             raise
-        self.close(self.MAX_KEPT)
+        self.close(MAX_KEPT_ENVS)
 
     def close(self, kept: int = 0) -> None:
         """Close all envs but so many."""

@@ -12,7 +12,6 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Protocol
 
 import numpy as np
 
@@ -51,20 +50,18 @@ PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new
 
 
 class TwinPlant:
-    """The members of a twin, one for each start, or by default the mean of all."""
+    """The members of a twin, one for each start, or by default the mean of all.
+
+    ``turn`` is a full turn for each entry of theta that is an angle and jumps; None where none is.
+    """
 
     def __init__(self, dynamics: Dynamics, members: Iterable[int] | None = None) -> None:
         self.dynamics = dynamics
         self.members = None if members is None else [*members]
         self._known: dict[bytes, Dynamics] = {}
-
-    @property
-    def turn(self) -> Array | None:
-        """A full turn for each entry of theta that is an angle and jumps; None where none does."""
-        turns = self.dynamics.coordinates.turn
-        if turns is None:
-            return None
-        return np.append(turns, np.zeros(self.dynamics.problem.n_theta - len(turns)))
+        turn = dynamics.coordinates.turn
+        others = dynamics.problem.n_theta - dynamics.problem.model.n_states
+        self.turn = None if turn is None else np.append(turn, np.zeros(others))
 
     def _acting(self, rows: Rows) -> Dynamics:
         if self.members is None:
@@ -116,27 +113,55 @@ class TwinPlant:
         A, B = self.slopes(row.begin(theta), u, rows)
         if row.observer is None:
             return A, B
-        n = parts.size
-        number = np.arange(n)
-        to = np.where(number < parts.n_states, number + row.state.start, number)
-        of_x = A[..., to, :]
+        to = np.arange(parts.size)
+        to[parts.state] += row.state.start
+        A = A[..., to, :]
         B = B[..., to, :]
-        found = of_x[..., :n].copy()
-        found[..., parts.state] += of_x[..., row.state]
-        found[..., parts.disturbance, :] = np.eye(n)[parts.disturbance]
-        B = B.copy()
+        A[..., parts.state] += A[..., row.state]
+        A[..., parts.disturbance, : parts.size] = np.eye(parts.size)[parts.disturbance]
         B[..., parts.disturbance, :] = 0.0
-        return found, B
+        return A[..., : parts.size], B
 
 
-class Doubt(Protocol):
-    """A price on what a model does not know, a sum of squares."""
+@dataclass(frozen=True, eq=False)
+class Disagreement:
+    """A price on the members' disagreement over a step, in standard deviations of the states.
+
+    One of these costs ``weight``. There are two members or more, and no observer.
+    """
+
+    dynamics: Dynamics
+    weight: float
 
     def costs(self, thetas: Array, inputs: Array) -> Array:
-        """Return what steps cost (T, k), at thetas (T, k, n_theta) and inputs (T, k, m)."""
+        """Return what steps cost (T, k)."""
+        return np.asarray(self.weight * np.sum(self._apart(thetas, inputs) ** 2, axis=-1))
 
     def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
         """Return gradients (T, k, n_theta + m) and Gauss-Newton curvatures of that."""
+        shape = thetas.shape[:2]
+        apart = self._apart(thetas, inputs)
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (thetas, inputs))
+        slopes = np.concatenate(self.dynamics.jacobians(*flat), axis=-1)
+        slopes = slopes[..., self.dynamics.row.state, :]
+        slopes = (slopes - slopes.mean(axis=0)) / self._units[:, None]
+        members, rows, n, size = slopes.shape
+        J = np.moveaxis(slopes, 0, 1).reshape(rows, members * n, size)
+        gradient = np.einsum("rqi,rq->ri", J, apart.reshape(rows, -1))
+        curvature = np.swapaxes(J, 1, 2) @ J
+        twice = 2 * self.weight
+        return twice * gradient.reshape(*shape, size), twice * curvature.reshape(*shape, size, size)
+
+    @cached_property
+    def _units(self) -> Array:
+        return np.asarray(self.dynamics.coordinates.units * np.sqrt(len(self.dynamics.members)))
+
+    def _apart(self, thetas: Array, inputs: Array) -> Array:
+        """Return how far each member is from their mean, (T, k, members n)."""
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (thetas, inputs))
+        residual = self.dynamics.residual(*flat)
+        apart = (residual - residual.mean(axis=0)) / self._units
+        return np.asarray(np.moveaxis(apart, 0, 1).reshape(*thetas.shape[:2], -1))
 
 
 @dataclass(frozen=True)
@@ -154,7 +179,7 @@ class Task:
     high: Array
     end: Array
     weight: float
-    doubt: Doubt | None = None
+    doubt: Disagreement | None = None
     end_slope: Array | float = 0.0
 
     @cached_property
@@ -167,7 +192,8 @@ class Task:
             stage = self.problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0)
             end = np.sum((thetas[-1] @ self.end + self.end_slope) * thetas[-1], axis=-1)
             outside = np.sum(self._bounds.beyond(thetas[1:], -INSIDE) ** 2, axis=(0, 2))
-            outside += np.sum(self._mixed_beyond(thetas[:-1], inputs) ** 2, axis=(0, 2))
+            mixed = mixed_beyond(self.problem.deviations, thetas[:-1], inputs, -INSIDE)
+            outside += np.sum(mixed**2, axis=(0, 2))
             total = stage + end + self.weight * outside
             if self.doubt is not None:
                 total = total + self.doubt.costs(thetas[:-1], inputs).sum(axis=0)
@@ -181,10 +207,9 @@ class Task:
         W = 2 * self.problem.stage_matrix
         slopes = np.concatenate([thetas, inputs], axis=-1) @ W + self.problem.stage_slope
         curved = np.broadcast_to(W, (*inputs.shape[:2], *W.shape))
-        prices = [self.mixed_penalty] if len(self.problem.mixed.F) else []
-        prices += [self.doubt.slopes] if self.doubt is not None else []
-        for price in prices:
-            slope, more = price(thetas, inputs)
+        prices = [self._mixed_penalty(thetas, inputs)] if len(self.problem.mixed.F) else []
+        prices += [self.doubt.slopes(thetas, inputs)] if self.doubt is not None else []
+        for slope, more in prices:
             slopes = slopes + slope
             curved = curved + more
         return slopes, curved
@@ -200,24 +225,18 @@ class Task:
         scaled = self._bounds.C / self._bounds.half[:, None]
         return self._squares(self._bounds.beyond(thetas, -INSIDE), scaled)
 
-    def mixed_penalty(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
+    def _mixed_penalty(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
         """Return the same by theta and u (..., n_theta + m) of what is beyond MixedBounds."""
         problem = self.problem
+        over = mixed_beyond(problem.deviations, thetas, inputs, -INSIDE)
         rows = np.zeros((len(problem.mixed.F), problem.n_theta + problem.model.n_inputs))
         rows[:, problem.layout.state] = problem.mixed.F
         rows[:, problem.n_theta :] = problem.mixed.G
-        return self._squares(
-            self._mixed_beyond(thetas, inputs), rows / mixed_half(problem)[:, None]
-        )
-
-    def _mixed_beyond(self, thetas: Array, inputs: Array) -> Array:
-        return mixed_beyond(self.problem.deviations, thetas, inputs, -INSIDE)
+        return self._squares(over, rows / mixed_half(problem)[:, None])
 
     def _squares(self, over: Array, rows: Array) -> tuple[Array, Array]:
-        """Return gradient and curvature of the price of what is over (..., k), of rows (k, n)."""
         weight = 2 * self.weight
-        active = (over != 0)[..., None, :]
-        return weight * over @ rows, weight * ((rows.T * active) @ rows)
+        return weight * over @ rows, weight * ((rows.T * (over != 0)[..., None, :]) @ rows)
 
 
 def roll_out(
@@ -225,7 +244,8 @@ def roll_out(
 ) -> tuple[Array, Array]:
     """Return thetas (steps + 1, k, n_theta) and inputs (steps, k, m) of a policy within bounds.
 
-    It begins at ``starts`` (k, n_theta); ``rows`` (k,) are their numbers, as the plant knows them.
+    It begins at ``starts`` (k, n_theta). Here and below ``rows`` (k,) are their numbers, as the
+    plant knows them.
     """
     m = task.problem.model.n_inputs
     limits = task.problem.deviations.input_range
@@ -241,8 +261,7 @@ def roll_out(
 class Plans:
     """Trajectories of k starts, with feedback and costs, which hold what is beyond bounds.
 
-    thetas (T + 1, k, n_theta), inputs (T, k, m), gains (T, k, m, n_theta). ``turn`` (n_theta,) is a
-    full turn for each entry that is an angle and jumps by it, 0 for the others.
+    thetas (T + 1, k, n_theta), inputs (T, k, m), gains (T, k, m, n_theta); ``turn`` is the plant's.
     """
 
     thetas: Array
@@ -275,10 +294,7 @@ def planned(
     rows: Rows,
     preferred: bool = False,
 ) -> Plans:
-    """Return the best plan of each start that the policies' trajectories lead to.
-
-    ``starts`` (k, n_theta), whose numbers are ``rows`` (k,), as the plant knows them.
-    """
+    """Return the best plan of each of the ``starts`` that the policies' trajectories lead to."""
     k = len(starts)
     turn = plant.turn
     soft = dataclasses.replace(task, weight=SOFT * task.weight)
@@ -319,10 +335,7 @@ def _played(
 
 
 def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
-    """Return plans that no correction improves, or those after so many rounds.
-
-    ``rows`` (k,) are the numbers of the starts, as the plant knows them.
-    """
+    """Return plans that no correction improves, or those after so many rounds."""
     plans = copy.deepcopy(plans)
     k = len(rows)
     damping: Array = np.zeros(k)
@@ -444,18 +457,14 @@ def initial_guesses(
     Two have inputs on their bounds for a while, then the MPC. The last one is, for each start, the
     cheapest of these and of unconstrained laws with other weights, after such a push or without: an
     MPC that leaves a pendulum hanging shows no plan that it can swing. There is none where the MPC
-    is as cheap. ``starts`` (k, n_theta) have the numbers ``rows`` (k,).
+    is as cheap.
     """
     problem = task.problem
-    until = steps // BURSTS
-    none = partial(_pushed, problem.deviations.u_min, 0)
-    pushes = [
-        none,
-        *(partial(_pushed, u, until) for u in (problem.deviations.u_min, problem.deviations.u_max)),
-    ]
-    first = [push(law_of(problem)) for push in pushes]
-
-    others = [push(lambda theta, K=K: theta @ K.T) for K in _gains(problem) for push in pushes]
+    own = problem.deviations
+    pushes = [(own.u_min, 0), *((u, steps // BURSTS) for u in (own.u_min, own.u_max))]
+    first = [_pushed(*push, law_of(problem)) for push in pushes]
+    laws = [lambda theta, K=K: theta @ K.T for K in _gains(problem)]
+    others = [_pushed(*push, law) for law in laws for push in pushes]
     played = [*_played(plant, task, [*first, *others], starts, steps, rows)]
     costs = np.concatenate([task.costs(*pair) for *pair, _ in played]).reshape(-1, len(starts))
     cheapest = np.argmin(costs, axis=0)
@@ -472,7 +481,7 @@ def _pushed(u: Array, until: int, law: Feedback) -> Policy:
 def _gains(problem: LinearMPC) -> Iterator[Array]:
     """Yield gains (m, n_theta) of unconstrained laws: with another weight of one error, or all."""
     errors = problem.error_system
-    size = len(problem.error_system.Q)
+    size = len(errors.Q)
     for chosen in (*np.eye(size, dtype=bool), np.ones(size, dtype=bool)):
         for factor in WEIGHTS:
             scale = np.where(chosen, np.sqrt(factor), 1.0)
@@ -488,6 +497,7 @@ def _gains(problem: LinearMPC) -> Iterator[Array]:
             yield errors.to_input - K @ errors.to_error
 
 
+@dataclass
 class Planning:
     """Plans for the rest of the episode, anew where a reference or disturbance changes.
 
@@ -500,28 +510,19 @@ class Planning:
     """
 
     remembers = True
+    plant: TwinPlant
+    task: Task
+    steps: int
+    pause: int = 0
+    room: float = np.inf
+    law: Feedback | None = None
+    guess: Feedback | None = None
 
-    def __init__(
-        self,
-        plant: TwinPlant,
-        task: Task,
-        steps: int,
-        pause: int = 0,
-        room: float = np.inf,
-        law: Feedback | None = None,
-        guess: Feedback | None = None,
-    ) -> None:
-        self.plant = plant
-        self.task = task
-        self.steps = steps
-        self.pause = pause
-        self.room = room
+    def __post_init__(self) -> None:
         self.plans: dict[int, tuple[int, Plans, Array]] = {}
-        # who has left its plan
-        self.law = law or law_of(task.problem)
-        self.guess = guess
-        self.lost = set[int]()
+        self.lost = set[int]()  # who has left its plan
         self._kept: dict[int, float] = {}  # what plans that are over have promised
+        self._act = self.law or law_of(self.task.problem)
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
@@ -548,7 +549,7 @@ class Planning:
                 self._plan(t, theta[chosen], rows[chosen])
         u: Array = np.zeros((len(rows), problem.model.n_inputs))
         if self.lost:
-            u = np.nan_to_num(self.law(theta))
+            u = np.nan_to_num(self._act(theta))
         for k, row in enumerate(rows):
             if row in self.plans and row not in self.lost:
                 planned_at, plan, _ = self.plans[row]
@@ -559,12 +560,11 @@ class Planning:
     def _plan(self, t: int, starts: Array, rows: Rows) -> None:
         left = self.steps - t
         guess = self.guess
-        policies: list[Policy] = [lambda _, at: self.law(at)]
+        policies: list[Policy] = [lambda _, at: self._act(at)]
+        preferred = guess is not None and rows[0] not in self.plans
         if rows[0] not in self.plans:
             policies = initial_guesses(self.plant, self.task, starts, left, rows)
-            if guess is not None:
-                policies = [*policies, lambda _, at: guess(at)]
-        preferred = guess is not None and len(policies) > 1
+            policies += [lambda _, at: guess(at)] if guess is not None else []
         found = planned(self.plant, self.task, policies, starts, left, rows, preferred)
         for k, row in enumerate(rows):
             self._kept[row] = self._promised(row, t)

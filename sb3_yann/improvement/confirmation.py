@@ -6,7 +6,7 @@ In a simulator pairs of episodes are played until they are decisive: the plant d
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -46,8 +46,6 @@ RAREST = 10.0
 many times as much at most where it is rare."""
 FURTHER = 0.01  # how much farther than the MPC a run may leave what the log shows, in its widths
 WINDOW = 200  # steps that are planned of a run of more than twice as many
-
-CostsAndUnsafe = tuple[Array, Array]  # costs, and what is unsafe (`unsafe_columns`), of all starts
 
 
 @dataclass(frozen=True)
@@ -122,11 +120,6 @@ class Trial:
     starts: Array
     n_known: int
     follow: Any
-    steps: int = field(init=False)
-    given: Array = field(init=False)
-    far: Array = field(init=False)
-    rows: Array = field(init=False)
-    mpc: CostsAndUnsafe = field(init=False)
 
     @classmethod
     def draw(cls, twin: PlantTwin, count: int, rng: np.random.Generator) -> Trial:
@@ -149,6 +142,10 @@ class Trial:
         episodes = self.twin.episodes
         part = self.twin.dynamics.row.given
         self.steps = max(map(len, episodes))
+        self.window = WINDOW if self.steps > 2 * WINDOW else self.steps  # steps that are planned
+        members, count = self.starts.shape[:2]
+        # Which of all starts, member by member, begin as the log does.
+        self.known = np.tile(np.arange(count) < self.n_known, members)
         self.given = np.repeat(self.starts[:1, :, part], self.steps, axis=0)
         for number, each in enumerate(episodes):
             rows = each.thetas[np.minimum(np.arange(self.steps), len(each)), part]
@@ -157,29 +154,21 @@ class Trial:
         self.rows = runs[0]
         self.far = np.nan_to_num(self._beyond(self.rows), nan=np.inf)
         self.mpc = self._outcome(*runs)
+        self.mean = float(np.abs(self.mpc.costs[self.known]).mean())
 
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Which of all starts, member by member, begin as the log does."""
-        return np.tile(np.arange(self.starts.shape[1]) < self.n_known, len(self.starts))
-
-    @property
-    def mean(self) -> float:
-        """The MPC's mean cost from the known starts."""
-        return float(np.abs(self.mpc[0][self.known]).mean())
-
-    def play(self, act: Feedback) -> CostsAndUnsafe:
+    def play(self, act: Feedback) -> Scores:
         """Return what comes of a policy."""
         return self._outcome(*self._run(act))
 
-    def _outcome(self, thetas: Array, inputs: Array) -> CostsAndUnsafe:
+    def _outcome(self, thetas: Array, inputs: Array) -> Scores:
         twin = self.twin
         with np.errstate(all="ignore"):
             costs, excess = costs_of(twin.problem, twin.dynamics.row.shown(thetas), inputs)
         costs = costs.ravel()
         excess = BoundExcess(*(each.ravel() for each in excess))
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
-        return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
+        unsafe = unsafe_columns(left, 0, ~np.isfinite(costs), excess)
+        return Scores(costs, unsafe, np.zeros((len(costs), 0), dtype=bool))
 
     def _run(self, act: Feedback) -> tuple[Array, Array]:
         with np.errstate(all="ignore"):
@@ -192,23 +181,22 @@ class Trial:
         over = np.maximum(x - limits.high, limits.low - x) / (limits.high - limits.low)
         return np.asarray(np.maximum(over, 0.0).max(axis=(0, -1)).ravel())
 
-    def check(self, iteration: int, played: CostsAndUnsafe) -> Check:
+    def check(self, iteration: int, played: Scores) -> Check:
         """Compare a policy with the MPC, by what came of it."""
-        costs, unsafe = played
         known = self.known
         mean = self.mean
-        excess = costs - self.mpc[0]
-        less = less_safe(unsafe, self.mpc[1]).any(axis=1)
-        policy, mpc = (Scores(c[known], u[known]) for c, u in (played, self.mpc))
-        allowed_more = RULE.tolerance(self.mpc[0][known], BoundNames.of(self.twin.problem))
-        reason = no_worse(policy, mpc, mpc, allowed_more).reason
+        excess = played.costs - self.mpc.costs
+        less = less_safe(played.unsafe, self.mpc.unsafe).any(axis=1)
+        mpc = self.mpc.at(known)
+        allowed_more = RULE.tolerance(mpc.costs, BoundNames.of(self.twin.problem))
+        reason = no_worse(played.at(known), mpc, mpc, allowed_more).reason
         reason = reason.replace(UNSAFE[0], "states beyond what the log shows")
         logged, error = self._as_logged(excess)
         if not reason and not logged <= 0:
             reason = f"episodes like the log's cost {100 * logged / mean:.2g} % more"
         if not reason and less.any():
-            worst = int(np.argmax(np.where(less, unsafe[:, LARGEST_EXCESS], -1)))
-            broken = allowed_more.exceeded(Scores(*played), worst) or "the cost is not finite"
+            worst = int(np.argmax(np.where(less, played.unsafe[:, LARGEST_EXCESS], -1)))
+            broken = allowed_more.exceeded(played, worst) or "the cost is not finite"
             reason = f"outside the log, from {self._in_words(worst)}, {broken}"
         beyond = (excess - self.room())[~known]
         if not reason and not np.all(beyond <= 0):
@@ -244,12 +232,8 @@ class Trial:
         """Return what each start may cost more than with the MPC."""
         chance = self.twin.starts.chance_beyond(self.starts).ravel()
         rare = np.clip(RARE / np.maximum(chance, 1e-300), 1.0, RAREST)
-        return np.asarray(MARGIN * self.mean + AROUND * rare * np.abs(self.mpc[0]) * ~self.known)
-
-    @property
-    def window(self) -> int:
-        """How many steps of a run are planned."""
-        return WINDOW if self.steps > 2 * WINDOW else self.steps
+        around = AROUND * rare * np.abs(self.mpc.costs) * ~self.known
+        return np.asarray(MARGIN * self.mean + around)
 
     def scenarios(self, rng: np.random.Generator) -> Scenarios:
         """Return the starts, in each of which another member acts; of a long log, from amid it."""
@@ -267,10 +251,10 @@ class Trial:
             self.twin, members, self.rows[begins, members, starts], self.given[times, starts]
         )
 
-    def hard(self, played: CostsAndUnsafe) -> Scenarios | None:
+    def hard(self, played: Scores) -> Scenarios | None:
         """Return the scenarios that a policy loses, or nearly, the worst first; None where none."""
-        loses = (played[0] - self.mpc[0]) / np.maximum(NEARLY * self.room(), 1e-300)
-        loses[np.any(less_safe(played[1], self.mpc[1]), axis=1)] = np.inf
+        loses = (played.costs - self.mpc.costs) / np.maximum(NEARLY * self.room(), 1e-300)
+        loses[np.any(less_safe(played.unsafe, self.mpc.unsafe), axis=1)] = np.inf
         worst = np.argsort(-np.nan_to_num(loses, nan=np.inf), kind="stable")
         worst = worst[~(loses[worst] <= 1)][:HARDEST]
         if not len(worst):
@@ -307,10 +291,8 @@ class SimulatorTrial(PairedTrial):
         self.simulator = simulator
         self.episodes = list[Episode | None]()
         self.played: tuple[Trajectories, Sequence[int]] | None = None
-        none = Scores(np.empty(0), np.empty((0, 9)))
-        super().__init__(
-            self._play, None, Starts((), none, Tolerance(0.0)), simulator.new_seeds, self._tolerated
-        )
+        none = Starts((), Scores(np.empty(0), np.empty((0, 9))), Tolerance(0.0))
+        super().__init__(self._play, None, none, simulator.new_seeds, self._tolerated)
 
     def _play(self, act: Feedback | None, seeds: Sequence[int]) -> Scores:
         controller = of_law(self.simulator.problem) if act is None else controller_of(act)
@@ -350,8 +332,8 @@ class SimulatorTrial(PairedTrial):
     @property
     def rides_a_bound(self) -> bool:
         """Whether a hard bound is in force: it is exceeded in some episode, also by the MPC."""
-        both = self.starts.mpc.unsafe, self.scores.unsafe
-        return any(bool(each[:, LARGEST_EXCESS].any()) for each in both)
+        both = np.concatenate([self.starts.mpc.unsafe, self.scores.unsafe])
+        return bool(both[:, LARGEST_EXCESS].any())
 
     def check(self, number: int, level: float, final: bool) -> tuple[Check, Verdict]:
         """Return what the pairs say of the policy, at a one-sided level of significance."""

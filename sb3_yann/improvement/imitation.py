@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,7 @@ CRITIC_BATCH = 256  # rows in a step of Adam on the critic
 CRITIC_UPDATES = 200  # steps of Adam on the critic
 
 
+@dataclass
 class Teacher:
     """Plans the episodes of a model, and keeps what plans and their feedback do.
 
@@ -68,39 +69,33 @@ class Teacher:
     ``n_usual`` ones. In a :class:`Family` lost starts count ``caution`` times as much as usual.
     """
 
-    def __init__(
-        self,
-        scenarios: Scenarios,
-        seed: int,
-        n_planned: int | None = None,
-        n_usual: int | None = None,
-        caution: float = 1.0,
-    ) -> None:
-        self.scenarios = scenarios
-        self.caution = caution
-        self.planned = slice(n_planned)
-        self.usual = slice(n_usual)
-        self.rng = np.random.default_rng([seed, 4])
-        model = scenarios.model
-        problem = scenarios.model.problem
-        self.problem = problem
-        self.units = model.dynamics.coordinates.units
-        self.mpc = scenarios.play(of_law(problem))
-        self.law = law_of(problem)
+    scenarios: Scenarios
+    seed: int
+    n_planned: int | None = None
+    n_usual: int | None = None
+    caution: float = 1.0
+
+    def __post_init__(self) -> None:
+        self.usual = slice(self.n_usual)
+        self.rng = np.random.default_rng([self.seed, 4])
+        model = self.scenarios.model
+        self.problem = model.problem
+        self.mpc = self.scenarios.play(of_law(self.problem))
+        self.law = law_of(self.problem)
         self.best = self.mpc.costs.copy()
-        self.known = np.zeros(len(scenarios), dtype=bool)
+        self.known = np.zeros(len(self.scenarios), dtype=bool)
         self.steps = len(self.mpc.inputs)
         finite = self.mpc.costs[np.isfinite(self.mpc.costs)]
         unit = max(float(np.median(np.abs(finite))) / self.steps, 1e-300) if len(finite) else 1.0
-        self.task = task_of(model, unit, priced=scenarios.members is None)
+        self.task = task_of(model, unit, priced=self.scenarios.members is None)
         self.earlier: list[tuple[Array, Array]] = []  # theta and inputs that others have shown
         self.taught: dict[tuple[int, int], tuple[Array, Array]] = {}  # by scenario and first step
-        self.weights: NDArray[np.int64] = np.ones(len(scenarios), dtype=np.int64)
+        self.weights: NDArray[np.int64] = np.ones(len(self.scenarios), dtype=np.int64)
 
     @property
     def gain(self) -> float:
         """What plans gain on average: see :meth:`saved`."""
-        return self.saved(self.best, self.planned)
+        return self.saved(self.best, slice(self.n_planned))
 
     def saved(self, costs: Array, part: slice | Mask = slice(None)) -> float:
         """Return what costs (k,) are below the MPC's on average, relative to those."""
@@ -115,15 +110,13 @@ class Teacher:
         A start counts as lost once at most: else one that falls would hide all the others. What it
         costs more than the MPC and a ``room`` counts ``price`` times besides.
         """
-        with np.errstate(invalid="ignore"):
-            more, lost = (
-                np.minimum(np.nan_to_num(each, nan=0.0, posinf=1.0, neginf=-1.0), 1.0)
-                for each in (
-                    relative_costs(costs - self.mpc.costs - least, self.mpc.costs)
-                    for least in (0.0, room)
-                )
-            )
-        return float(-more.mean() - price * np.maximum(lost, 0.0).mean())
+
+        def more(least: Array | float) -> Array:
+            with np.errstate(invalid="ignore"):
+                found = relative_costs(costs - self.mpc.costs - least, self.mpc.costs)
+            return np.minimum(np.nan_to_num(found, nan=0.0, posinf=1.0, neginf=-1.0), 1.0)
+
+        return float(-more(0.0).mean() - price * np.maximum(more(room), 0.0).mean())
 
     def show(self, act: Feedback | None = None, played: Imagined | None = None) -> None:
         """Plan the scenarios; those that a policy ``played``, from where it had got to.
@@ -133,7 +126,7 @@ class Teacher:
         that in the end neighbors do alike.
         """
         pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
-        chosen: NDArray[np.intp] = np.arange(len(self.scenarios))[self.planned]
+        chosen: NDArray[np.intp] = np.arange(len(self.scenarios))[: self.n_planned]
         begins: NDArray[np.int64] = np.zeros(len(chosen), dtype=np.int64)
         if played:
             chosen, begins = self.hardest(played)
@@ -167,28 +160,26 @@ class Teacher:
                     each = enumerate(zip(acting, near, strict=True))
                     return np.array([follow(plan, t - at, x) for t, ((at, plan, _), x) in each])
 
-                self._keep(key, shown.thetas[:-1, i], shown.inputs[:, i], answers)
+                self._keep(key, shown, i, answers)
             elif not begins[i]:
-                taught = mpc.thetas[:-1, i], mpc.inputs[:, i]
-                self._keep(key, *taught, lambda near: self.law(near.reshape(-1, near.shape[-1])))
+                self._keep(key, mpc, i, lambda near: self.law(near.reshape(-1, near.shape[-1])))
 
-    def _keep(self, key: tuple[int, int], thetas: Array, inputs: Array, answers: Feedback) -> None:
-        """Keep inputs (T, m) at thetas (T, n_theta), and the answers to states near each."""
+    def _keep(self, key: tuple[int, int], played: Imagined, i: int, answers: Feedback) -> None:
+        """Keep the inputs of an episode at its thetas, and the answers to states near each."""
+        thetas = played.thetas[:-1, i]
+        inputs = played.inputs[:, i]
         near = np.repeat(thetas[:, None], NEARBY, axis=1)
         states = near[..., self.problem.layout.state]
-        states += SPREAD * self.units * self.rng.standard_normal(states.shape)
+        coordinates = self.scenarios.model.dynamics.coordinates
+        states += SPREAD * coordinates.units * self.rng.standard_normal(states.shape)
         rows = near.reshape(-1, near.shape[-1])
         answered = np.clip(answers(near).reshape(len(rows), -1), *self.task.limits(rows))
-        self.scenarios.model.dynamics.coordinates.wrap(rows)
+        coordinates.wrap(rows)
         self.taught[key] = np.concatenate([thetas, rows]), np.concatenate([inputs, answered])
 
     @property
     def attainable(self) -> Array:
-        """What plans cost in each scenario (k,).
-
-        In one that was not planned they are taken to gain what they do in the one where the MPC's
-        cost is nearest.
-        """
+        """What plans cost (k,); without one, their gain where the MPC's cost is nearest counts."""
         mpc = np.nan_to_num(self.mpc.costs)
         known = np.flatnonzero(self.known)
         nearest = known[np.abs(mpc[:, None] - mpc[known]).argmin(axis=1)]
@@ -388,8 +379,7 @@ def fit_layer(
 
     Rows that are not finite are left out. The networks go on from where they are.
     """
-    low = problem.deviations.u_min
-    wanted = np.clip((inputs - low) / problem.u_half - 1, -1, 1)
+    wanted = np.clip((inputs - problem.deviations.u_min) / problem.u_half - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
     wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
@@ -405,11 +395,9 @@ def _fit(
     updates: int,
 ) -> None:
     """Fit a layer to actions (rows, m) at theta (rows, n_theta), see :meth:`LawLayer.descend`."""
-    what = "the policy learns: steps of Adam"
-    steps = (
-        (rng.integers(len(at), size=BATCH), RATE * (1 - k / updates))
-        for k in bar(what, range(updates if len(at) else 0), timed=True)
-    )
+    count = range(updates if len(at) else 0)
+    shown = bar("the policy learns: steps of Adam", count, timed=True)
+    steps = ((rng.integers(len(at), size=BATCH), RATE * (1 - k / updates)) for k in shown)
     layer.descend(at, to, largest, steps)
 
 
@@ -435,28 +423,27 @@ def refit_critic(policy: StartsAsMPC, twin: LearntModel, seed: int) -> None:
     """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
     problem = policy.problem
     rng = np.random.default_rng([seed, 2])
-    layer = copy.deepcopy(policy.actor.mu).cpu()
-    half = problem.u_half
+    act = policy_of(copy.deepcopy(policy.actor.mu).cpu(), problem)
     members = len(twin.dynamics.members)
     starts = twin.starts.draw_logged(RETURNS // members * members, rng)
     seen = twin.dynamics.row.shown(starts)
-    first = policy_of(layer, problem)(seen)
+    first = act(seen)
     # The critic must know its slope in the first input.
-    first = first + 0.1 * half * rng.standard_normal(first.shape)
+    first = first + 0.1 * problem.u_half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.deviations.u_min, problem.deviations.u_max)
-    costs = _discounted(policy, twin, layer, starts, first)
+    costs = _discounted(policy, twin, act, starts, first)
     options = policy.critic_options
     returns = options.offset_of_return(policy.gamma) - options.reward_scale * costs
     known = np.isfinite(returns)
     if np.count_nonzero(known) < CRITIC_BATCH:  # too few to say anything
         return
-    scaled = (first - problem.deviations.u_min) / half - 1
-    _fit_critic(policy, seen[known], scaled[known], returns[known], rng)
+    scaled = (first - problem.deviations.u_min) / problem.u_half - 1
+    _fit_critic(policy, np.hstack([seen, scaled])[known], returns[known], rng)
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 
 
 def _discounted(
-    policy: StartsAsMPC, twin: LearntModel, layer: LawLayer, at: Array, u: Array
+    policy: StartsAsMPC, twin: LearntModel, act: Feedback, at: Array, u: Array
 ) -> Array:
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
     problem = policy.problem
@@ -468,26 +455,27 @@ def _discounted(
     shown = dynamics.row.shown
     with np.errstate(all="ignore"):
         first = dynamics.step(starts, u)
-        rows, inputs = dynamics.roll_out(policy_of(layer, problem), first, RETURN_STEPS)
+        rows, inputs = dynamics.roll_out(act, first, RETURN_STEPS)
         thetas = shown(rows)
         stage = problem.deviations.stage_cost(thetas[:-1], inputs)
         end = problem.value_terms(gamma).at(thetas[-1])
-        later = (
-            np.tensordot(gamma ** np.arange(RETURN_STEPS), stage, axes=1)
-            + gamma**RETURN_STEPS * end
-        )
+        later = np.tensordot(gamma ** np.arange(RETURN_STEPS), stage, axes=1)
+        later = later + gamma**RETURN_STEPS * end
         # What leaves the log is not known, and may be many times as dear as all the rest.
         later = np.where(twin.limits.violated(rows).any(axis=0), np.nan, later)
         return np.asarray(problem.deviations.stage_cost(shown(starts), u) + gamma * later).ravel()
 
 
 def _fit_critic(
-    policy: StartsAsMPC, theta: Array, actions: Array, returns: Array, rng: np.random.Generator
+    policy: StartsAsMPC, inputs: Array, returns: Array, rng: np.random.Generator
 ) -> None:
-    """Take steps of Adam on the critics' squared errors, in units of the returns' spread."""
+    """Take steps of Adam on the critics' squared errors, in units of the returns' spread.
+
+    ``inputs`` (rows, n_theta + m) are theta and actions.
+    """
     critic = policy.critic
     device = policy.device
-    points = th.cat([th.as_tensor(theta), th.as_tensor(actions)], dim=1).to(device)
+    points = th.as_tensor(inputs).to(device)
     wanted = th.as_tensor(returns, dtype=th.float32)[:, None].to(device)
     unit = float(np.std(returns)) or 1.0
     if critic.scales_itself and policy.critic_updates == 0:

@@ -6,8 +6,9 @@ import copy
 import hashlib
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from os import PathLike
 from typing import Any
 
@@ -71,8 +72,6 @@ RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it 
 PROMISED = 0.95  # share of a gain in the model that the simulator must show from the same starts
 LITTLE_MORE = 0.02  # share of a gain by which another round must raise it
 OTHERS = 9  # scenarios beside each that is planned, in which a policy shows what it has not learnt
-
-Weights = dict[str, th.Tensor]
 
 
 def of_estimates(problem: LinearMPC) -> str:
@@ -418,12 +417,9 @@ class _Progress:
             each = (self.ends[-1] - self.ends[0]) / (len(self.ends) - 1)
             left = max(each * self.rounds - (time.monotonic() - self.ends[-1]), 0.0)
             if self.simulator:
-                left += self.simulator.seconds_of(2 * (self.confirmations * LOOKS[-1] - pairs))
+                episodes = 2 * (self.confirmations * LOOKS[-1] - pairs)
+                left += self.simulator.seconds * episodes / max(self.simulator.played, 1)
         self.write(text, left, detail)
-
-    def detail(self, text: str) -> None:
-        """Write a line that a file can do without."""
-        self(text, detail=True)
 
     def begin(self, simulator: Simulator) -> None:
         """Count the steps of a simulator."""
@@ -443,29 +439,22 @@ class _Progress:
         self.confirmations = TRIES + 1 - attempt
 
 
+@dataclass
 class _Work:
     """The search for a better actor: a copy of a policy's layer, given back if it passes."""
 
-    def __init__(
-        self,
-        policy: StartsAsMPC,
-        n_starts: int,
-        rounds: int,
-        updates: int,
-        seed: int,
-        say: _Progress,
-        confine: bool = True,
-    ) -> None:
-        self.policy = policy
-        self.problem = policy.problem
-        self.say = say
-        self.n_starts = n_starts
-        self.rounds = rounds
-        self.updates = updates
-        self.seed = seed
-        self.confine = confine
-        self.layer: LawLayer = copy.deepcopy(policy.actor.mu).cpu()
-        self.rng = np.random.default_rng([seed, 1])
+    policy: StartsAsMPC
+    n_starts: int
+    rounds: int
+    updates: int
+    seed: int
+    say: _Progress
+    confine: bool = True
+
+    def __post_init__(self) -> None:
+        self.problem = self.policy.problem
+        self.layer: LawLayer = copy.deepcopy(self.policy.actor.mu).cpu()
+        self.rng = np.random.default_rng([self.seed, 1])
         self.checks: list[Check] = []
         self.hard: Scenarios | None = None  # what the last check in a twin has lost
         self.is_family = False  # the first model of a simulator
@@ -482,14 +471,10 @@ class _Work:
         """Return the layer as it is now as a policy."""
         return policy_of(self.layer, self.problem)
 
-    def weights(self) -> Weights:
-        """Return a copy of the layer's weights."""
-        return copy.deepcopy(self.layer.state_dict())
-
-    def scale(self, share: float, weights: Weights) -> None:
+    def scale(self, share: float, weights: Mapping[str, th.Tensor]) -> None:
         """Give the layer a share of a correction."""
         last = [key for key in weights if key.startswith("network.rest.")][-1]
-        self.layer.load_state_dict(weights | {last: share * weights[last]})
+        self.layer.load_state_dict({**weights, last: share * weights[last]})
 
     def accept(self, model: LearntModel) -> None:
         """Give the policy the layer as it is, and a critic that knows it."""
@@ -551,7 +536,7 @@ class _Work:
                 return improvement(False, f"{plans} in the twin, too little to teach")
             if shown is not None:
                 teacher.earlier = [*shown.earlier, *shown.taught.values()]
-            gained = imitate(self.layer, teacher, self.updates, self.say.detail)
+            gained = imitate(self.layer, teacher, self.updates, partial(self.say, detail=True))
             shown = teacher
             self.say.end_of_round()
             self.say(
@@ -567,7 +552,7 @@ class _Work:
         """Return whether a part of a correction passes; not where a forecast doubts all of it."""
         if self.checks[-1].interval is not None:
             return False
-        whole = self.weights()
+        whole = copy.deepcopy(self.layer.state_dict())
         for share in RETREATS:
             self.scale(share, whole)
             if passes(share):
@@ -727,13 +712,13 @@ class _Work:
     ) -> tuple[LearntModel, str]:
         """Fit, plan and imitate until the simulator shows what plans gain, or nothing more."""
         lost: list[Any] = []
-        weights = self.weights()
+        weights = copy.deepcopy(self.layer.state_dict())
         least = best
         note = ""
         self.say.end_of_round()
         for number in range(self.rounds):
             model, teacher = self._taught(simulator, lost, number)
-            promised = imitate(self.layer, teacher, self.updates, self.say.detail)
+            promised = imitate(self.layer, teacher, self.updates, partial(self.say, detail=True))
             if max(promised, teacher.gain) < RULE.least_gain:
                 note = f"plans {change_in_percent(-teacher.gain)}, too little to teach"
                 break
@@ -749,16 +734,14 @@ class _Work:
             lost = trial.lost
             useful = found.safe and found.change < least
             stalls = least < best and found.change > (1 + LITTLE_MORE) * least
-            if useful:
-                weights = self.weights()
-                least = found.change
+            # Ten starts may hold none that gains: the confirmation has others.
+            hopes = least == best and found.safe and found.change - promised < 2 * best
+            if useful or hopes:
+                weights = copy.deepcopy(self.layer.state_dict())
                 note = ""
             elif least == best:
                 note = found.reason or "no gain in the simulator"
-                if found.safe and found.change - promised < 2 * best:
-                    # Ten starts may hold none that gains: the confirmation has others.
-                    weights = self.weights()
-                    note = ""
+            least = found.change if useful else least
             played = [each for each in trial.episodes if each is not None]
             asks = useful and found.accepted
             ends = number > 0 and stalls
@@ -780,7 +763,7 @@ class _Work:
         for attempt in range(TRIES + 1):
             self.say.confirm(attempt)
             if attempt == TRIES:
-                self.scale(RETREATS[0], self.weights())
+                self.scale(RETREATS[0], self.layer.state_dict())
             share = RULE.significance / (TRIES + 1)  # all tries together err with no more
             found, trial = confirm(self.act(), simulator, len(self.checks) + 1, self.say, share)
             if found.accepted and not found.change < best:
@@ -793,6 +776,6 @@ class _Work:
                 break
             if attempt < TRIES - 1:
                 model, teacher = self._taught(simulator, trial.lost, self.rounds + attempt)
-                imitate(self.layer, teacher, self.updates, self.say.detail)
+                imitate(self.layer, teacher, self.updates, partial(self.say, detail=True))
                 self.say.end_of_round()
         return False

@@ -145,23 +145,22 @@ class Headroom:
 
     def report(self) -> str:
         """Return the figures, and what to do, in words."""
-        parts = [
-            f"{-100 * part + 0.0:+.2f} % {how} {name}"
-            if costs is not None
-            else f"{name}: not played"
-            for part, costs, how, name in (
-                (self.offset, self.observer_played, "with", "a disturbance observer"),
-                (self.model_error, self.reidentified_played, "more with", "a re-identified model"),
-            )
-        ]
         rest = "nonlinearity and constraints" if self._rivals_played else "all the rest"
-        parts.append(f"{-100 * self.nonlinearity + 0.0:+.2f} % more by {rest}")
+        parts = (
+            (self.offset, self.observer_played, "with", "a disturbance observer"),
+            (self.model_error, self.reidentified_played, "more with", "a re-identified model"),
+            (self.nonlinearity, self.best_costs, "more by", rest),
+        )
+        of_that = [
+            f"{name}: not played" if costs is None else f"{-100 * part + 0.0:+.2f} % {how} {name}"
+            for part, costs, how, name in parts
+        ]
         where = "twin" if self._in_twin else "env"
         steps = f"{self.steps:,} of the {where}. {self.note}".strip() if self.steps else self.note
         return summary_lines(
             f"Verdict: {self.verdict}. By its own cost, from starts of {self.source}:",
             **paired_rows(self.best_costs, self.mpc_costs),
-            of_that=", ".join(parts),
+            of_that=", ".join(of_that),
             observer=self._as_played(self.observer_played, "observer"),
             new_model=self._as_played(self.reidentified_played, "model"),
             steps=steps,
@@ -321,7 +320,7 @@ def headroom(
     search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), max_steps)
     with shown(progress_bar, parts=True), threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore", OnlineLawWarning)
-        return search.found()
+        return search.run()
 
 
 class _Search:
@@ -348,14 +347,13 @@ class _Search:
         self.source = "the twin" if self.twin is not None else self.simulator.name
         self.random = self.poor = False
         self.law: Controller = of_law(mpc)  # the better one, of the MPC and with another model
-        self.d_max: Array | None = None
         self.played: dict[str, Array] = {}  # costs of each controller, losses included
         self.fair: dict[str, Array] = {}  # the MPC's where a bound is broken by more
-        self.reidentified: LinearMPC | None = None
+        self.found: dict[str, Any] = {}  # of the result: what is known of the rivals
         self.why: dict[str, str] = {}
         self.planned = np.zeros(len(seeds), dtype=bool)  # starts from which a plan was played
 
-    def found(self) -> Headroom:
+    def run(self) -> Headroom:
         """Play all of it, and return the figures."""
         note = ""
         try:
@@ -426,7 +424,7 @@ class _Search:
             self.why["observer"] = str(error)
             return
         if np.any(largest > SHARE * unit):  # the default would cut off what was found here
-            self.d_max = np.maximum(largest, SHARE * unit)
+            self.found["d_max"] = np.maximum(largest, SHARE * unit)
         self.add("observer", self.simulator.play(Observing(mpc, *pair), self.seeds))
         self.say("the MPC with a disturbance observer")
 
@@ -443,7 +441,7 @@ class _Search:
             return
         self.why["model"] = "these episodes tell no other one"
         if other is not self.mpc:
-            self.reidentified = other
+            self.found["reidentified"] = other
             law = of_model(self.mpc, other)
             self.add("model", self.simulator.play(law, self.seeds))
             if self.fair["model"].mean() < self.base.costs.mean():
@@ -512,22 +510,21 @@ class _Search:
             which = f"{ended} of {len(base)} episodes of the MPC are ended by the env"
             note = f"{which}: their costs are those of fewer steps. {note}".strip()
         excess = self.base.excess
-        if excess is not None and (beyond := np.count_nonzero(excess.largest)):
-            some = f"{beyond} of {len(base)} episodes"
-            note = f"{note} The MPC exceeds a hard bound in {some}.".strip()
-        if excess is not None and (paid := np.count_nonzero(excess.penalty)):
+        assert excess is not None
+        if beyond := np.count_nonzero(excess.largest):
+            note += f" The MPC exceeds a hard bound in {beyond} of {len(base)} episodes."
+        if paid := np.count_nonzero(excess.penalty):
             share = 100 * float(np.mean(excess.penalty) / (abs(np.mean(base)) or 1.0))
             some = f"of the MPC's cost is for soft bounds, from {paid} of {len(base)} starts"
-            note = f"{note} {share:.2g} % {some}.".strip()
+            note += f" {share:.2g} % {some}."
         # The MPC's own where another one is not better on average.
         both = (self.fair.get(name, base) for name in ("observer", "model"))
         observer, model = (each if each.mean() < base.mean() else base for each in both)
         best = self.best
-        total, offset, known = (gain(base, each) for each in (best, observer, model))
-        offset = min(offset, total)
-        known = min(known, total)
+        total = gain(base, best)
+        offset, known = (min(gain(base, each), total) for each in (observer, model))
         parts = offset, max(0.0, known - offset), total - max(offset, known)
-        whole = Headroom(base, observer, model, best, *parts, "", self.source, self.d_max)
+        whole = Headroom(base, observer, model, best, *parts, "", self.source, **self.found)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
         if verdict == [*ADVICE][1]:  # where it loses from some starts, others may bring less
             if not offset > SURE * dataclasses.replace(whole, best_costs=observer).standard_error:
@@ -546,8 +543,7 @@ class _Search:
             observer_played=self.played.get("observer"),
             reidentified_played=self.played.get("model"),
             steps=self.simulator.steps,
-            note=note,
-            reidentified=self.reidentified,
+            note=note.strip(),
             budget=self.simulator.needed(most_episodes()) if self.twin is None else 0,
             unplanned=unplanned,
             why=self.why,
@@ -568,18 +564,14 @@ def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
     return act
 
 
+@dataclass
 class Observing:
     """The offset-free MPC with an observer for each episode; the env shows theta of the problem."""
 
+    problem: LinearMPC
+    other: LinearMPC
+    observer: DisturbanceObserver
     remembers = True
-
-    def __init__(self, problem: LinearMPC, other: LinearMPC, observer: DisturbanceObserver) -> None:
-        self.problem = problem
-        self.other = other
-        self.observer = observer
-        self.observers: list[DisturbanceObserver] = []
-        self.u: Array = np.zeros((0, 0))
-        self.loads: Array = np.zeros((0, 0))  # disturbances, measured or to come, as u acted
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
@@ -591,7 +583,7 @@ class Observing:
         if t == 0:
             self.observers = [copy.copy(self.observer) for _ in x]
             self.u = np.zeros((len(x), self.other.model.n_inputs))
-            self.loads = measured.copy()
+            self.loads = measured.copy()  # disturbances, measured or to come, as u acted
             found = [each.reset(y) for each, y in zip(self.observers, x, strict=True)]
         else:
             found = [

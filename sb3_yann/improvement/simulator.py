@@ -28,9 +28,17 @@ from sb3_yann.audit.meaning import (
 from sb3_yann.compare import NewSeeds, unsafe_columns
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import costs_of
-from sb3_yann.env_pool import EnvPool, Source, maker, name_of, pool_of
-from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
-from sb3_yann.rollout import Controller, Rows, Trajectories, joined, of_episode, rollout
+from sb3_yann.env_pool import Source, maker, name_of, pool_of
+from sb3_yann.plan import WEIGHT, Disagreement, Task, TwinPlant, value_at_end
+from sb3_yann.rollout import (
+    Controller,
+    Rows,
+    Trajectories,
+    joined,
+    of_episode,
+    require_repeated,
+    rollout,
+)
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of, play
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.log import SHORTEST, Episode, observer_of
@@ -53,24 +61,17 @@ class OutOfStepsError(Exception):
     """The simulator would take more steps than it may."""
 
 
+@dataclass
 class _Count:
     """Steps, of which there may be no more than so many; ``strict`` envs may not fail in one."""
 
-    def __init__(self, most: float, strict: bool = True) -> None:
-        self.steps = 0
-        self.most = most
-        self.strict = strict
-
-    def add(self) -> None:
-        """Count a step before it is taken; OutOfStepsError where none is left."""
-        self.steps += 1
-        if self.steps > self.most:
-            self.steps -= 1
-            raise OutOfStepsError
+    most: float
+    strict: bool = True
+    steps: int = 0
 
 
 class _Counted(gym.Wrapper[Any, Any, Any, Any]):
-    """Counts each step before it is taken."""
+    """Counts each step before it is taken; OutOfStepsError where none is left."""
 
     def __init__(self, env: gym.Env[Any, Any], count: _Count) -> None:
         super().__init__(env)
@@ -78,7 +79,9 @@ class _Counted(gym.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> Any:
         """Step the env; where it fails off the MPC's ways, the episode ends with NaN."""
-        self.count.add()
+        if self.count.steps >= self.count.most:
+            raise OutOfStepsError
+        self.count.steps += 1
         try:
             return self.env.step(action)
         except Exception as error:  # whatever it raises in a state that it cannot be in
@@ -179,10 +182,6 @@ class Simulator:
         """Return how many steps the first episodes and so many later ones take; 0: not known."""
         return self.longest * (self.usual + 1 + later)
 
-    def seconds_of(self, episodes: int) -> float:
-        """Return how long so many episodes take, as those so far did."""
-        return self.seconds * episodes / max(self.played, 1)
-
     @property
     def steps(self) -> int:
         """How many it has taken."""
@@ -197,7 +196,8 @@ class Simulator:
         played = self.play(of_law(problem), seeds)
         starts = np.array([each[0] for each, _ in played.pairs])
         require_theta_shown(problem, played.steps()[0], starts)
-        require_repeated(problem, self.envs, seeds[0], played.costs[0])
+        again = rollout(of_law(problem), self.envs, seeds[:1], problem=problem)
+        require_repeated("the env", seeds[0], played.costs[0], again.costs[0])
         if not checked:
             return played
         self._warn(played, seeds)
@@ -242,7 +242,7 @@ class Simulator:
         if len(seeds) > self.affordable():
             raise OutOfStepsError
         begun = time.monotonic()
-        joblib: Any = sys.modules.get("joblib")  # without it there is no such context
+        joblib: Any = sys.modules.get("joblib")
         alone = joblib is None or self.envs.most or getattr(controller, "remembers", False)
         jobs = 1 if alone else min(joblib.effective_n_jobs(), len(seeds))
         if jobs > 1:
@@ -287,10 +287,9 @@ class Simulator:
         """
         bounds = self.problem.deviations
         part = self.problem.layout.state
-        low = bounds.theta_min[part]
-        high = bounds.theta_max[part]
         x = thetas[:, part]
-        near = (x >= low - (high - low)) & (x <= high + (high - low))
+        width = (bounds.theta_max - bounds.theta_min)[part]
+        near = (x >= bounds.theta_min[part] - width) & (x <= bounds.theta_max[part] + width)
         return np.asarray(near.all(axis=1) & np.isfinite(thetas).all(axis=1))
 
     def close(self) -> None:
@@ -316,37 +315,26 @@ def rests_aside(row: RowLayout, episodes: Sequence[Episode]) -> bool:
     return bool(np.any(np.abs(left.mean(axis=0)) > np.maximum(ASIDE, error)))
 
 
-def require_repeated(problem: LinearMPC, env: Source | EnvPool, seed: int, cost: float) -> None:
-    """Raise unless the MPC's episode from a seed costs the same again; inf is not compared."""
-    again = rollout(of_law(problem), env, [seed], problem=problem).costs[0]
-    if np.isfinite(cost) and not np.isclose(again, cost, rtol=1e-6, atol=0):
-        raise ValueError(
-            f"The MPC's episode from the seed {seed} cost {cost:.6g}, then {again:.6g}: the env "
-            "does not repeat it. All that is random must come from reset(seed=...). If it draws "
-            "from numpy's global generator, wrap it in sb3_yann.wrappers.SeededGlobals."
-        )
-
-
 def of_law(problem: LinearMPC) -> Controller:
     """Return the MPC itself."""
     law = law_of(problem)
     return lambda t, theta, rows: np.nan_to_num(law(theta))
 
 
+@dataclass
 class Excited:
     """The MPC with inputs that are moved at random, each for some steps.
 
     They are moved by ``push`` half-widths at most, for a share ``often`` of the time.
     """
 
-    def __init__(
-        self, problem: LinearMPC, seed: int, push: float = PUSH, often: float = OFTEN
-    ) -> None:
-        self.problem = problem
-        self.seed = seed
-        self.law = of_law(problem)
-        self.push = push
-        self.often = often
+    problem: LinearMPC
+    seed: int
+    push: float = PUSH
+    often: float = OFTEN
+
+    def __post_init__(self) -> None:
+        self.law = of_law(self.problem)
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m): those of an episode do not depend on what others there are."""
@@ -414,26 +402,22 @@ class Family(LearntModel):
 
     def member_of(self, episode: Episode) -> int:
         """Return the number of the member that predicts an episode best."""
-        dynamics = self.dynamics
-        part = dynamics.row.state
-        after = episode.thetas[1:, part]
-        predicted = dynamics.step(episode.thetas[None, :-1], episode.actions[None])[..., part]
-        missed = after - dynamics.coordinates.nearest(predicted, after)
-        errors = missed / dynamics.coordinates.units
+        errors = _missed(self, episode, slice(None)) / self.dynamics.coordinates.units
         return int(np.argmin(np.mean(errors**2, axis=(1, 2))))
 
 
 def missed_of(model: LearntModel, episode: Episode) -> Array:
     """Return what a model misses of the states after each step of an episode, (T, n)."""
-    dynamics = model.dynamics
-    if isinstance(model, Family):
-        acting = dynamics.members[model.member_of(episode)]
-        dynamics = Dynamics(model.problem, dynamics.coordinates, (acting,))
-    part = dynamics.row.state
-    rows = episode.thetas[:-1]
+    return _missed(model, episode, model.member_of(episode) if isinstance(model, Family) else None)
+
+
+def _missed(model: LearntModel, episode: Episode, member: int | slice | None) -> Array:
+    """Return the same of one member, of each (members, T, n), or of the mean of all."""
+    part = model.dynamics.row.state
     after = episode.thetas[1:, part]
-    predicted = TwinPlant(dynamics).advance(rows, episode.actions, np.arange(len(rows)))[:, part]
-    return np.asarray(after - dynamics.coordinates.nearest(predicted, after))
+    steps = model.dynamics.step(episode.thetas[None, :-1], episode.actions[None])[..., part]
+    predicted = steps.mean(axis=0) if member is None else steps[member]
+    return np.asarray(after - model.dynamics.coordinates.nearest(predicted, after))
 
 
 def lacks(model: LearntModel) -> tuple[bool, bool]:
@@ -458,47 +442,6 @@ def lacks(model: LearntModel) -> tuple[bool, bool]:
     whole = float(np.mean(errors**2))
     errs = bool(np.median(np.abs(errors), axis=0).max() > NOISE)
     return errs, errs and apart < LACKING * whole
-
-
-@dataclass(frozen=True, eq=False)
-class Disagreement:
-    """A price on the members' disagreement over a step, in standard deviations of the states.
-
-    One of these costs ``weight``. There are two members or more, and no observer.
-    """
-
-    dynamics: Dynamics
-    weight: float
-
-    def costs(self, thetas: Array, inputs: Array) -> Array:
-        """Return what steps cost (T, k)."""
-        return np.asarray(self.weight * np.sum(self._apart(thetas, inputs) ** 2, axis=-1))
-
-    def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
-        """Return gradients (T, k, n_theta + m) and Gauss-Newton curvatures of that."""
-        shape = thetas.shape[:2]
-        apart = self._apart(thetas, inputs)
-        flat = (each.reshape(1, -1, each.shape[-1]) for each in (thetas, inputs))
-        slopes = np.concatenate(self.dynamics.jacobians(*flat), axis=-1)
-        slopes = slopes[..., self.dynamics.row.state, :]
-        slopes = (slopes - slopes.mean(axis=0)) / self._units[:, None]
-        members, rows, n, size = slopes.shape
-        J = np.moveaxis(slopes, 0, 1).reshape(rows, members * n, size)
-        gradient = np.einsum("rqi,rq->ri", J, apart.reshape(rows, -1))
-        curvature = np.swapaxes(J, 1, 2) @ J
-        twice = 2 * self.weight
-        return twice * gradient.reshape(*shape, size), twice * curvature.reshape(*shape, size, size)
-
-    @property
-    def _units(self) -> Array:
-        return np.asarray(self.dynamics.coordinates.units * np.sqrt(len(self.dynamics.members)))
-
-    def _apart(self, thetas: Array, inputs: Array) -> Array:
-        """Return how far each member is from their mean, (T, k, members n)."""
-        flat = (each.reshape(1, -1, each.shape[-1]) for each in (thetas, inputs))
-        residual = self.dynamics.residual(*flat)
-        apart = (residual - residual.mean(axis=0)) / self._units
-        return np.asarray(np.moveaxis(apart, 0, 1).reshape(*thetas.shape[:2], -1))
 
 
 def task_of(model: LearntModel, unit: float, priced: bool = True) -> Task:
@@ -571,21 +514,19 @@ class Scenarios:
             last[:] = rng.integers([len(each) for each in episodes[len(first) - midway :]])
         thetas = row.shown(np.array([e.thetas[t] for e, t in zip(episodes, first, strict=True)]))
         if rng is not None:
-            thetas = thetas.copy()
             moved = thetas[1 : len(first) - midway : 2, :n]
             moved[:] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
         given = [
             e.thetas[np.minimum(t + np.arange(steps), len(e)), row.given]
             for e, t in zip(episodes, first, strict=True)
         ]
-        members = None
+        once = {id(each): each for each in episodes}
+        members = missed = None
         if isinstance(model, Family):
-            once = {id(each): each for each in episodes}
             number = {key: model.member_of(each) for key, each in once.items()}
             members = np.array([number[id(each)] for each in episodes])
-        missed = None
         if row.estimator is not None:
-            of_each = {id(e): missed_of(model, e) for e in episodes}
+            of_each = {key: missed_of(model, each) for key, each in once.items()}
             missed = np.zeros((steps, len(episodes), n))
             for i, (e, t) in enumerate(zip(episodes, first, strict=True)):
                 missed[: len(e) - t, i] = of_each[id(e)][t:]
