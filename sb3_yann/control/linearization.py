@@ -8,10 +8,11 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sb3_yann._validation import (
     Array,
+    Mask,
     check_array,
     check_positive,
     check_positive_vector,
@@ -33,6 +34,7 @@ from sb3_yann.control.simulator import (
 if TYPE_CHECKING:
     from sb3_yann.control.simulator import Maker
 
+Rate = Callable[[Array], Array]  # dx/dt (n,), or how far the state moves, at [x, u, d]
 LEVELS = 6
 RATIO = 4.0
 """Number of steps that approach a point, and how much shorter each is than the one before."""
@@ -196,9 +198,9 @@ XTOL = 1e-12  # in scales, of what is solved for; what is smaller is zero
 
 
 def _least_moved(
-    motion: Callable[[Array], Array],
+    motion: Rate,
     start: Array,
-    free: NDArray[np.bool_],
+    free: Mask,
     scale: Array,
     step: float,
     bounds: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
@@ -238,28 +240,17 @@ SETTLES = 2_000  # steps in which a plant may come to rest by itself
 SEARCH_STEP = 1e-3  # in scales, as a float32 state needs: SciPy's own would vanish in its rounding
 
 
-def _residual(simulator: Simulator, point: Array, scale: Array) -> Array:
-    """Return the motion of the state (n,) in one step, relative to the scale."""
-    reached = simulator.step(point)
-    return np.asarray((reached - point[: reached.size]) / scale[: reached.size])
-
-
 def _steady_state(
-    simulator: Simulator, start: Array, free: NDArray[np.bool_], scale: Array
+    simulator: Simulator, motion: Rate, start: Array, free: Mask, scale: Array
 ) -> Array:
     """Return the steady state and its action, shape (n+m,), with the free entries solved for.
 
-    ``start`` (n+m,) holds the known entries, and a guess for the free ones. ``scale`` (n+m,) is the
-    range in which each moves in use.
+    ``motion`` is that of the state in one step, in scales. ``start`` (n+m,) holds the known
+    entries, and a guess for the free ones.
     """
-    low = np.full(scale.size, -np.inf)
-    high = np.full(scale.size, np.inf)
     n = scale.size - simulator.space.shape[0]
-    low[n:] = simulator.space.low
-    high[n:] = simulator.space.high
-
-    def motion(point: Array) -> Array:
-        return _residual(simulator, point, scale)
+    low = np.append(np.full(n, -np.inf), simulator.space.low)
+    high = np.append(np.full(n, np.inf), simulator.space.high)
 
     def search(start: Array) -> tuple[Array, float]:
         return _least_moved(motion, start, free, scale, SEARCH_STEP, (low, high))
@@ -278,8 +269,7 @@ def _steady_state(
             point = other
             most = most_of_other
     if most > STEADY_RESIDUAL:
-        # What is left of the motion may be no more than the simulator's own error.
-        left = motion(point)
+        left = motion(point)  # which may be no more than the simulator's own error
         noise = noise_of(simulator.step, point, np.where(np.arange(scale.size) < n, scale, 0.0))
         noise /= scale[:n]
         if not (np.all(np.abs(left) <= STEADY_RESIDUAL + 5 * noise) and np.all(noise <= MAX_NOISE)):
@@ -408,11 +398,15 @@ def _linearize(
     scales = np.concatenate([size, (high - low) / 2])
     free = np.isnan(np.concatenate([np.full(n, np.nan) if x is None else x, u]))
     point = np.concatenate([x_start, u_start])
+
+    def motion(point: Array) -> Array:
+        return np.asarray((simulator.step(point) - point[:n]) / size)
+
     if np.any(free):
-        point = _steady_state(simulator, point, free, scales)
+        point = _steady_state(simulator, motion, point, free, scales)
     found, noise = _differentiate(simulator, point, scales)
     if not np.any(free):
-        _require_steady_state(_residual(simulator, point, scales), point, found.value, scales)
+        _require_steady_state(motion(point), point, found.value, scales)
     A, B = np.split(found.value, [n], axis=1)
     notes = [
         *notes_of(found, names((n, u.size))),
@@ -482,7 +476,6 @@ STARTS = (0.0, 1.0, -1.0, 0.1, 10.0, 100.0)
 """Scales of the free entries from which the steady state is sought, in turn."""
 RATE_STEP = 1e-6  # of the slopes that a search takes, in scales
 ANOTHER = 1e-3  # distance, in scales, from which two steady states are different ones
-Rate = Callable[[Array], Array]  # dx/dt (n,) at [x, u, d]
 
 
 def linearize_dynamics(

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
-from sb3_yann.control.identification.innovations import dead_times
-from sb3_yann.control.identification.least_squares import Regression
+from sb3_yann.control.identification.innovations import dead_times, no_effect, with_lags
+from sb3_yann.control.identification.least_squares import Regression, stacked
 from sb3_yann.control.identification.residuals import leftover, project_out
 from sb3_yann.control.linear_system import names
 from sb3_yann.log import Episode
@@ -41,33 +40,20 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
     """
     none = [0] * n_inputs
     longer = [episode for episode in episodes if len(episode) > MAX_DELAY + 1]
-    steps = sum(len(episode) - MAX_DELAY for episode in longer)
+    rows = with_lags(longer, MAX_DELAY + 1, MAX_DELAY)
     n = episodes[0].states.shape[1]
-    if steps <= 4 * (episodes[0].regressors.shape[1] + 1 + MAX_DELAY * n_inputs):
+    width = episodes[0].regressors.shape[1]
+    if sum(map(len, rows)) <= 4 * (width + 1 + MAX_DELAY * n_inputs):
         return none
-    unit = np.std(np.concatenate([each.regressors for each in longer]), axis=0)
-    unit = np.where(unit > 0, unit, 1.0)
-    m = longer[0].inputs.shape[1]
-    scaled = [
-        Episode(e.states / unit[:n], e.inputs / unit[n : n + m], e.disturbances / unit[n + m :])
-        for e in longer
-    ]
-    best = dead_times(scaled, MAX_DELAY, n_inputs)[0]
+    best = dead_times(longer, MAX_DELAY, n_inputs)[0]
     if not any(best):
         return none
-    now = np.concatenate([episode.regressors[MAX_DELAY:] for episode in longer])
-    target = np.concatenate([episode.states[MAX_DELAY + 1 :] for episode in longer])
-    plain = np.column_stack([np.ones(steps), now - np.mean(now, axis=0)])
-    taps = [
-        np.concatenate([e.driven[MAX_DELAY - lag : len(e) - lag, j] for e in longer])
-        for j, delay in enumerate(best)
-        for lag in range(1, delay + 1)
-    ]
-    regressors = np.column_stack([plain, *taps])
+    known, target = stacked(rows)
+    taps = [lag * width + n + j for j, delay in enumerate(best) for lag in range(1, delay + 1)]
+    known = known[:, [*range(width), *taps]]
     # Behind sensor noise earlier inputs tell of the state, too, but it is the latest that acts.
     prompt = [
-        _explained(regressors, 1 + n + j, target)
-        > _explained(regressors, plain.shape[1] + sum(best[: j + 1]) - 1, target)
+        _explained(known, n + j, target) > _explained(known, width + sum(best[: j + 1]) - 1, target)
         for j in range(n_inputs)
     ]
     found = [0 if each else lag for lag, each in zip(best, prompt, strict=True)]
@@ -78,6 +64,7 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
 def _explained(regressors: Array, column: int, target: Array) -> float:
     """Return the sum over targets (k, n) of squared partial correlations with one column."""
     others = np.delete(regressors, column, axis=1)
+    others = np.column_stack([np.ones(len(others)), others - others.mean(axis=0)])
     left = project_out(others, np.column_stack([target, regressors[:, column]]))
     sizes = np.sum(left**2, axis=0)
     explained = (left[:, :-1].T @ left[:, -1]) ** 2
@@ -154,17 +141,15 @@ def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
         return []
     left = []
     for early in range(MOST_EARLY + 1):
-        known = []
-        for x, u in rows:
-            count = len(u) - lags - MOST_EARLY
-            past = [a[lags - i :][:count] for i in range(lags + 1) for a in (x, u[early:])]
-            known.append(np.hstack([np.ones((count, 1)), *past]))
-        after = np.concatenate(
-            [x[lags + 1 :][: len(z)] for (x, _), z in zip(rows, known, strict=True)]
-        )
-        if len(after) < 4 * known[0].shape[1]:
+        moved = [
+            Episode(x[: len(u) - MOST_EARLY + 1], u[early : len(u) - MOST_EARLY + early])
+            for x, u in rows
+        ]
+        known, after = stacked(with_lags(moved, lags + 1, lags))
+        known = np.column_stack([np.ones(len(known)), known])
+        if len(after) < 4 * known.shape[1]:
             return []
-        left.append(np.mean(project_out(np.concatenate(known), after) ** 2, axis=0))
+        left.append(np.mean(project_out(known, after) ** 2, axis=0))
     floor = 1e-10 * np.var(after, axis=0) + np.finfo(float).tiny
     shares = (np.array(left[1:]) + floor) / (left[0] + floor)
     least = np.mean(shares, axis=1)  # with earlier inputs beside, still later rows do as well
@@ -194,7 +179,7 @@ def input_notes(
     lags = found_delays(episodes, m + d)
     notes = []
     for column, (name, lag) in enumerate(zip(names(sizes)[n:], lags, strict=True), n):
-        idle = _chance(found, n, column) > EFFECT_LEVEL
+        idle = no_effect(found, [column], EFFECT_LEVEL)
         if lag:
             start = f"{name} has no effect beyond chance, and t" if idle else "T"
             cure = f" Move its measurements {lag} samples down, in the log and on the plant."
@@ -210,15 +195,3 @@ def input_notes(
     if any(lags[:m]):
         notes.append(f"Pass delay={lags[:m] if m > 1 else lags[0]}, or delay='auto'.")
     return notes
-
-
-def _chance(found: Regression, n: int, column: int) -> float:
-    """Return the p-value of Hotelling's T-squared test that a whole column is zero."""
-    floor = (1e-10 * np.maximum(found.spread[:n], np.finfo(float).tiny)) ** 2
-    floor = np.diag(np.maximum(floor, 1e-13 * np.diag(found.covariance)))  # above its rounding
-    effect = found.coefficients[:, column] / max(found.factors[column], np.finfo(float).tiny)
-    square = float(effect @ np.linalg.solve(found.covariance + floor, effect))
-    freedom = found.degrees_of_freedom - n + 1
-    if freedom < 1:  # too little is known for a verdict
-        return 0.0
-    return float(fdtrc(n, freedom, square * freedom / (n * found.degrees_of_freedom)))

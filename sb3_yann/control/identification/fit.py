@@ -29,7 +29,7 @@ from sb3_yann.control.identification.least_squares import (
     regress,
     regularized,
 )
-from sb3_yann.control.identification.outputs import feedback
+from sb3_yann.control.identification.outputs import feedback, missed
 from sb3_yann.control.identification.residuals import (
     LONG_PREDICTION,
     TIED,
@@ -44,16 +44,6 @@ from sb3_yann.log import Episode, Log, split_episodes
 UNSURE = 3.0  # standard errors within which an effect may be none
 
 
-@dataclass(frozen=True, eq=False)
-class LogFit:
-    """A system fitted to a log, its fits one and ten steps ahead, (n,) each, and the dead times."""
-
-    system: LinearSystem
-    regression: Regression
-    fits: tuple[Array, Array]
-    delays: tuple[int, ...]
-
-
 def fit_log(
     log: Log,
     *,
@@ -64,8 +54,11 @@ def fit_log(
     ridge: float | str = "auto",
     held_out: float = 0.2,
     delay: int | str | Sequence[int] = 0,
-) -> LogFit:
-    """Return the least-squares fit to a log; options as of `identify`."""
+) -> tuple[LinearSystem, Regression, tuple[Array, Array], tuple[int, ...]]:
+    """Return the system that fits a log, its regression, its fits, and the dead times.
+
+    The fits (n,) are those one and ten steps ahead; the options are as of `identify`.
+    """
     log = log.with_all_states()
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
     episodes = list(log.episodes)
@@ -124,7 +117,7 @@ def fit_log(
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
     system = replace(system, notes=tuple(map(log.in_names, notes)))
-    return LogFit(system, found, fits, tuple(delays))
+    return system, found, fits, tuple(delays)
 
 
 def require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> None:
@@ -180,21 +173,14 @@ def system_of(
 
 def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
     """Return each state's fit (n,) in percent, predicted so many steps ahead."""
-    errors = []
-    targets = []
+    guesses = []
     for episode in episodes:
         starts = max(len(episode) - steps + 1, 0)
         x = episode.states[:starts]
         for k in range(steps):
             x = found.predict(np.hstack([x, episode.driven[k : k + starts]]))
-        errors.append(x - episode.states[steps:])
-        targets.append(episode.states[steps:])
-    target = np.concatenate([*targets, np.zeros((0, found.reached.size))])
-    if not len(target):
-        return np.full(found.reached.size, np.nan)
-    moved = np.linalg.norm(target - np.mean(target, axis=0), axis=0)
-    missed = np.linalg.norm(np.concatenate(errors), axis=0)
-    return np.asarray(100 * (1 - missed / np.where(moved > 0, moved, np.nan)))
+        guesses.append(x)
+    return missed([each.states[steps:] for each in episodes], guesses, found.reached.size)[1]
 
 
 def _delayed(

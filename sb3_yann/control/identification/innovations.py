@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from scipy.special import chdtrc
+from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
 from sb3_yann.control.gains import count_integrators, responses
@@ -34,7 +34,7 @@ CHANCE = 0.001
 CHANCES = (CHANCE, 1e-6)
 """The levels that are tried."""
 FLOOR = 1e-14
-"""Variance, of scaled outputs, below which all is rounding."""
+"""Variance, relative to the output's, below which all is rounding."""
 TINY_RIDGE = 1e-9
 """Of the number of steps: lags of a log without noise depend on each other."""
 
@@ -60,11 +60,6 @@ class Innovations:
     def order(self) -> int:
         """Number of states n."""
         return len(self.A)
-
-    @property
-    def n_parameters(self) -> int:
-        """Number of parameters, without those that a change of coordinates moves."""
-        return int(self.order * (self.B.shape[1] + 2 * len(self.C)))
 
     @property
     def inner(self) -> Array:
@@ -123,8 +118,7 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
     best = np.inf
     for p in tried:
         found = arx(episodes, p, start)
-        floor = FLOOR * np.eye(q)  # below it all is rounding
-        log_det = np.linalg.slogdet(found.covariance + floor)[1]
+        log_det = np.linalg.slogdet(above_rounding(found))[1]
         criterion = found.steps * log_det + 2 * q * p * width
         if criterion < best:
             best = criterion
@@ -139,9 +133,9 @@ def dead_times(
 ) -> list[tuple[int, ...]]:
     """Return for each input how many of its latest values have no effect on the next output.
 
-    With ``n_driven`` for so many of the inputs and disturbances. Outputs and inputs are scaled.
+    With ``n_driven`` for so many of the inputs and disturbances.
 
-    Wald's test that their coefficients in a long ARX model are zero, for one sample more as long as
+    A test that their coefficients in a long ARX model are zero, for one sample more as long as
     it does not speak against it, at each of the levels ``CHANCES``: among many inputs and outputs
     one that is too strict ends it too early.
     """
@@ -167,13 +161,23 @@ def dead_times(
     return delays
 
 
+def above_rounding(found: Regression) -> Array:
+    """Return the covariance (n, n) of residuals, the variances above what rounding makes."""
+    spread = found.spread[: len(found.reached)]
+    return found.covariance + np.diag(FLOOR * np.where(spread > 0, spread, 1.0) ** 2)
+
+
 def no_effect(found: Regression, columns: Sequence[int], chance: float) -> bool:
-    """Return whether Wald's test cannot tell the coefficients of some columns from zero."""
+    """Return whether an F test cannot tell the coefficients of some columns from zero.
+
+    Of one column it is Hotelling's T-squared test.
+    """
     b = found.coefficients[:, columns]
-    covariance = found.covariance + FLOOR * np.eye(len(b))
-    inner = np.linalg.solve(found.correlation[np.ix_(columns, columns)], b.T)
-    wald = float(np.sum(np.linalg.solve(covariance, b) * inner.T))
-    return bool(chdtrc(b.size, wald) > chance)
+    own = found.correlation[np.ix_(columns, columns)] + np.finfo(float).tiny * np.eye(len(columns))
+    inner = np.linalg.solve(own, b.T)
+    wald = float(np.sum(np.linalg.solve(above_rounding(found), b) * inner.T))
+    freedom = found.degrees_of_freedom - len(b) + 1
+    return bool(fdtrc(b.size, freedom, wald * freedom / b.size / found.degrees_of_freedom) > chance)
 
 
 class Past:
@@ -189,7 +193,7 @@ class Past:
         self.width = episodes[0].regressors.shape[1]
         self.rows = with_lags(episodes, p, p - 1)
         past = [each.regressors - self.arx.center for each in self.rows]
-        whiten = linalg.inv(linalg.cholesky(self.arx.covariance + FLOOR * np.eye(q), lower=True))
+        whiten = linalg.inv(linalg.cholesky(above_rounding(self.arx), lower=True))
         block = whiten @ self.arx.coefficients
         # What the past says of the output i samples on, beside what comes in between.
         future = np.zeros((p * q, p * self.width))

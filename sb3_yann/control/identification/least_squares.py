@@ -34,7 +34,6 @@ class Regression:
     center: Array  # (p,)
     reached: Array  # (n,)
     spread: Array  # (p,), root mean square about the center
-    factors: Array  # (p,), a column's standard errors over the residuals' deviation
     correlation: Array  # (p, p): its outer product with covariance is that of the coefficients
     covariance: Array  # (n, n), of the residuals
     autocorrelation: Array  # (n,), of residuals one step apart; zero where they are rounding
@@ -56,9 +55,8 @@ def regress(
     It passes through ``origin`` (n+m+d,), by default the mean of the data: an offset is fitted.
     ``ridge`` weighs squared coefficients, each in units of its regressor's spread.
     """
-    regressors = np.concatenate([episode.regressors for episode in episodes])
-    targets = np.concatenate([episode.states[1:] for episode in episodes])
-    steps = regressors.shape[0]
+    regressors, targets = stacked(episodes)
+    steps = len(regressors)
     unknowns = regressors.shape[1] + (origin is None)
     if steps <= unknowns:
         raise ValueError(
@@ -79,19 +77,18 @@ def regress(
         fixed = [f"{_direction(v, scale, labels)} never changes" for v in missing]
         raise ValueError(f"The data do not excite the plant: {'; '.join(fixed)}. {NOT_EXCITED}")
     inverse = right.T * (singular / (singular**2 + ridge)) if ridge else right.T / singular
-    coefficients = ((inverse @ left.T @ (targets - reached)) / scale[:, None]).T
+    inverse = inverse / scale[:, None]
+    coefficients = (inverse @ left.T @ (targets - reached)).T
     residuals = targets - reached - centered @ coefficients.T
     covariance = residuals.T @ residuals / (steps - unknowns)
-    factors = np.linalg.norm(inverse, axis=1) / scale
     real = np.sum(residuals**2, axis=0) > 1e-20 * np.sum(targets**2, axis=0)
     return Regression(
         coefficients=coefficients,
-        standard_errors=np.sqrt(np.diag(covariance))[:, None] * factors,
+        standard_errors=np.sqrt(np.diag(covariance))[:, None] * np.linalg.norm(inverse, axis=1),
         center=center,
         reached=reached,
         spread=spread,
-        factors=factors,
-        correlation=(inverse / scale[:, None]) @ (inverse / scale[:, None]).T,
+        correlation=inverse @ inverse.T,
         covariance=covariance,
         autocorrelation=np.where(real, neighbors(residuals, episodes), 0.0),
         degrees_of_freedom=steps - unknowns,
@@ -99,6 +96,12 @@ def regress(
         excitation=float(singular[-1] / singular[0]) if singular[0] > 0 else 0.0,
         weakest=_direction(right[-1], scale, labels),
     )
+
+
+def stacked(episodes: Sequence[Episode]) -> tuple[Array, Array]:
+    """Return the regressors (steps, p) and the next states (steps, n) of all episodes."""
+    regressors = np.concatenate([each.regressors for each in episodes])
+    return regressors, np.concatenate([each.states[1:] for each in episodes])
 
 
 def _direction(weights: Array, scale: Array, labels: list[str]) -> str:

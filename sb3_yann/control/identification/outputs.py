@@ -248,17 +248,18 @@ class Search:
         The chunks' own first states would count as parameters.
         """
         # A record's first samples say where it began, not how the plant moves.
-        first = [min(SETTLING, len(each) // 5) for each in self.fitted]
-        shown = np.concatenate([x.states[1 + k :] for x, k in zip(self.fitted, first, strict=True)])
-        guess = np.concatenate(
-            [predicted(model, x, start, 1)[k:] for x, k in zip(self.fitted, first, strict=True)]
-        )
-        read = np.isfinite(shown)
-        steps, q = shown.shape
-        price = 2 * np.log(np.log(max(steps, 16)))
-        noise = mean_square(np.where(read, shown - guess, 0.0), read) + FLOOR * np.eye(q)
+        parts = []
+        for each in self.fitted:
+            left = each.states[1:] - predicted(model, each, start, 1)
+            parts.append(left[min(SETTLING, len(each) // 5) :])
+        errors = np.concatenate(parts)
+        read = ~np.isnan(errors)
+        steps, q = errors.shape
+        # A change of the states' coordinates moves the other parameters.
+        count = model.order * (model.B.shape[1] + 2 * q)
+        noise = mean_square(np.where(read, errors, 0.0), read) + FLOOR * np.eye(q)
         size = log_determinant(noise, read.sum(axis=0))
-        return float(size + price * model.n_parameters / steps)
+        return float(size + 2 * np.log(np.log(max(steps, 16))) * count / steps)
 
 
 def free_run_errors(
@@ -272,17 +273,27 @@ def free_run_errors(
     Where no output has ten readings the fit is NaN.
     """
     longer = [each for each in episodes if len(each) > ahead]
-    if not longer:
-        none = np.full(len(model.C), np.nan)
-        return none, none
-    target = np.concatenate([each.states[ahead:] for each in longer])
-    guess = np.concatenate([predicted(model, each, start, ahead) for each in longer])
+    targets = [each.states[ahead:] for each in longer]
+    guesses = [predicted(model, each, start, ahead) for each in longer]
+    return missed(targets, guesses, len(model.C), least=10)
+
+
+def missed(
+    targets: Sequence[Array], guesses: Sequence[Array], size: int, least: int = 1
+) -> tuple[Array, Array]:
+    """Return the root mean square (size,) of what guesses miss, and the fit in percent.
+
+    Targets may be NaN. The fit is NaN where no column has so many at ``least``, and of a constant.
+    """
+    none = np.zeros((0, size))
+    target = np.concatenate([none, *targets])
+    left = target - np.concatenate([none, *guesses])
     with np.errstate(invalid="ignore"):
         count = np.isfinite(target).sum(axis=0)
-        mean = np.nansum(target, axis=0) / count
-        moved = np.sqrt(np.nansum((target - mean) ** 2, axis=0) / count)
-        errors = np.sqrt(np.nansum((target - guess) ** 2, axis=0) / count)
-    return errors, 100 * (1 - errors / np.where((moved > 0) & (count.max() >= 10), moved, np.nan))
+        away = target - np.nansum(target, axis=0) / count
+        errors, moved = (np.sqrt(np.nansum(each**2, axis=0) / count) for each in (left, away))
+        known = (moved > 0) & (count.max() >= least)
+        return errors, 100 * (1 - errors / np.where(known, moved, np.nan))
 
 
 def predicted(

@@ -11,12 +11,14 @@ from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
 from sb3_yann.control.gains import CURVED, UNTOLD
+from sb3_yann.control.identification.innovations import with_lags
 from sb3_yann.control.identification.least_squares import (
     WEAK,
     Regression,
     neighbors,
     pole_errors,
     pole_note,
+    stacked,
 )
 from sb3_yann.log import Episode
 from sb3_yann.units import FLOAT32_ROUNDING
@@ -54,9 +56,9 @@ def curvature_test(found: Regression, episodes: list[Episode]) -> tuple[Array, A
     The shares are corrected for the number of features, and zero where chance explains them. What
     is left has the shape (steps, n).
     """
-    now = np.concatenate([episode.regressors for episode in episodes]) - found.center
-    reached = np.concatenate([episode.states[1:] for episode in episodes])
-    residuals = reached - found.predict(now + found.center)
+    regressors, reached = stacked(episodes)
+    residuals = reached - found.predict(regressors)
+    now = regressors - found.center
     known = np.column_stack([np.ones(len(now)), now])
     added = features(now)
     before = project_out(known, residuals)
@@ -155,19 +157,12 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     """
     n = episodes[0].states.shape[1]
     lags = max(ORDERS[-1], *delays, 0)
-    longer = [episode for episode in episodes if len(episode) > lags]
-    steps = sum(len(episode) - lags for episode in longer)
-    none = np.zeros(n)
+    rows = with_lags(episodes, lags + 1, lags)
     width = episodes[0].regressors.shape[1]
-    if steps <= 4 * (2 * width + sum(delays) + 1):
-        return Leftover(none, none, none, none, none)
-    target = np.concatenate([each.states[lags + 1 :] for each in longer])[:SEARCHED]
-
-    def before(lag: int) -> Array:
-        rows = [each.regressors[lags - lag : len(each) - lag] for each in longer]
-        return np.concatenate(rows)[:SEARCHED]
-
-    now, *past = map(before, range(lags + 1))
+    if sum(map(len, rows)) <= 4 * (2 * width + sum(delays) + 1):
+        return Leftover(*[np.zeros(n)] * 5)
+    known, target = (each[:SEARCHED] for each in stacked(rows))
+    now, *past = np.split(known, lags + 1, axis=1)
     steps = len(now)
     center = now.mean(axis=0)
     plain = np.column_stack([np.ones(steps), now - center])

@@ -107,14 +107,10 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     Parameters
     ----------
     states : Log, or array_like, shape (T+1, n), or a sequence of such
-        A log; or one episode or several, each with the state before every action and after the
-        last. With a log, ``actions``, ``dt``, ``disturbances`` and ``time`` are its own.
-    actions : array_like, shape (T, m), or a sequence of such
-        The inputs as they were executed (clipped, if the plant clips).
-    dt : float
-        Sampling time.
-    disturbances : array_like, shape (T, d), or a sequence of such, optional
-        Measured disturbances, which make E.
+        A log; or the states of one episode or several.
+    actions, dt, disturbances, time
+        With states that are no log: inputs, ``dt``, disturbances and time as of
+        :meth:`sb3_yann.Log.from_arrays`. Disturbances make E.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
         The operating point. By default, inputs and disturbances take their mean, and the state is
         the fitted model's steady state. An integrating state keeps its mean, which the inputs hold.
@@ -127,9 +123,6 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
         over held-out data choose.
     held_out : float, default 0.2
         Fraction of all steps, the last ones, that tests the fit instead of making the model.
-    time : array_like, shape (T+1,), or a sequence of such, optional
-        When each row of the states was measured, in the unit of ``dt``. Steps whose time differs
-        from ``dt`` by more than 10 % are left out.
     delay : int, sequence of int, or "auto", default 0
         Dead time of the inputs, or of each, in samples: so many past inputs become states, newest
         first, input by input. "auto" finds it, up to 10 samples.
@@ -158,24 +151,17 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
         raise TypeError("identify takes a Log, or states and actions with dt=.")
     else:
         log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
+    point = {"x_ss": x_ss, "u_ss": u_ss, "d_ss": d_ss}
     try:
-        found = fit_log(
-            log,
-            x_ss=x_ss,
-            u_ss=u_ss,
-            d_ss=d_ss,
-            offset=offset,
-            ridge=ridge,
-            held_out=held_out,
-            delay=delay,
+        system, step, fits, delays = fit_log(
+            log, **point, offset=offset, ridge=ridge, held_out=held_out, delay=delay
         )
     except ValueError as error:
         raise ValueError(log.in_names(str(error))) from None
-    model = LinearModel(**{**vars(found.system), "disturbance_names": log.disturbance_names})
+    model = LinearModel(**{**vars(system), "disturbance_names": log.disturbance_names})
     if log.state_names:
         model = model.named(log.state_names, log.input_names, log.named_units)
-    step = found.regression
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)
     residuals = (step.covariance, step.degrees_of_freedom, step.autocorrelation)
-    return Identified(model, A, B, E, *residuals, *found.fits, step.excitation, found.delays)
+    return Identified(model, A, B, E, *residuals, *fits, step.excitation, delays)

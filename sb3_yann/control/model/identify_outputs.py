@@ -187,10 +187,8 @@ def identify_outputs(
     outputs : Log, or array_like, shape (T + 1, q), or a sequence of such
         A log whose states are the outputs; or one record or several. Rows with NaN are gaps, but
         for outputs that are read in fewer than two of three samples: these need not be there.
-    inputs : array_like, shape (T, m), or a sequence of such
-        As they were executed: row k acts between rows k and k + 1 of the outputs.
-    dt : float
-        Sampling time.
+    inputs, dt, disturbances
+        With outputs that are no log: as of :meth:`sb3_yann.Log.from_arrays`. Disturbances make E.
     order : int or "auto", default "auto"
         Number of states without dead time. "auto" takes that of the least criterion of Hannan and
         Quinn (J. R. Stat. Soc. B 41, 1979), up to 16.
@@ -198,8 +196,6 @@ def identify_outputs(
         Dead time of the inputs in samples. "auto" takes one, up to 10, where the latest inputs
         have no effect, it lowers the criterion, and free runs over held-out data do not suffer.
         Outputs that are read at each sample tell; where there is none, it takes 0.
-    disturbances : array_like, shape (T, d), or a sequence of such, optional
-        Measured disturbances, which make E.
     held_out : float, default 0.2
         Fraction of all steps, the last ones, over which the fits are reported. The model that is
         returned is fitted to all of them.

@@ -299,7 +299,7 @@ class LinearModel(LinearSystem):
             As of :func:`sb3_yann.identify`, which also returns standard errors.
         """
         log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
-        return cls(**vars(fit_log(log, **options).system))
+        return cls(**vars(fit_log(log, **options)[0]))
 
     def step(self, x: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> Array:
         """Return ``A x + B u + E d``; each is a vector or a batch of them, (batch, size)."""

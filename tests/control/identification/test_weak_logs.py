@@ -186,3 +186,12 @@ def test_a_rounded_law_of_the_states_is_refused_and_a_test_signal_is_not() -> No
             identify(x, u, dt=1)
     with pytest.raises(ValueError, match="within their rounding"):
         identify(x, u, dt=1)
+
+
+def test_a_ridge_takes_a_state_that_rests() -> None:
+    u = np.random.default_rng(0).normal(size=(100, 1))
+    x = np.zeros((101, 2))
+    for k in range(100):
+        x[k + 1, 0] = 0.8 * x[k, 0] + u[k, 0]
+    found = identify(x, u, dt=1, ridge=0.1)
+    assert not found.model.A[1].any() and not any("u[0] has no" in n for n in found.model.notes)
