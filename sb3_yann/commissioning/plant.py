@@ -148,11 +148,17 @@ class Plant:
             violations += violated or bool(excess > EXCESS_ROOM)
             unsafe += forbidden
             if alarm is None:
-                why = "The plant reports a violation, or ends the episode." if forbidden else ""
-                if excess > limit:
+                if not np.isfinite(read).all():
+                    alarm = Alarm("not a number", f"It reads {self._not_finite(read)}.")
+                elif excess > limit:
                     names = BoundNames.of(self.problem)
-                    why = f"On the plant {names.in_words(float(beyond.worst), float(excess))}."
-                alarm = self._look(watchdog, known, u, read, why)
+                    why = names.in_words(float(beyond.worst), float(excess))
+                    alarm = Alarm("violation", f"On the plant {why}.")
+                elif forbidden:
+                    why = "The plant reports a violation, or ends the episode."
+                    alarm = Alarm("violation", why)
+                elif watchdog is not None:
+                    alarm = watchdog.watch(known, u.astype(np.float64), read)
                 if alarm is not None:
                     step = len(actions)
                     act = self.mpc
@@ -176,15 +182,6 @@ class Plant:
         both[:, lost] = [[0.0], [1.0]]
         one, other = self.yann.theta(both).double().cpu().numpy()
         return np.where(one == other, one, np.nan)
-
-    def _look(
-        self, watchdog: Watchdog | None, known: Array, u: Array, read: Array, why: str
-    ) -> Alarm | None:
-        if not np.isfinite(read).all():
-            return Alarm("not a number", f"It reads {self._not_finite(read)}.")
-        if why:
-            return Alarm("violation", why)
-        return None if watchdog is None else watchdog.watch(known, u.astype(np.float64), read)
 
     def _not_finite(self, theta: Array) -> str:
         """Return which entries are not finite, by name."""

@@ -168,18 +168,26 @@ class Limits:
         of a worn plant, which rests beside its set-points, does not show that.
         """
         problem = coordinates.row.problem
+        own = problem.deviations
         n = problem.model.n_states
-        soft = problem.soft.x > 0
         low = coordinates.low[:n]
         high = coordinates.high[:n]
-        planned = [_planned(coordinates, starts)] if problem.layout.has_constants else []
-        for least, most in [(starts.low, starts.high), *planned]:
+        boxes = [(starts.low, starts.high)]
+        if problem.layout.has_constants:
+            model = Dynamics(problem, coordinates, (Residual.zero(len(coordinates.scale), n),))
+            first = starts.draw(PLANNED, np.random.default_rng(0))
+            steps = len(starts.rows) // len(starts.first)  # as many as the log's episodes have
+            rows = model.roll_out(law_of(problem), first[None], steps)[0]
+            x = np.clip(rows[..., coordinates.row.state], own.theta_min[:n], own.theta_max[:n])
+            boxes.append((x.min(axis=(0, 1, 2)), x.max(axis=(0, 1, 2))))
+        for least, most in boxes:
             width = BEYOND_DATA * (most - least)
             low = np.minimum(low, least - width)
             high = np.maximum(high, most + width)
+        soft = problem.soft.x > 0
         room = ON_BOUND * problem.theta_half[:n]
-        low = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min)) - room
-        high = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max)) + room
+        low = np.maximum(low, np.where(soft, -np.inf, own.x_min)) - room
+        high = np.minimum(high, np.where(soft, np.inf, own.x_max)) + room
         return cls(coordinates.row, low, high)
 
     def violated(self, thetas: Array, room: float = 0.0) -> NDArray[np.bool_]:
@@ -187,20 +195,6 @@ class Limits:
         x = thetas[..., self.row.state]
         more = room * self.row.problem.theta_half[: len(self.low)]
         return np.asarray(~((x >= self.low - more) & (x <= self.high + more)).all(axis=-1))
-
-
-def _planned(coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
-    """Return the box of the MPC's runs on its own model: as long as the log's, from its starts."""
-    problem = starts.problem
-    own = problem.deviations
-    n = problem.model.n_states
-    steps = len(starts.rows) // len(starts.first)
-    model = Dynamics(problem, coordinates, (Residual.zero(len(coordinates.scale), n),))
-    first = starts.draw(PLANNED, np.random.default_rng(0))
-    rows = model.roll_out(law_of(problem), first[None], steps)[0]
-    x = rows[..., coordinates.row.state].reshape(-1, n)
-    low, high = np.clip([x.min(axis=0), x.max(axis=0)], own.theta_min[:n], own.theta_max[:n])
-    return low, high
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -89,7 +89,9 @@ class _Replays:
         rows, inputs = (
             np.repeat(each[:, None], self.members, axis=1) for each in (self.rows[:-1], self.inputs)
         )
-        predicted = np.stack([self._step(r, u) for r, u in zip(rows, inputs, strict=True)])
+        with np.errstate(all="ignore"):
+            steps = map(self.dynamics.step, rows, inputs)
+            predicted = np.stack([*steps])
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
         self.weights = None
@@ -104,10 +106,6 @@ class _Replays:
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
         sizes = np.log(np.sum(unseen**2, axis=-1) + TINY_SQUARE)
         self.left = np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0)
-
-    def _step(self, rows: Array, u: Array) -> Array:
-        with np.errstate(all="ignore"):
-            return self.dynamics.step(rows, u)
 
     def new_given(self, some: int, rng: np.random.Generator) -> Array:
         """Return references and loads (T, N * some, p) of new episodes, ``some`` like each logged.
@@ -149,7 +147,7 @@ class _Replays:
         def step(t: int, rows: Array, inputs: Array) -> Array:
             if self.weights is not None:
                 missed[t] += self._regressors(t, rows[t], inputs, missed) @ self.weights
-            after: Array = self._step(rows[t], inputs[t]) + missed[t] @ row.spread.T
+            after: Array = self.dynamics.step(rows[t], inputs[t]) + missed[t] @ row.spread.T
             row.clip(after)
             after[:, ~alive[t]] = rows[t][:, ~alive[t]]
             return after

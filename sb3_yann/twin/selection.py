@@ -453,34 +453,24 @@ def held_out(
         return FreeRuns(np.array([1]), np.full((len(choices), 1, 1), np.inf))
     longest = min(LONGEST_RUN, int(np.median([*map(len, parts)])))
     horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
-    errors = np.empty((len(choices), len(parts), len(horizons)))
+    errors = np.full((len(choices), len(parts), len(horizons)), np.nan)
     # Stepped as one: those with hidden units, and those without.
     plain = np.array([each.by_fold[0].is_polynomial for each in choices])
     alike = [np.flatnonzero(plain == kind) for kind in {*plain.tolist()}]
     for i, episode in enumerate(bar("candidates on held-out episodes", parts)):
+        known = horizons[horizons <= len(episode)]  # a short piece says nothing of more
+        steps = int(known.max(initial=0))
+        starts = np.unique(np.linspace(0, len(episode) - steps, RUNS).astype(int))
+        actual = episode.thetas[starts[:, None] + known, coordinates.row.state]
         for same in alike:
-            made = [choices[j].by_fold[i % FOLDS] for j in same]
-            errors[same, i] = _errors(coordinates, episode, made, horizons)
+            members = tuple(choices[j].by_fold[i % FOLDS] for j in same)
+            dynamics = Dynamics(coordinates.row.problem, coordinates, members)
+            with np.errstate(all="ignore"):
+                free = dynamics.replay(episode, starts, steps)[:, :, known]
+                mean = np.mean(((free - actual) / coordinates.units) ** 2, axis=(1, 3))
+            mean = np.where(np.isfinite(mean), np.minimum(mean, 1e12), 1e12)
+            errors[same, i, : len(known)] = mean
     return FreeRuns(horizons, np.sqrt(errors))
-
-
-def _errors(
-    coordinates: Coordinates, episode: Episode, made: Sequence[Residual], horizons: Any
-) -> Array:
-    """Return mean squares (candidates, h) of one episode's free runs."""
-    found = np.full((len(made), len(horizons)), np.nan)
-    horizons = horizons[horizons <= len(episode)]  # a short piece says nothing of more
-    if not len(horizons):
-        return found
-    steps = int(horizons[-1])
-    starts = np.unique(np.linspace(0, len(episode) - steps, RUNS).astype(int))
-    actual = episode.thetas[starts[:, None] + horizons, coordinates.row.state]
-    dynamics = Dynamics(coordinates.row.problem, coordinates, tuple(made))
-    with np.errstate(all="ignore"):
-        free = dynamics.replay(episode, starts, steps)[:, :, horizons]
-        mean = np.mean(((free - actual) / coordinates.units) ** 2, axis=(1, 3))
-    found[:, : len(horizons)] = np.where(np.isfinite(mean), np.minimum(mean, 1e12), 1e12)
-    return found
 
 
 def judges(

@@ -361,7 +361,18 @@ class MeasuredDisturbance(Appending):
                 f"info has no {self.key!r}, only {sorted(info)}. Pass the name of the entry that "
                 "holds the measured disturbance as key."
             )
-        d = self._with_preview(np.atleast_1d(np.asarray(info[self.key], np.float64)), u is None)
+        given = np.atleast_1d(np.asarray(info[self.key], np.float64))
+        size = self.n_loads
+        rows = len(self.low) // size
+        d = given.reshape(-1, size) if given.ndim == 1 and len(given) % size == 0 else given
+        least = rows if u is None else 1
+        if d.ndim != 2 or d.shape[1] != size or not least <= len(d) <= rows:
+            expected = (size,) if rows == 1 else (rows, size)
+            ahead = f", a row for this sample and each of {rows - 1} ahead" if rows > 1 else ""
+            raise ValueError(
+                f"info[{self.key!r}] has shape {given.shape}, expected {expected}{ahead}."
+            )
+        d = d[np.minimum(np.arange(rows), len(d) - 1)].ravel()
         failing = ~np.isfinite(d)
         self.held = np.where(failing, self.held, d)
         if np.any(failing & ~self.failing):  # once, for a sensor that stays so
@@ -372,19 +383,6 @@ class MeasuredDisturbance(Appending):
             )
         self.failing = failing
         return [observation, self.held]
-
-    def _with_preview(self, given: Array, begins: bool) -> Array:
-        """Return d with its preview, (preview + 1) n_loads; the last row stays in an episode."""
-        size = self.n_loads
-        rows = len(self.low) // size
-        d = given.reshape(-1, size) if given.ndim == 1 and len(given) % size == 0 else given
-        if d.ndim != 2 or d.shape[1] != size or not (rows if begins else 1) <= len(d) <= rows:
-            expected = (size,) if rows == 1 else (rows, size)
-            ahead = f", a row for this sample and each of {rows - 1} ahead" if rows > 1 else ""
-            raise ValueError(
-                f"info[{self.key!r}] has shape {given.shape}, expected {expected}{ahead}."
-            )
-        return np.asarray(d[np.minimum(np.arange(rows), len(d) - 1)].ravel())
 
 
 def below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
