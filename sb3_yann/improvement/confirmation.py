@@ -131,7 +131,7 @@ class Trial:
         """
         starts = twin.starts
         drawn = np.concatenate([starts.draw_between(count, rng), starts.draw_around(count, rng)])
-        between = twin.dynamics.row.given.start < twin.dynamics.row.given.stop
+        between = drawn[:, twin.dynamics.row.given].size > 0
         follow = np.full(len(drawn), -1)
         logged = np.arange(count)[int(between) :: 1 + between]
         follow[logged] = np.arange(len(logged)) % len(twin.episodes)
@@ -148,7 +148,7 @@ class Trial:
         self.known = np.tile(np.arange(count) < self.n_known, members)
         self.given = np.repeat(self.starts[:1, :, part], self.steps, axis=0)
         for number, each in enumerate(episodes):
-            rows = each.thetas[np.minimum(np.arange(self.steps), len(each)), part]
+            rows = each.thetas[np.minimum(np.arange(self.steps), len(each))][:, part]
             self.given[:, self.follow == number] = rows[:, None]
         runs = self._run(law_of(self.twin.problem))
         self.rows = runs[0]

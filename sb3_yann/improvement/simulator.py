@@ -517,7 +517,7 @@ class Scenarios:
             moved = thetas[1 : len(first) - midway : 2, :n]
             moved[:] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
         given = [
-            e.thetas[np.minimum(t + np.arange(steps), len(e)), row.given]
+            e.thetas[np.minimum(t + np.arange(steps), len(e))][:, row.given]
             for e, t in zip(episodes, first, strict=True)
         ]
         once = {id(each): each for each in episodes}

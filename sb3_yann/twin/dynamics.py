@@ -261,7 +261,7 @@ class Dynamics:
         """
         times = starts + np.arange(steps)[:, None]
         begin = np.repeat(episode.thetas[starts][None], len(self.members), axis=0)
-        given = episode.thetas[times, self.row.given]
+        given = episode.thetas[times][..., self.row.given]
         rows, _ = self._play(lambda t, _: episode.actions[times[t]], begin, steps, given)
         return np.asarray(np.moveaxis(rows[..., self.row.state], 0, 2))
 

@@ -155,7 +155,7 @@ class _Replays:
         with np.errstate(all="ignore"):
             begins = np.repeat(starts.reshape(1, -1, size), self.members, axis=0)
             if given is None:
-                given = self.rows[:-1, like, row.given]
+                given = self.rows[:-1, like][..., row.given]
             rows, inputs = play(inputs_at, step, begins, steps, m, (row.given, given))
             found, _ = costs_of(problem, row.shown(rows), inputs, alive[:, None])
         found = np.where(np.isfinite(found), found, np.inf)

@@ -24,7 +24,6 @@ LEAST_SAVED = 1e-3  # a search is done when a correction saves less than this pa
 GUESS = 1e-5  # weight of the given states where windows begin, beside the outputs'
 KNOWN = 1e-2  # of those that another fit found: what is hidden has the same coordinates then
 FARTHEST = 3.0  # times the largest magnitude in the log, of a residual while it is fitted
-Run = Callable[[Array, Array], tuple[Array, Array]]
 
 
 def shoot(
@@ -102,7 +101,7 @@ def _run(
 
 
 def _descended(
-    run: Run,
+    run: Callable[[Array, Array], tuple[Array, Array]],
     target: tuple[Array, Array, Array, Array],
     weights: Array,
     begin: Array,

@@ -99,14 +99,13 @@ class RowLayout:
         return slice(parts.size, parts.size + parts.n_states)
 
     @cached_property
-    def given(self) -> slice:
-        """The entries that an episode prescribes: references, and disturbances if measured."""
+    def given(self) -> Any:
+        """The entries that an episode prescribes: references, what is measured of d, and bounds."""
         parts = self.problem.layout
-        if self.observer is not None:
-            return parts.reference
-        if self.estimator is None or not self.estimator.n_estimated:
+        found = slice(parts.constant.start, self._estimated.start)
+        if found.stop == parts.disturbance.stop:
             return parts.constant
-        return slice(parts.constant.start, self._estimated.start)
+        return np.r_[found, parts.limits] if parts.bounds else found
 
     @cached_property
     def measured(self) -> Array:

@@ -317,11 +317,6 @@ class Setting(NamedTuple):
     gain: tuple[int, float] | None = None
     drifts: bool = False
 
-    @property
-    def freedom(self) -> float:
-        """How far it may leave the given model."""
-        return float(self.degree - 2 * np.log10(self.shrinkage) - np.log10(self.factor))
-
     def __str__(self) -> str:
         """Name the kind and the shrinkage."""
         strongest = self.shrinkage * self.factor
@@ -400,7 +395,7 @@ def candidates(
     degrees = [degree for degree in (1, 2) if KINDS[degree] in kinds]
     choices = product(degrees, SHRINKAGES, INPUT_FACTORS)
     settings = [Setting(*each, drifts=drifts) for each in choices]
-    settings.sort(key=lambda each: each.freedom)
+    settings.sort(key=lambda s: s.degree - 2 * np.log10(s.shrinkage) - np.log10(s.factor))
     fits = [ridge(coordinates, each, settings) for each in kept if settings]
     zero = Residual.zero(len(coordinates.scale), coordinates.row.problem.model.n_states)
     found = [Candidate("none", (zero,) * len(kept))]

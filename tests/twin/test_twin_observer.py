@@ -18,6 +18,7 @@ from sb3_yann import (
     DisturbanceObserver,
     LinearModel,
     LinearMPC,
+    PlantEnv,
     PlantTwin,
     Tracking,
     improve,
@@ -25,6 +26,7 @@ from sb3_yann import (
     with_extra,
 )
 from sb3_yann._validation import Array
+from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.log import Episode, EstimatedDisturbanceWarning, observer_of, warn_of_estimates
 from sb3_yann.twin.row_layout import RowLayout
@@ -417,3 +419,16 @@ def test_measured_disturbances_stay_beside_estimated_ones() -> None:
     assert mpc.layout.names == ("x[0]", "x[1]", "r[0]", "d[0]", "d[1]")
     row = RowLayout(mpc, estimator)
     assert row.given == slice(2, 4)
+
+
+def test_bounds_that_change_are_those_of_the_log_beside_an_estimated_disturbance() -> None:
+    problem = LinearMPC(
+        LinearModel([[0.9]], [[0.1]], 1.0), Q=[[1]], R=[[0.1]], horizon=3, u_min=-1, u_max=1,
+        theta_min=-2, theta_max=2, parametric_bounds=["u_max"], tracking=Tracking([0], -0.5, 0.5),
+    )  # fmt: skip
+    mpc, observer = offset_free(problem)
+    options = {"hold": 10, "observer": observer, "max_episode_steps": 40}
+    env = PlantEnv(lambda x, u: np.log(0.9) * (x - 0.9 * u), mpc, **options)
+    log = evaluate(mpc.law(), env, seeds=range(6)).pairs
+    twin = PlantTwin.fit(mpc, log, observer=observer, residuals=["none", "linear"])
+    assert twin.trusted, twin.report()
