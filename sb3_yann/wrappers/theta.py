@@ -463,7 +463,7 @@ class EstimateState(Appending):
         self.measured: Any = below(env, MeasuredDisturbance)
         _require_known(observer, self.measured)
         if np.size(low) == np.size(high) == observer.model.n_disturbances:
-            low, high = (np.ravel(side)[-observer.n_estimated :] for side in (low, high))
+            low, high = (np.ravel(side)[observer.n_known :] for side in (low, high))
         super().__init__(env, low, high, observer.n_measured, observer.model.n_states)
         if len(self.low) != observer.n_estimated:
             raise ValueError(

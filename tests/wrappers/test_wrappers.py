@@ -356,6 +356,12 @@ def test_wrappers_in_another_order_than_theta_are_refused(use) -> None:
     use(SetPoint(EstimateState(Loaded(), StateEstimator(model)), [-4], [4]), plain)
 
 
+def test_bounds_of_measured_disturbances_are_left_out_where_none_is_estimated() -> None:
+    model = LinearModel(np.eye(2) / 2, np.ones((2, 1)), 1.0, E=np.ones((2, 1)))
+    env = MeasuredDisturbance(Counter(), -1, 1)
+    assert EstimateState(env, StateEstimator(model), -1, 1).observation_space.shape == (3,)
+
+
 def test_an_observer_without_a_measured_load_is_refused_in_any_order() -> None:
     mpc = loaded([[0.07, 1.0]], estimated=[1])
     knows = DisturbanceObserver(mpc.model)
