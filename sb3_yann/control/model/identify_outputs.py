@@ -139,11 +139,9 @@ class IdentifiedOutputs(ReadOnlyArrays):
     def estimator(self) -> StateEstimator:
         """Return the Kalman filter of this model, in deviations, for `wrappers.EstimateState`."""
         spread = self.gain @ self.noise
-        gain = None
-        if any(each > 1 for each in self.every):
-            own = len(self.model.A) - sum(self.delays)  # the rest are inputs on their way
-            gain = np.zeros_like(self.gain)
-            gain[:own] = np.linalg.lstsq(self.model.A[:own, :own], self.gain[:own], rcond=None)[0]
+        own = len(self.model.A) - sum(self.delays)  # the rest are inputs on their way
+        gain = np.zeros_like(self.gain)
+        gain[:own] = np.linalg.lstsq(self.model.A[:own, :own], self.gain[:own], rcond=None)[0]
         return StateEstimator(
             self.model,
             state_noise=spread @ self.gain.T,

@@ -90,6 +90,7 @@ def test_dead_time_is_told_from_order() -> None:
     u = steps(800, 1, 2)
     found = identify_outputs(played(u, a, b, c, 3, delay=5), u, dt=1)
     assert (found.order, found.delays, found.model.n_states) == (2, (5,), 7)
+    assert not found.estimator().gain[2:].any()  # inputs on their way are known
     prompt = identify_outputs(played(u, a, b, c, 3), u, dt=1)
     assert (prompt.order, prompt.delays) == (2, (0,))
     fresh = steps(500, 1, 8)
