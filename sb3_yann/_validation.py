@@ -20,8 +20,7 @@ Bounds = tuple[Array, Array]  # low, high
 Feedback = Callable[[Array], Array]  # thetas (batch, n_theta) -> inputs (batch, m)
 Options = TypeVar("Options")
 Kind = TypeVar("Kind")
-LARGEST_BOUND = 1e100
-"""Squares and sums of larger ones overflow."""
+LARGEST_BOUND = 1e100  # squares and sums of larger ones overflow
 
 
 class NonFiniteWarning(RuntimeWarning):

@@ -42,6 +42,11 @@ class Episode:
         return len(self.inputs)
 
     @property
+    def sizes(self) -> tuple[int, int, int]:
+        """The numbers n, m and d of states, inputs and disturbances."""
+        return self.states.shape[1], self.inputs.shape[1], self.disturbances.shape[1]
+
+    @property
     def driven(self) -> Array:
         """Inputs and disturbances of each step, shape (T, m + d)."""
         if not self.disturbances.size:
@@ -137,8 +142,7 @@ class Log:
     @property
     def sizes(self) -> tuple[int, int, int]:
         """The numbers n, m and d of states, inputs and disturbances."""
-        first = self.episodes[0]
-        return first.states.shape[1], first.inputs.shape[1], first.disturbances.shape[1]
+        return self.episodes[0].sizes
 
     @property
     def named_units(self) -> dict[str, str]:
@@ -257,27 +261,7 @@ class Log:
     ) -> Log:
         """Return the log of records, cut at gaps and where a step takes another time."""
         dt = check_positive("dt", dt)
-        labels: list[str] = []
-        columns: list[Array] = []
-        empty: list[str] = []
-        kinds = ("state", "x"), ("input", "u"), ("disturbance", "d"), ("reference", "r")
-        for of, letter in kinds:
-            parts = [getattr(each, f"{of}s") for each in records]
-            whole = np.concatenate(parts)
-            own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(whole.shape[1])]
-            whole = _without_marks(own, whole)
-            empty += [a for a, z in zip(own, whole.T, strict=True) if not np.isfinite(z).any()]
-            cut = np.split(whole, np.cumsum([len(each) for each in parts])[:-1])
-            cut = _without_spikes(own, cut) if of == "state" else cut
-            records = [
-                replace(each, **{f"{of}s": part}) for each, part in zip(records, cut, strict=True)
-            ]
-            if of != "reference":
-                labels += own
-                columns += [*np.concatenate(cut).T]
-        n = records[0].states.shape[1]
-        _warn_of_other_units(labels, columns, n)
-        _warn_of_repeats(labels[:n], records)
+        records, empty = _cleaned(records, names)
         on_time = None if time is None else _on_time(records, time, dt)
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
@@ -419,8 +403,7 @@ class Log:
         )
 
 
-SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}
-"""In a unit of time."""
+SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}  # in a unit of time
 
 
 NO_READING = -999, -9999, -99999, 999, 9999, 99999  # in place of one, as historians write it
@@ -512,24 +495,65 @@ def _name_and_unit(header: str) -> tuple[str, str]:
     return (name.strip(), unit.strip()) if bracket and header.endswith("]") else (header, "")
 
 
-def _without_marks(names: Sequence[str], values: Array) -> Array:
-    """Return values (N, k) with NaN for what historians write for no reading, far from all else."""
-    values = values.copy()
-    for name, column in zip(names, values.T, strict=True):
-        marks = np.isin(np.trunc(column), NO_READING)
-        rest = column[~marks & np.isfinite(column)]
-        if not (marks.any() and len(rest)):
-            continue
-        least = np.maximum(10 * np.ptp(rest), np.abs(column) / 2)
-        far = marks & (np.abs(column - np.median(rest)) > least)
-        far &= (column < 0) | (np.ptp(rest) > 0)  # else a switch may have these two values
-        if far.any():
+def _cleaned(records: list[Episode], names: dict[str, Any]) -> tuple[list[Episode], list[str]]:
+    """Return records without what is no reading, and the names of columns that have none.
+
+    What may be wrong besides is warned of.
+    """
+    empty = []
+    periods: dict[str, int] = {}
+    driven = set[int]()
+    for of, letter in ("state", "x"), ("input", "u"), ("disturbance", "d"), ("reference", "r"):
+        parts = [getattr(each, f"{of}s").copy() for each in records]
+        own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(parts[0].shape[1])]
+        for i, name in enumerate(own):
+            columns = [each[:, i] for each in parts]
+            _leave_out_marks(name, columns)
+            if of == "state":
+                _leave_out_spikes(name, columns)
+                periods[name] = _period(columns)
+            else:
+                driven.add(_period(columns))
+            whole = np.concatenate(columns)
+            if not np.isfinite(whole).any():
+                empty.append(name)
+            if of != "reference":
+                _warn_of_another_unit(name, whole, of == "state")
+        records = [
+            replace(each, **{f"{of}s": part}) for each, part in zip(records, parts, strict=True)
+        ]
+    for name, every in periods.items():
+        if every > 1 and every not in driven:
             warn(
-                f"{name} of the log is {column[far][0]:g} in {np.count_nonzero(far)} rows, far "
-                "from all others: taken for no reading. Leave such cells empty, or NaN."
+                f"{name} changes only once in {every} rows. If a historian repeats a reading, as a "
+                "laboratory's, leave the repeats empty (NaN): models and estimators then know it."
             )
-            column[far] = np.nan
-    return values
+    return records, empty
+
+
+def _leave_out(columns: Sequence[Array], rows: NDArray[np.bool_]) -> None:
+    """Set rows of a column, in parts, to NaN."""
+    ends = np.cumsum([len(each) for each in columns])[:-1]
+    for column, at in zip(columns, np.split(rows, ends), strict=True):
+        column[at] = np.nan
+
+
+def _leave_out_marks(name: str, columns: Sequence[Array]) -> None:
+    """Leave out what historians write for no reading, far from all else."""
+    column = np.concatenate(columns)
+    marks = np.isin(np.trunc(column), NO_READING)
+    rest = column[~marks & np.isfinite(column)]
+    if not (marks.any() and len(rest)):
+        return
+    least = np.maximum(10 * np.ptp(rest), np.abs(column) / 2)
+    far = marks & (np.abs(column - np.median(rest)) > least)
+    far &= (column < 0) | (np.ptp(rest) > 0)  # else a switch may have these two values
+    if far.any():
+        warn(
+            f"{name} of the log is {column[far][0]:g} in {np.count_nonzero(far)} rows, far "
+            "from all others: taken for no reading. Leave such cells empty, or NaN."
+        )
+        _leave_out(columns, far)
 
 
 UNITS = (
@@ -547,33 +571,27 @@ SPIKE = 50.0  # times nearly all other steps of a state are the two to and from 
 LONGEST_SPIKE = 3  # readings
 
 
-def _without_spikes(names: Sequence[str], parts: Sequence[Array]) -> list[Array]:
-    """Return records of states (T + 1, n), NaN where up to three in a row are far beyond the rest.
+def _leave_out_spikes(name: str, columns: Sequence[Array]) -> None:
+    """Leave out up to three readings in a row that are far beyond the rest.
 
-    They are left alone where there are many: a plant may answer a pulse so.
+    They stay where there are many: a plant may answer a pulse so.
     """
-    parts = [each.copy() for each in parts]
-    for i, name in enumerate(names):
-        columns = [each[:, i] for each in parts]
-        moves = np.abs(np.concatenate([np.diff(each[np.isfinite(each)]) for each in columns]))
-        moves = moves[moves > 0]
-        if len(moves) < LEAST_READ:
-            continue
-        least = SPIKE * float(np.quantile(moves, 0.9))
-        whole = np.concatenate(columns)
-        far = np.concatenate([_there_and_back(each, least) for each in columns])
-        rest = whole[~far & np.isfinite(whole)]
-        beyond = far & (np.abs(whole - np.median(rest)) > 1.5 * np.ptp(rest))
-        rows = np.flatnonzero(beyond)
-        if 0 < len(rows) <= LONGEST_SPIKE + len(whole) // 1000:
-            warn(
-                f"{name} of the log is {whole[rows[0]]:g} in row {rows[0]}, and far from it before "
-                f"and after ({len(rows)} such rows): taken for no reading."
-            )
-            ends = np.cumsum([len(each) for each in columns])[:-1]
-            for column, spike in zip(columns, np.split(beyond, ends), strict=True):
-                column[spike] = np.nan
-    return parts
+    moves = np.abs(np.concatenate([np.diff(each[np.isfinite(each)]) for each in columns]))
+    moves = moves[moves > 0]
+    if len(moves) < LEAST_READ:
+        return
+    least = SPIKE * float(np.quantile(moves, 0.9))
+    whole = np.concatenate(columns)
+    far = np.concatenate([_there_and_back(each, least) for each in columns])
+    rest = whole[~far & np.isfinite(whole)]
+    far &= np.abs(whole - np.median(rest)) > 1.5 * np.ptp(rest)
+    rows = np.flatnonzero(far)
+    if 0 < len(rows) <= LONGEST_SPIKE + len(whole) // 1000:
+        warn(
+            f"{name} of the log is {whole[rows[0]]:g} in row {rows[0]}, and far from it before "
+            f"and after ({len(rows)} such rows): taken for no reading."
+        )
+        _leave_out(columns, far)
 
 
 def _there_and_back(column: Array, least: float) -> NDArray[np.bool_]:
@@ -590,45 +608,25 @@ def _there_and_back(column: Array, least: float) -> NDArray[np.bool_]:
     return found
 
 
-def _warn_of_other_units(labels: Sequence[str], columns: Sequence[Array], n: int) -> None:
-    """Warn where a column goes on in another unit: where it jumps so far, and its steps grow so.
-
-    The first n are states.
-    """
-    for i, (name, column) in enumerate(zip(labels, columns, strict=True)):
-        rows = np.flatnonzero(np.isfinite(column))
-        z = column[rows]
-        steps = np.diff(z)
-        k = int(np.argmax(np.abs(steps))) if len(steps) else 0
-        if not LEAST_READ <= k < len(steps) - LEAST_READ:
-            continue
-        before, after = (np.sqrt(np.mean(each**2)) for each in (steps[:k], steps[k + 1 :]))
-        alone = abs(steps[k]) > JUMP * np.max(np.abs(np.delete(steps, k)))
-        for factor, shift in UNITS if alone and before * after > 0 else ():
-            near = abs(z[k + 1] - factor * z[k] - shift) < 4 * max(factor * before, after)
-            # An input may well be stepped by as much as zeros of units differ.
-            if near and 0.5 < factor * before / after < 2 and (i < n or not shift):
-                reads = f"{factor:.3g} times " * (factor != 1) + "what it did"
-                reads += f" {shift:+g}" * bool(shift)
-                warn(
-                    f"From row {rows[k + 1]} of the log on, {name} reads {reads}: has its unit "
-                    "changed? Bring the whole column to one unit."
-                )
-
-
-def _warn_of_repeats(labels: Sequence[str], records: Sequence[Episode]) -> None:
-    """Warn of states that change once in so many rows, always as many; not as an input does."""
-    driven = {
-        _period([z[:, i] for z in parts])
-        for parts in zip(*((e.inputs, e.disturbances, e.references) for e in records), strict=True)
-        for i in range(parts[0].shape[1])
-    }
-    for i, name in enumerate(labels):
-        every = _period([each.states[:, i] for each in records])
-        if every > 1 and every not in driven:
+def _warn_of_another_unit(name: str, column: Array, is_state: bool) -> None:
+    """Warn where a column goes on in another unit: where it jumps so far, and its steps grow so."""
+    rows = np.flatnonzero(np.isfinite(column))
+    z = column[rows]
+    steps = np.diff(z)
+    k = int(np.argmax(np.abs(steps))) if len(steps) else 0
+    if not LEAST_READ <= k < len(steps) - LEAST_READ:
+        return
+    before, after = (np.sqrt(np.mean(each**2)) for each in (steps[:k], steps[k + 1 :]))
+    alone = abs(steps[k]) > JUMP * np.max(np.abs(np.delete(steps, k)))
+    for factor, shift in UNITS if alone and before * after > 0 else ():
+        near = abs(z[k + 1] - factor * z[k] - shift) < 4 * max(factor * before, after)
+        # An input may well be stepped by as much as zeros of units differ.
+        if near and 0.5 < factor * before / after < 2 and (is_state or not shift):
+            reads = f"{factor:.3g} times " * (factor != 1) + "what it did"
+            reads += f" {shift:+g}" * bool(shift)
             warn(
-                f"{name} changes only once in {every} rows. If a historian repeats a reading, as a "
-                "laboratory's, leave the repeats empty (NaN): models and estimators then know it."
+                f"From row {rows[k + 1]} of the log on, {name} reads {reads}: has its unit "
+                "changed? Bring the whole column to one unit."
             )
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from sb3_yann._validation import Array, ReadOnlyArrays, check_type, is_text
 from sb3_yann.control.gains import Gains
 
-LARGEST_EXPONENT = 709.0
-"""Beyond it the exponential function exceeds what numbers hold."""
+LARGEST_EXPONENT = 709.0  # beyond it the exponential function exceeds what numbers hold
 
 
 @dataclass(frozen=True, eq=False)

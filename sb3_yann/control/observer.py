@@ -13,9 +13,7 @@ from sb3_yann._validation import Array, check_array, check_int, check_outputs, c
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
 
-PERIODS = 40
-"""Of all rates, after which the gain of a filter with several is that of the limit."""
-STANDARD = "Give standard deviations, above 0."
+PERIODS = 40  # of all rates, after which the gain of a filter with several is that of the limit
 
 
 class StateEstimator:
@@ -279,7 +277,7 @@ class DisturbanceObserver(StateEstimator):
 def _covariance(name: str, value: ArrayLike, size: int) -> tuple[Array, list[float]]:
     """Return a covariance (size, size) and standard deviations, given either."""
     if np.ndim(value) < 2:
-        deviations = check_positive_vector(name, value, size, STANDARD)
+        deviations = check_positive_vector(name, value, size, "Give standard deviations, above 0.")
         with np.errstate(all="ignore"):
             return np.diag(deviations**2), deviations.tolist()
     given = check_array(name, value, (size, size))

@@ -38,37 +38,14 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
 
     Long ARX models tell it from sensor noise and from curvature.
     """
-    none = [0] * n_inputs
     longer = [episode for episode in episodes if len(episode) > MAX_DELAY + 1]
-    rows = with_lags(longer, MAX_DELAY + 1, MAX_DELAY)
-    n = episodes[0].states.shape[1]
-    width = episodes[0].regressors.shape[1]
-    if sum(map(len, rows)) <= 4 * (width + 1 + MAX_DELAY * n_inputs):
-        return none
-    best = dead_times(longer, MAX_DELAY, n_inputs)[0]
-    if not any(best):
-        return none
-    known, target = stacked(rows)
-    taps = [lag * width + n + j for j, delay in enumerate(best) for lag in range(1, delay + 1)]
-    known = known[:, [*range(width), *taps]]
-    # Behind sensor noise earlier inputs tell of the state, too, but it is the latest that acts.
-    prompt = [
-        _explained(known, n + j, target) > _explained(known, width + sum(best[: j + 1]) - 1, target)
-        for j in range(n_inputs)
-    ]
-    found = [0 if each else lag for lag, each in zip(best, prompt, strict=True)]
+    steps = sum(len(episode) - MAX_DELAY for episode in longer)
+    if steps <= 4 * (sum(episodes[0].sizes) + 1 + MAX_DELAY * n_inputs):
+        return [0] * n_inputs
+    found = dead_times(longer, MAX_DELAY, n_inputs)[0]
     # A hidden state makes earlier inputs count too, but earlier states with them.
-    return none if any(found) and leftover(longer, found).is_hidden else found
-
-
-def _explained(regressors: Array, column: int, target: Array) -> float:
-    """Return the sum over targets (k, n) of squared partial correlations with one column."""
-    others = np.delete(regressors, column, axis=1)
-    others = np.column_stack([np.ones(len(others)), others - others.mean(axis=0)])
-    left = project_out(others, np.column_stack([target, regressors[:, column]]))
-    sizes = np.sum(left**2, axis=0)
-    explained = (left[:, :-1].T @ left[:, -1]) ** 2
-    return float(np.sum(explained / np.maximum(sizes[:-1] * sizes[-1], np.finfo(float).tiny)))
+    hidden = any(found) and leftover(longer, found).is_hidden
+    return [0] * n_inputs if hidden else [*found]
 
 
 def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]:
@@ -168,17 +145,15 @@ def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
 EFFECT_LEVEL = 0.01  # significance level of an input's effect
 
 
-def input_notes(
-    found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
-) -> list[str]:
+def input_notes(found: Regression, episodes: list[Episode]) -> list[str]:
     """Return notes on inputs and disturbances without effect, or with a delay.
 
     ``found`` is fitted without dead time to a part of the episodes.
     """
-    n, m, d = sizes
+    n, m, d = found.sizes
     lags = found_delays(episodes, m + d)
     notes = []
-    for column, (name, lag) in enumerate(zip(names(sizes)[n:], lags, strict=True), n):
+    for column, (name, lag) in enumerate(zip(names(found.sizes)[n:], lags, strict=True), n):
         idle = no_effect(found, [column], EFFECT_LEVEL)
         if lag:
             start = f"{name} has no effect beyond chance, and t" if idle else "T"

@@ -61,11 +61,9 @@ def fit_log(
     """
     log = log.with_all_states()
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
-    episodes = list(log.episodes)
-    sizes = log.sizes
-    require_moving(episodes, sizes)
-    episodes, sizes, delays = _delayed(episodes, sizes, delay)
-    n, m, d = sizes
+    require_moving(log.episodes)
+    episodes, delays = _delayed([*log.episodes], delay)
+    n, m, d = episodes[0].sizes
     if x_ss is not None and any(delays):
         if u_ss is None:
             raise ValueError(
@@ -83,7 +81,7 @@ def fit_log(
     fitted, tested = split_episodes(episodes, check_range("held_out", held_out, 0, 1, "[)"))
     weight = 0.0 if automatic else check_range("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
-    found = regress(fitted, sizes, origin, weight)
+    found = regress(fitted, origin, weight)
     if not weight:
         _require_excited(found, fitted, n, m)
         # Where an integral action ties inputs to earlier states the noise of the sensors biases
@@ -91,9 +89,9 @@ def fit_log(
         feedback(log.episodes)
     shrunk = list[str]()
     if automatic:
-        found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
+        found, weight, shrunk = regularized(found, fitted, tested, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, LONG_PREDICTION))
-    system = replace(system_of(found, sizes, given, log.dt, delays), time_unit=log.time_unit)
+    system = replace(system_of(found, given, log.dt, delays), time_unit=log.time_unit)
     memory = list[str]()
     if any(delays):
         own = n - sum(delays)
@@ -109,7 +107,7 @@ def fit_log(
             f"sb3_yann.wrappers.PastInputs(env, {delays}, initial=[{rest}])."
             f"{longest_note(delays)}"
         )
-    late = [] if any(delays) else early_note(episodes) or input_notes(found, episodes, sizes)
+    late = [] if any(delays) else early_note(episodes) or input_notes(found, episodes)
     if late:
         warn(log.in_names(" ".join(late)))
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
@@ -120,12 +118,12 @@ def fit_log(
     return system, found, fits, tuple(delays)
 
 
-def require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> None:
+def require_moving(episodes: Sequence[Episode]) -> None:
     """Raise where a sensor stands still though the plant moves."""
     states = [each.states for each in episodes]
     found = frozen_rows(states, [each.driven for each in episodes])
     if found:
-        raise ValueError(" ".join(words_for(found, names(sizes), states)))
+        raise ValueError(" ".join(words_for(found, names(episodes[0].sizes), states)))
 
 
 def _require_excited(found: Regression, episodes: list[Episode], n: int, m: int) -> None:
@@ -144,15 +142,11 @@ def _require_excited(found: Regression, episodes: list[Episode], n: int, m: int)
 
 
 def system_of(
-    found: Regression,
-    sizes: tuple[int, int, int],
-    given: Sequence[Array | None],
-    dt: float,
-    delays: Sequence[int],
+    found: Regression, given: Sequence[Array | None], dt: float, delays: Sequence[int]
 ) -> LinearSystem:
     """Return the system about its operating point, with notes on drift and extrapolation."""
-    n, m, _ = sizes
-    point = operating_point(found, sizes, given, delays)
+    n, m, _ = found.sizes
+    point = operating_point(found, given, delays)
     A, B, E = np.split(found.coefficients, [n, n + m], axis=1)
     x, u, d = np.split(point, [n, n + m])
     notes = []
@@ -167,7 +161,7 @@ def system_of(
     if away.size:
         notes.append(f"x_ss[{away[0]}] lies far outside the data: the model is extrapolated.")
     return LinearSystem(
-        A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None, gains_of(found, n, m)
+        A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None, gains_of(found)
     )
 
 
@@ -184,25 +178,24 @@ def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
 
 
 def _delayed(
-    episodes: list[Episode], sizes: tuple[int, int, int], delay: int | str | Sequence[int]
-) -> tuple[list[Episode], tuple[int, int, int], list[int]]:
-    """Return the episodes with past inputs as states, their sizes, and the dead times."""
-    n, m, d = sizes
+    episodes: list[Episode], delay: int | str | Sequence[int]
+) -> tuple[list[Episode], list[int]]:
+    """Return the episodes with past inputs as states, and the dead times."""
+    m = episodes[0].sizes[1]
     delays = as_delays(delay, m)
     if delays is None:
         delays = found_delays(episodes, m)
     if not any(delays):
-        return episodes, sizes, delays
+        return episodes, delays
     extended = with_memory(episodes, delays)
     if not extended:
         raise ValueError(
             f"delay = {delay!r}, but no episode has more than {max(delays)} steps: record longer."
         )
-    return extended, (n + sum(delays), m, d), delays
+    return extended, delays
 
 
-REPEATED_SHARE = 0.05
-"""Of all rows: so many repeated readings of one sensor are too many."""
+REPEATED_SHARE = 0.05  # of all rows: so many repeated readings of one sensor are too many
 LEAST_REPEATS = 10
 TIMES = 10.0
 """Equal readings in a row that a frozen sensor shows at least; how many times as many as usual."""

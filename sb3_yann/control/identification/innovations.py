@@ -24,19 +24,13 @@ from sb3_yann.control.identification.least_squares import Regression, regress
 from sb3_yann.control.lqr import spectral_radius
 from sb3_yann.log import Episode
 
-LAGS = (1, 2, 4, 6, 9, 13, 19, 28)
-"""Lags of the ARX models that are tried."""
-CHUNK = 2000
-"""Longest stretch of samples whose first state is estimated on its own."""
+LAGS = (1, 2, 4, 6, 9, 13, 19, 28)  # lags of the ARX models that are tried
+CHUNK = 2000  # longest stretch of samples whose first state is estimated on its own
 FORGOTTEN = 20.0  # errors of a filter's states fall to exp(-20) within a chunk
-CHANCE = 0.001
-"""Significance level of the effects of inputs."""
-CHANCES = (CHANCE, 1e-6)
-"""The levels that are tried."""
-FLOOR = 1e-14
-"""Variance, relative to the output's, below which all is rounding."""
-TINY_RIDGE = 1e-9
-"""Of the number of steps: lags of a log without noise depend on each other."""
+CHANCE = 0.001  # significance level of the effects of inputs
+CHANCES = (CHANCE, 1e-6)  # the levels that are tried
+FLOOR = 1e-14  # variance, relative to the output's, below which all is rounding
+TINY_RIDGE = 1e-9  # of the number of steps: lags of a log without noise depend on each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +93,7 @@ def with_lags(episodes: Sequence[Episode], lags: int, start: int) -> list[Episod
 def arx(episodes: Sequence[Episode], lags: int, start: int) -> Regression:
     """Return the ARX model of so many lags; a row of its regressors is as of `with_lags`."""
     rows = with_lags(episodes, lags, start)
-    first = rows[0]
-    sizes = (first.states.shape[1], first.inputs.shape[1], first.disturbances.shape[1])
-    return regress(rows, sizes, None, TINY_RIDGE * sum(map(len, rows)))
+    return regress(rows, ridge=TINY_RIDGE * sum(map(len, rows)))
 
 
 def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
@@ -229,7 +221,7 @@ class Past:
             for state, each in zip(self.states, self.rows, strict=True)
             if len(state) > 1
         ]
-        found = regress(moves, (n, driven, q), None, TINY_RIDGE * sum(map(len, moves)))
+        found = regress(moves, ridge=TINY_RIDGE * sum(map(len, moves)))
         inner, B, K = np.split(found.coefficients, [n, n + driven], axis=1)
         errors = y - self.arx.reached - x @ C.T
         noise = errors.T @ errors / len(errors)
@@ -402,8 +394,6 @@ def mean_square(errors: Array, read: NDArray[np.bool_]) -> Array:
     """Return the mean square (q, q) of errors (T, q); correlations where all are read."""
     whole = errors[np.all(read, axis=1)]
     found = whole.T @ whole / max(len(whole), 1)
-    if len(whole) == len(errors):
-        return np.asarray(found)
     size = np.sqrt(np.sum(np.where(read, errors, 0.0) ** 2, axis=0) / np.sum(read, axis=0))
     own = np.sqrt(np.diag(found))
     scale = np.where(own > 0, size / np.where(own > 0, own, 1.0), 0.0)

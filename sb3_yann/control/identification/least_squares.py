@@ -29,6 +29,7 @@ NOT_EXCITED = (
 class Regression:
     """``x[k+1] = reached + coefficients (z[k] - center)``, n states x, p regressors z."""
 
+    sizes: tuple[int, int, int]  # numbers of states, inputs and disturbances
     coefficients: Array  # (n, p)
     standard_errors: Array  # (n, p)
     center: Array  # (p,)
@@ -48,15 +49,16 @@ class Regression:
 
 
 def regress(
-    episodes: list[Episode], sizes: tuple[int, int, int], origin: Array | None, ridge: float
+    episodes: Sequence[Episode], origin: Array | None = None, ridge: float = 0.0
 ) -> Regression:
-    """Return the least-squares fit of one step, for numbers of states, inputs and disturbances.
+    """Return the least-squares fit of one step.
 
     It passes through ``origin`` (n+m+d,), by default the mean of the data: an offset is fitted.
     ``ridge`` weighs squared coefficients, each in units of its regressor's spread.
     """
     regressors, targets = stacked(episodes)
     steps = len(regressors)
+    sizes = episodes[0].sizes
     unknowns = regressors.shape[1] + (origin is None)
     if steps <= unknowns:
         raise ValueError(
@@ -83,6 +85,7 @@ def regress(
     covariance = residuals.T @ residuals / (steps - unknowns)
     real = np.sum(residuals**2, axis=0) > 1e-20 * np.sum(targets**2, axis=0)
     return Regression(
+        sizes=sizes,
         coefficients=coefficients,
         standard_errors=np.sqrt(np.diag(covariance))[:, None] * np.linalg.norm(inverse, axis=1),
         center=center,
@@ -112,7 +115,7 @@ def _direction(weights: Array, scale: Array, labels: list[str]) -> str:
     return combination(np.where(small, 0.0, factors / factors[largest]), labels, 4)
 
 
-def neighbors(residuals: Array, episodes: list[Episode]) -> Array:
+def neighbors(residuals: Array, episodes: Sequence[Episode]) -> Array:
     """Return the correlation (n,) of residuals (steps, n) with those one step before."""
     borders = np.cumsum([len(episode) for episode in episodes])[:-1]
     pairs = sum(np.sum(part[1:] * part[:-1], axis=0) for part in np.split(residuals, borders))
@@ -121,8 +124,7 @@ def neighbors(residuals: Array, episodes: list[Episode]) -> Array:
 
 
 WEAK = 0.01  # excitation below which a log is weak
-RIDGES = 10.0 ** np.arange(-9, 0)
-"""Ridges that are tried, relative to the number of steps."""
+RIDGES = 10.0 ** np.arange(-9, 0)  # ridges that are tried, relative to the number of steps
 BLIND = 1.0  # error of free runs, in spreads of the states, from which the mean says as much
 FREE_RUN = 50  # steps of a free run
 
@@ -131,7 +133,6 @@ def regularized(
     found: Regression,
     fitted: list[Episode],
     tested: list[Episode],
-    sizes: tuple[int, int, int],
     origin: Array | None,
 ) -> tuple[Regression, float, list[str]]:
     """Return the fit, its ridge and notes; a log that is not weak has none.
@@ -144,7 +145,7 @@ def regularized(
         return found, 0.0, []
     inner, outer = (fitted, tested) if tested else split_episodes(fitted, 0.2)
     ridges = np.array([0.0, *RIDGES]) * found.steps
-    errors = np.array([_free_run(regress(inner, sizes, origin, r), outer) for r in ridges])
+    errors = np.array([_free_run(regress(inner, origin, r), outer) for r in ridges])
     if np.min(errors) >= BLIND:
         raise ValueError(
             f"The log is too weakly excited: {found.weakest} moved {found.excitation:.1e} times as "
@@ -161,14 +162,13 @@ def regularized(
         f"{errors[best]:.2g} spreads of the states, without it by {errors[0]:.2g}. It biases "
         "weakly excited entries towards zero, which their standard errors leave out."
     )
-    return regress(fitted, sizes, origin, float(ridges[best])), float(ridges[best]), [note]
+    return regress(fitted, origin, float(ridges[best])), float(ridges[best]), [note]
 
 
 def _free_run(found: Regression, episodes: list[Episode]) -> float:
     """Return the error of free runs, root mean square in spreads of the states."""
     n = found.reached.size
-    total = 0.0
-    count = 0
+    squares = []
     unit = np.where(found.spread[:n] > 0, found.spread[:n], 1.0)
     for episode in episodes:
         for start in range(0, len(episode), FREE_RUN):
@@ -178,9 +178,8 @@ def _free_run(found: Regression, episodes: list[Episode]) -> float:
                 # One that runs away is as bad as can be, and its size says nothing.
                 error = np.minimum(np.abs(x - episode.states[k + 1]) / unit, 1e3)
                 x = np.clip(x, -1e150, 1e150)
-                total = total + float(np.mean(error**2))
-                count = count + 1
-    return float(np.sqrt(total / max(count, 1)))
+                squares.append(np.mean(error**2))
+    return float(np.sqrt(np.mean(squares)))
 
 
 def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
@@ -202,8 +201,9 @@ def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
 STEP = 1e-3  # of a standard deviation, in which responses are linear
 
 
-def gains_of(found: Regression, n: int, m: int) -> Gains:
-    """Return what m held inputs do to n states in the end, with errors by the delta method."""
+def gains_of(found: Regression) -> Gains:
+    """Return what held inputs do to states in the end, with errors by the delta method."""
+    n, m, _ = found.sizes
     A, B = np.split(found.coefficients[:, : n + m], [n], axis=1)
     part = found.correlation[: n + m, : n + m]
 
@@ -253,17 +253,14 @@ EXTRAPOLATED = 5.0  # spreads from the mean of the data beyond which a model is 
 
 
 def operating_point(
-    found: Regression,
-    sizes: tuple[int, int, int],
-    given: Sequence[Array | None],
-    delays: Sequence[int] = (),
+    found: Regression, given: Sequence[Array | None], delays: Sequence[int]
 ) -> Array:
     """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant.
 
     ``given`` holds what is known of x, u and d, None where nothing is. So many of the last states
-    are each input on its way: at rest these are the inputs, however far from the data.
+    as ``delays`` says are each input on its way: at rest these are the inputs.
     """
-    n, m, _ = sizes
+    n, m, _ = found.sizes
     means = zip(given, np.split(found.center, [n, n + m]), strict=True)
     start = np.concatenate([mean if value is None else value for value, mean in means])
     # The state gives way, or the inputs where the state is given; nothing where both are.
@@ -272,26 +269,22 @@ def operating_point(
     scale = np.where(found.spread > 0, found.spread, 1.0)
     moves = (found.coefficients - np.eye(n, scale.size)) * scale / scale[:n, None]
     doubt = found.standard_errors * scale / scale[:n, None]
-    drift = (found.predict(start[None])[0] - start[:n]) / scale[:n]
-    states = slice(0, n)
     inputs = slice(n, n + m)
+
+    def drift() -> Array:
+        return np.asarray((found.predict(start[None])[0] - start[:n]) / scale[:n])
+
     if given[0] is not None:
-        start[inputs] += scale[inputs] * _way(moves[:, inputs], drift, doubt[:, inputs])
+        start[inputs] += scale[inputs] * _way(moves[:, inputs], drift(), doubt[:, inputs])
         return start
     if given[1] is None:  # only the inputs can hold an integrator
-        left, _, _, known = _directions(moves[:, states], doubt[:, states])
+        left, _, _, known = _directions(moves[:, :n], doubt[:, :n])
         free = left[:, ~known].T
         errors = np.sqrt(free**2 @ doubt[:, inputs] ** 2)
-        way = _way(free @ moves[:, inputs], free @ drift, errors)
-        start[inputs] += scale[inputs] * way
-        drift = drift + moves[:, inputs] @ way
-    if any(delays):
-        states = slice(0, n - sum(delays))
-        start[states.stop : n] = np.repeat(start[inputs], delays)
-        drift = ((found.predict(start[None])[0] - start[:n]) / scale[:n])[states]
-        moves = moves[states]
-        doubt = doubt[states]
-    start[states] += scale[states] * _way(moves[:, states], drift, doubt[:, states])
+        start[inputs] += scale[inputs] * _way(free @ moves[:, inputs], free @ drift(), errors)
+    own = n - sum(delays)
+    start[own:n] = np.repeat(start[inputs], delays)
+    start[:own] += scale[:own] * _way(moves[:own, :own], drift()[:own], doubt[:own, :own])
     return np.where(np.abs(start) <= 1e-12 * scale, 0.0, start)  # no rounding
 
 

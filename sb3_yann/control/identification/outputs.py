@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from sb3_yann.control.identification.innovations import (
     Innovations,
     Past,
     dead_times,
-    errors_of,
     filtered,
     log_determinant,
     mean_square,
@@ -29,22 +28,19 @@ from sb3_yann.control.identification.innovations import (
 from sb3_yann.control.identification.least_squares import NOT_EXCITED
 from sb3_yann.control.identification.residuals import (
     TIED,
-    curvature_test,
     project_out,
     within_rounding,
 )
 from sb3_yann.log import Episode, split_episodes
 
-RUN_AHEAD = 20
-"""Samples of the free runs over held-out data."""
+RUN_AHEAD = 20  # samples of the free runs over held-out data
 MAX_ORDER = 16
 BETTER = 0.85
 """Mean square of free runs, relative to the criterion's choice, below which another is taken."""
 AS_LIKELY = 0.1
 """For each output, how much larger its criterion may be: errors of one step are 5 % larger then."""
 ORDER_PATIENCE = 4  # orders without a better criterion after which none is tried any more
-SURE_DELAY = 10.0
-"""By so much, over all steps, dead time must lower the criterion."""
+SURE_DELAY = 10.0  # by so much, over all steps, dead time must lower the criterion
 NO_MOVE = 1e-12
 SETTLING = 30  # samples in which a filter finds the first state
 FOLLOWS = 0.1  # share of an input that its feedback law leaves, below which the notes say so
@@ -54,32 +50,24 @@ WORSE = 1.1
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """A model of outputs in scaled units, with what chose it; NaN without held-out data."""
+    """A model of outputs in scaled units, with what chose it."""
 
     model: Innovations
     delays: tuple[int, ...]
-    errors: Array  # (q,), root mean square of free runs, in spreads of the outputs
+    error: float  # mean square of free runs, in spreads of the outputs; inf where there were none
     criterion: float  # Hannan and Quinn's, for each step
     start: tuple[Array, Array]  # mean (n,) and covariance (n, n) of the states
-    fits: tuple[Array, Array]  # (q,) each, one and `RUN_AHEAD` steps ahead, in percent
+    fits: tuple[Array, Array]  # (q,) each, one and `RUN_AHEAD` steps ahead, in percent, or NaN
     refined: bool = False  # by prediction errors
-    idle: tuple[int, ...] = ()  # inputs and disturbances without effect beyond chance
-    curvature: Array = field(default_factory=lambda: np.zeros(0))  # (q,), share of the errors
-    poles: tuple[Array, Array] = (np.zeros(0),) * 2  # with errors
-    integrators: int = 0
-    gain_errors: Array = field(default_factory=lambda: np.zeros((4, 0, 0)))  # (4, q, k)
-
-    @property
-    def error(self) -> float:
-        """Mean square of the free runs, inf where there were none."""
-        size = float(np.mean(self.errors**2))
-        return size if np.isfinite(size) else np.inf
 
 
 def fit_structure(
     episodes: Sequence[Episode], order: int | None, delays: Sequence[int] | None, held_out: float
-) -> Structure:
-    """Return the model of scaled episodes whose order and dead times are given, or None to find."""
+) -> tuple[Structure, Search]:
+    """Return the model of scaled episodes whose order and dead times are given, or None to find.
+
+    With it comes the search in all of the episodes.
+    """
     read, tested = split_episodes(episodes, held_out)
     with bar("models of the outputs") as tries:
         if delays is None:
@@ -92,18 +80,7 @@ def fit_structure(
             again = Search(read, tested, found.delays, tries, found).best(order)
             found = min(found, again, key=lambda each: each.criterion)
         final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
-    past = whole.past
-    *poles, integrators, gain_errors = errors_of(final.model, whole.chunks)
-    return replace(
-        found,
-        model=final.model,
-        start=final.start,
-        idle=tuple(past.idle()),
-        curvature=curvature_test(past.arx, past.rows)[0],
-        poles=(poles[0], poles[1]),
-        integrators=integrators,
-        gain_errors=gain_errors,
-    )
+    return replace(found, model=final.model, start=final.start), whole
 
 
 def delayed(
@@ -208,7 +185,7 @@ class Search:
                     break
                 n += step
         best = min(found.values(), key=lambda each: each.criterion)
-        limit = best.criterion + AS_LIKELY * len(best.errors)
+        limit = best.criterion + AS_LIKELY * len(best.model.C)
         rough = [] if self.chunks.rare.any() else self.tried  # those read slow outputs never
         near = [each for each in (*rough, *found.values()) if each.criterion <= limit]
         free = min(near, key=lambda each: each.error)
@@ -231,16 +208,23 @@ class Search:
         self.tries.update()
         q = len(model.C)
         if not self.chunks.forgets(model):
-            none = np.full(q, np.inf)
+            none = np.full(q, np.nan)
             nowhere = np.zeros(model.order), np.eye(model.order)
-            return Structure(model, self.delays, none, np.inf, nowhere, (none, none))
+            return Structure(model, self.delays, np.inf, np.inf, nowhere, (none, none))
         start = self.chunks.spread(model)
+
+        def ahead(steps: int) -> tuple[Array, Array]:
+            longer = [each for each in self.tested if len(each) > steps]
+            targets = [each.states[steps:] for each in longer]
+            guesses = [predicted(model, each, start, steps) for each in longer]
+            return missed(targets, guesses, q, least=10)
+
         with np.errstate(all="ignore"):
-            errors, long = free_run_errors(model, self.tested, start)
-            fits = free_run_errors(model, self.tested, start, 1)[1], long
+            errors, long = ahead(RUN_AHEAD)
+            fits = ahead(1)[1], long
             criterion = self.criterion(model, start)
-        size = criterion if np.isfinite(criterion) else np.inf
-        return Structure(model, self.delays, errors, size, start, fits)
+        error, size = (float(np.nan_to_num(x, nan=np.inf)) for x in (np.mean(errors**2), criterion))
+        return Structure(model, self.delays, error, size, start, fits)
 
     def criterion(self, model: Innovations, start: tuple[Array, Array]) -> float:
         """Return Hannan and Quinn's criterion (J. R. Stat. Soc. B 41, 1979), of whole records.
@@ -260,22 +244,6 @@ class Search:
         noise = mean_square(np.where(read, errors, 0.0), read) + FLOOR * np.eye(q)
         size = log_determinant(noise, read.sum(axis=0))
         return float(size + 2 * np.log(np.log(max(steps, 16))) * count / steps)
-
-
-def free_run_errors(
-    model: Innovations,
-    episodes: Sequence[Episode],
-    start: tuple[Array, Array],
-    ahead: int = RUN_AHEAD,
-) -> tuple[Array, Array]:
-    """Return the root mean square (q,) so many samples ahead, and the fit in percent.
-
-    Where no output has ten readings the fit is NaN.
-    """
-    longer = [each for each in episodes if len(each) > ahead]
-    targets = [each.states[ahead:] for each in longer]
-    guesses = [predicted(model, each, start, ahead) for each in longer]
-    return missed(targets, guesses, len(model.C), least=10)
 
 
 def missed(
@@ -309,8 +277,7 @@ def predicted(
     return np.asarray(x @ model.C.T + model.y_0)
 
 
-STAND_IN_RIDGE = 1e-3
-"""Of the number of readings: filtered signals depend on each other."""
+STAND_IN_RIDGE = 1e-3  # of the number of readings: filtered signals depend on each other
 
 
 def stand_ins(episodes: Sequence[Episode], earlier: Structure | None = None) -> list[Episode]:

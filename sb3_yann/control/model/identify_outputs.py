@@ -19,7 +19,14 @@ from sb3_yann.control.identification.dead_time import (
     memory_labels,
 )
 from sb3_yann.control.identification.fit import require_moving, system_of
-from sb3_yann.control.identification.innovations import TINY_RIDGE, Innovations, filtered, shifted
+from sb3_yann.control.identification.innovations import (
+    TINY_RIDGE,
+    Innovations,
+    Past,
+    errors_of,
+    filtered,
+    shifted,
+)
 from sb3_yann.control.identification.least_squares import WEAK, Regression, pole_note, regress
 from sb3_yann.control.identification.outputs import (
     RUN_AHEAD,
@@ -29,7 +36,7 @@ from sb3_yann.control.identification.outputs import (
     predicted,
     stand_ins,
 )
-from sb3_yann.control.identification.residuals import listed, listed_errors
+from sb3_yann.control.identification.residuals import curvature_test, listed, listed_errors
 from sb3_yann.control.linear_system import names
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
@@ -37,8 +44,7 @@ from sb3_yann.log import Arrays, Episode, Log
 
 EARLY_LAGS = 4  # earlier outputs beside which inputs of later rows are tried
 FEWEST = 30  # readings of an output that is read now and then: a model fits fewer by heart
-MAX_CONDITION = 1e3
-"""Condition number of C up to which outputs serve as states."""
+MAX_CONDITION = 1e3  # condition number of C up to which outputs serve as states
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +140,15 @@ class IdentifiedOutputs(ReadOnlyArrays):
         ahead = check_int("ahead", ahead, 1)
         if ahead > len(u):
             raise ValueError(f"ahead = {ahead}, but the record has {len(u)} steps.")
-        return predicted(self._innovations, Episode(y, u, d), self.start, ahead)
+        driven = np.hstack([model.B, model.E])
+        rest = model.x_ss - model.A @ model.x_ss - driven @ np.append(model.u_ss, model.d_ss)
+        C = model.shown
+        none = np.zeros(len(C))
+        sparse = any(each > 1 for each in self.every)
+        whole = Innovations(
+            model.A, driven, self.gain, C, rest + self.drift, none, self.noise, sparse
+        )
+        return predicted(whole, Episode(y, u, d), self.start, ahead)
 
     def estimator(self) -> StateEstimator:
         """Return the Kalman filter of this model, in deviations, for `wrappers.EstimateState`."""
@@ -150,18 +164,6 @@ class IdentifiedOutputs(ReadOnlyArrays):
             every=self.every or 1,
             gain=gain,
         )
-
-    @property
-    def _innovations(self) -> Innovations:
-        """The model in plant units, with its constant."""
-        model = self.model
-        driven = np.hstack([model.B, model.E])
-        rest = model.x_ss - model.A @ model.x_ss - driven @ np.append(model.u_ss, model.d_ss)
-        none = np.zeros(len(self.noise))
-        C = model.shown
-        sparse = any(each > 1 for each in self.every)
-        c = rest + self.drift
-        return Innovations(model.A, driven, self.gain, C, c, none, self.noise, sparse)
 
 
 def identify_outputs(
@@ -233,20 +235,22 @@ def identify_outputs(
             raise ValueError(log.in_names(f"{words}: leave it out, or log for longer."))
     episodes = stand_ins(read)
     try:
-        require_moving(episodes, log.sizes)
-        plain = regress(episodes, log.sizes, None, 0.0)
+        require_moving(episodes)
+        plain = regress(episodes)
         center = plain.center
         scale = np.where(plain.spread > 0, plain.spread, 1.0)
         scaled = [_scaled(each, center, scale, q, m) for each in read]
-        follows = feedback(stand_ins(scaled))
-        early = early_note(stand_ins(scaled), EARLY_LAGS)
+        filled = [_scaled(each, center, scale, q, m) for each in episodes]
+        follows = feedback(filled)
+        early = early_note(filled, EARLY_LAGS)
     except ValueError as error:
         words = str(error).replace("x[", "y[").replace(", or pass ridge > 0", "")
         raise ValueError(log.in_names(words)) from None
     if early:
         warn(early[0])
     share = check_range("held_out", held_out, 0, 0.5, "[]")
-    found = fit_structure(scaled, wanted, as_delays(delay, m), share)
+    found, search = fit_structure(scaled, wanted, as_delays(delay, m), share)
+    values, doubts, integrators, gain_errors = errors_of(found.model, search.chunks)
     model, start = _in_plant_units(found, center, scale, q)
     states = [
         replace(x, states=filtered(model, x.states, x.driven @ model.B.T + model.c, start))
@@ -255,16 +259,17 @@ def identify_outputs(
     n = model.order
     if wanted is not None and n < wanted:
         warn(f"order = {order}, but the log tells no more than {n} states: these are taken.")
-    step = regress(states, (n, m, d), None, TINY_RIDGE * sum(map(len, states)))
+    step = regress(states, ridge=TINY_RIDGE * sum(map(len, states)))
     both = np.hstack([model.A, model.B])
     step = replace(step, coefficients=both, reached=both @ step.center + model.c)
-    system = system_of(step, (n, m, d), (None, None, None), log.dt, [0] * m)
+    system = system_of(step, (None, None, None), log.dt, [0] * m)
     drift = step.predict(np.concatenate([system.x_ss, system.u_ss, system.d_ss])[None])[0]
     A, B, E, C, K = _with_memory(model, m, found.delays)
     errors = np.zeros((4, *B.shape))
     if np.array_equal(model.C, np.eye(q, n)):  # the first states are the outputs
-        errors[:, :q] = found.gain_errors[..., :m] * scale[:q, None] / scale[q : q + m]
+        errors[:, :q] = gain_errors[..., :m] * scale[:q, None] / scale[q : q + m]
     state_names = _state_names(log, model, found.delays)
+    told = _notes(log, found, search.past, plain, model, follows, (values, doubts))
     named = *state_names, *log.input_names, *log.disturbance_names
     whole = LinearModel(
         A,
@@ -274,8 +279,8 @@ def identify_outputs(
         system.u_ss,
         E if d else None,
         system.d_ss if d else None,
-        notes=[*system.notes, *early, *_notes(log, found, plain, step, model.noise, follows)],
-        gains=Gains.of(A, B, found.integrators, errors),
+        notes=[*system.notes, *early, *told],
+        gains=Gains.of(A, B, integrators, errors),
         state_names=state_names,
         input_names=log.input_names,
         disturbance_names=log.disturbance_names,
@@ -381,19 +386,19 @@ def _state_names(log: Log, model: Innovations, delays: Sequence[int]) -> Sequenc
 def _notes(
     log: Log,
     found: Structure,
+    past: Past,
     plain: Regression,
-    step: Regression,
-    noise: Array,
+    model: Innovations,
     follows: list[tuple[int, float]],
+    poles: tuple[Array, Array],
 ) -> list[str]:
     """Return notes on the fit, dead time, weak excitation, feedback, curvature and poles."""
-    n = found.model.order
     driven = names((0, *log.sizes[1:]))
     notes = [
-        f"From outputs: order {n}, fitted to {sum(map(len, log.episodes))} steps; one step differs "
-        f"from the prediction by {listed_errors(noise, plain.spread)} (standard deviation of each "
-        "output). A policy sees estimates: sb3_yann.wrappers.EstimateState(env, "
-        "found.estimator())."
+        f"From outputs: order {found.model.order}, fitted to {sum(map(len, log.episodes))} steps; "
+        f"one step differs from the prediction by {listed_errors(model.noise, plain.spread)} "
+        "(standard deviation of each output). A policy sees estimates: "
+        "sb3_yann.wrappers.EstimateState(env, found.estimator())."
     ]
     if not np.all(np.isnan(found.fits[0])):
         longer = f", {listed(found.fits[1])} % {RUN_AHEAD} steps ahead"
@@ -404,7 +409,7 @@ def _notes(
     if any(found.delays):
         notes.append(
             f"Dead time: inputs act for {[*found.delays]} samples. The states from "
-            f"x[{step.reached.size}] on are the inputs on their way.{longest_note(found.delays)}"
+            f"x[{model.order}] on are the inputs on their way.{longest_note(found.delays)}"
         )
     if plain.excitation < WEAK:
         notes.append(
@@ -414,23 +419,24 @@ def _notes(
     notes += [
         f"{driven[j]} has no effect on the outputs beyond chance. Is it delayed by more "
         "than the log shows, too small beside the noise, or not what the plant got?"
-        for j in found.idle
+        for j in past.idle()
     ]
     notes += [
         f"{driven[j]} follows the outputs: a feedback law explains all but {100 * left:.2g} % of "
         "what its own past leaves. Its gain rests on that rest."
         for j, left in follows
     ]
-    if np.any(found.curvature > 0):
+    curvature = curvature_test(past.arx, past.rows)[0]
+    if np.any(curvature > 0):
         notes.append(
             f"{CURVED}squares and products of outputs and inputs explain "
-            f"{listed(100 * found.curvature)} % of the prediction errors' variance. The plant is "
+            f"{listed(100 * curvature)} % of the prediction errors' variance. The plant is "
             "not linear over this log: record closer to the operating point."
         )
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")
     notes = [log.in_names(each) for each in notes]
-    notes.append(pole_note(*found.poles, "process and sensor noise"))
+    notes.append(pole_note(*poles, "process and sensor noise"))
     shown = log.state_names or [f"y[{i}]" for i in range(len(log.every))]
     if rare := [f"{name} every {n}" for name, n in zip(shown, log.every, strict=True) if n > 1]:
         notes.append(f"Read now and then: {', '.join(rare)} samples.")

@@ -14,8 +14,7 @@ from sb3_yann.log import in_names
 MAY_INTEGRATE = f"may integrate: it is 1 within {SURE_ERRORS:g} standard errors"
 UNREACHED = 1e-6
 SAME_SCALE = 2.0  # factor of balancing up to which states are of one size
-HARDLY_REACHED = 1e-3
-"""Motions of a direction by the inputs, relative to the largest."""
+HARDLY_REACHED = 1e-3  # motions of a direction by the inputs, relative to the largest
 DOUBLINGS = 16  # doublings of the Gramian's horizon: 65,536 samples
 GONE = 0.1  # time constant, in samples, below which a mode counts as a delay
 SLOW_SAMPLING = 1.0

@@ -64,7 +64,7 @@ def test_steady_gains_have_errors_and_one_that_may_be_zero_is_named() -> None:
     G = np.linalg.solve(np.eye(2) - A, B)
     none = np.zeros((400, 0))
     logs = [[Episode(*record(i, process=0.02)[:2], none)] for i in range(200)]
-    gains = [gains_of(regress(log, (2, 1, 0), None, 0.0), 2, 1) for log in logs]
+    gains = [gains_of(regress(log)) for log in logs]
     found = identify(*record(0, process=0.02)[:2], dt=1, held_out=0).model
     np.testing.assert_allclose(found.gains.errors, gains[0].errors)
     np.testing.assert_allclose(np.linalg.solve(np.eye(2) - found.A, found.B), gains[0].values)
@@ -97,7 +97,7 @@ def test_rates_of_what_integrates_have_intervals_that_hold(plant: str, noise: fl
         rng = np.random.default_rng(seed)
         u = np.repeat(rng.uniform(-1, 1, (50, m)), 8, axis=0)
         x = played(lambda x, u, r=rng: A @ x + B @ u + noise * r.normal(size=n), u, np.zeros(n))
-        gains = gains_of(regress([Episode(x, u, np.zeros((400, 0)))], (n, m, 0), None, 0.0), n, m)
+        gains = gains_of(regress([Episode(x, u, np.zeros((400, 0)))]))
         if gains.integrators < integrators and plant == "a slow lag":
             continue  # its gain is told, as of another lag
         assert gains.integrators == integrators

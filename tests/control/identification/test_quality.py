@@ -27,11 +27,8 @@ def log(steps: int = 300, curved: float = 0.0, noise: float = 0.1, seed: int = 0
     return Episode(played(step, driven, [0, 0]), driven)
 
 
-SIZES = (2, 1, 1)
-
-
 def fit(episode: Episode) -> Regression:
-    return regress([episode], SIZES, None, 0.0)
+    return regress([episode])
 
 
 def test_what_curvature_explains_is_no_noise() -> None:
