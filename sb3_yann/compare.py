@@ -484,6 +484,12 @@ class PairedTrial:
         """Those of the MPC from the starts that the policy has played."""
         return self.starts.mpc.at(slice(len(self.scores.costs)))
 
+    @property
+    def relative(self) -> Array:
+        """What each start costs more than with the MPC, in its own cost or the typical one."""
+        mpc = self.mpc_scores.costs
+        return relative_costs(self.scores.costs - mpc, mpc)
+
     def verdict(
         self,
         level: float,
@@ -516,8 +522,8 @@ class PairedTrial:
         enough = change <= -least_gain
         if found.reason or not must_gain or (enough and found.is_sure):
             return found
-        error = Difference.of(relative_costs(more, mpc.costs)).error
-        measured = f"{100 * change:+.2g} % (± {100 * error:.1g}) in {len(more)} pairs"
+        error = 100 * Difference.of(self.relative).error
+        measured = f"{100 * change:+.2g} % (± {error:.1g}) in {len(more)} pairs"
         return found._replace(reason=f"{measured}: {'not sure' if enough else TOO_LITTLE}")
 
 

@@ -345,17 +345,16 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
     passed = bar(f"{n} episode{'s' * (n > 1)}: steps", total=limit_of(plant.envs[0]))
     while running.any():
         actions = np.asarray(controller(len(inputs), shown, rows))
-        step = plant.step(actions, rows)
+        step = _Step(*(_scattered(each, rows, n) for each in plant.step(actions, rows)))
         inputs.append(_scattered(actions, rows, n).astype(np.float64))
-        states.append(_scattered(step.observations, rows, n).astype(np.float64))
+        states.append(step.observations.astype(np.float64))
+        steps.append(step)
         passed.update()
-        steps.append(_Step(*(_scattered(each, rows, n) for each in step)))
-        running[rows] &= ~(step.terminated | step.truncated)
+        running &= ~(step.terminated | step.truncated)
+        rows = rows if plant.steps_all else np.flatnonzero(running)
+        shown = step.observations[rows]
         if running.any():
             _watch_length(plant.envs[rows[0] if len(plant.envs) > 1 else 0], len(inputs))
-        live = np.ones(len(rows), dtype=bool) if plant.steps_all else running[rows]
-        shown = step.observations[live]
-        rows = rows[live]
     passed.close()
     _, rewards, terminated, truncated, violated, succeeded, changed, penalty = map(
         np.array, zip(*steps, strict=True)
@@ -430,6 +429,15 @@ def as_seeds(seeds: Iterable[int]) -> list[int]:
     """Return the seeds of episodes, whole numbers of at least 0."""
     check_type("seeds", seeds, Iterable, "a seed for each episode, e.g. range(20)")
     return [check_int("seeds", each, 0) for each in seeds]
+
+
+def require_finite(env: str, seeds: Sequence[int], costs: Array) -> None:
+    """Raise ValueError where an MPC's episode from a seed costs no finite number."""
+    for i in np.flatnonzero(~np.isfinite(costs))[:1]:
+        raise ValueError(
+            f"The MPC's episode of {env} from the seed {seeds[i]} costs {costs[i]:g}: what the env "
+            "shows and pays must be finite numbers, for policies are compared by their costs."
+        )
 
 
 def require_repeated(env: str, seed: int, cost: float, again: float) -> None:

@@ -24,7 +24,7 @@ from sb3_yann.guard.decide import GuardSettings, Player, Unplayable, try_before_
 from sb3_yann.guard.state import Decision, Evidence, GuardState
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import StartsAsMPC, require_problem_of_twin
-from sb3_yann.rollout import Trajectories, preserve_rng, require_repeated
+from sb3_yann.rollout import Trajectories, preserve_rng, require_finite, require_repeated
 
 REPEATED = 2  # starts from which the MPC plays twice: a simulator repeats itself
 OTHER_REWARD = 0.01  # of the mean cost: a reward that differs by more is another one
@@ -80,12 +80,7 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
     """
     name = settings.env
     mpc = player.episodes(player.mpc, seeds)
-    for i in np.flatnonzero(~np.isfinite(mpc.costs))[:1]:
-        raise ValueError(
-            f"The MPC's episode of the guard's env {name} from the seed {seeds[i]} costs "
-            f"{mpc.costs[i]:g}. Policies are compared by their costs: rewards must be finite "
-            "numbers."
-        )
+    require_finite(f"the guard's env {name}", seeds, mpc.costs)
     with preserve_rng():  # an env that draws from these would else repeat itself by accident
         random.random()
         np.random.random()  # noqa: NPY002

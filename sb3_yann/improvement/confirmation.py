@@ -27,7 +27,6 @@ from sb3_yann.compare import (
     looks,
     mean_change,
     no_worse,
-    relative_costs,
     unsafe_columns,
 )
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, costs_of
@@ -313,12 +312,6 @@ class SimulatorTrial(PairedTrial):
         return super().stages(policy, counts)
 
     @property
-    def relative(self) -> Array:
-        """What each costs against the MPC, in its own cost or the MPC's typical one."""
-        mpc = self.mpc_scores.costs
-        return relative_costs(self.scores.costs - mpc, mpc)
-
-    @property
     def less_safe(self) -> NDArray[np.bool_]:
         """Which of the policy's episodes are less safe than the MPC's."""
         return np.asarray(less_safe(self.scores.unsafe, self.mpc_scores.unsafe).any(axis=1))
@@ -365,7 +358,7 @@ def confirm(
     act: Feedback,
     simulator: Simulator,
     number: int,
-    say: Callable[[str, int], None] = lambda text, pairs: None,
+    say: Callable[[str], None] = lambda text: None,
     significance: float = RULE.significance,
 ) -> tuple[Check, SimulatorTrial]:
     """Play pairs from new starts until they are decisive; return the last look, and the trial.
@@ -375,14 +368,14 @@ def confirm(
     first look that shows it. One that surely gains too little is so from the second on: ten starts
     may all be of those from which nothing can be gained. Where a hard bound is in force, acceptance
     takes all 80: it may be exceeded in few episodes, and that is never traded for cost. ``say`` is
-    called with what each look shows, and after how many pairs.
+    called with what each look shows.
     """
     trial = SimulatorTrial(simulator)
     level = significance / sum(count >= ENOUGH for count in LOOKS)
     for _ in trial.stages(act, LOOKS):
         found, verdict = trial.check(number, level, final=True)
         count = len(trial.starts.seeds)
-        say(f"confirmation, {count} new starts: {100 * found.change:+.2f} %", count)
+        say(f"confirmation, {count} new starts: {100 * found.change:+.2f} %")
         enough = LOOKS[-1] if trial.rides_a_bound else ENOUGH
         most = max(-found.change, 2 * found.error - found.logged)  # what it may gain
         hopeless = count > FIRST_LOOK and (verdict.is_hopeless or most < RULE.least_gain)

@@ -144,8 +144,8 @@ class Improvement:
         """
         if not self.accepted:
             return 0.0, 0.0
-        known = [each.interval for each in self.checks if each.accepted and each.interval]
-        return known[-1] if known else (-np.inf, np.inf)
+        last = self._accepted
+        return (last and last.interval) or (-np.inf, np.inf)
 
     def export(self, path: str | PathLike[str], **options: Any) -> Exported:
         """Write policy and estimator as a file or as code: :func:`sb3_yann.export` of the model."""
@@ -156,11 +156,12 @@ class Improvement:
         """Why nothing was accepted; empty where something was."""
         if self.accepted:
             return ""
-        text = self.note or (self._last.reason if self._last else f"no gain in {self.where}")
-        if not text and self._last:
-            change = change_in_percent(self._last.change)
-            text = f"{change} in {self.where} is too little, or not sure"
-        return f"Nothing better was found: {text}."
+        last = self._last
+        text = f"no gain in {self.where}"
+        if last:
+            little = f"{change_in_percent(last.change)} in {self.where} is too little, or not sure"
+            text = last.reason or little
+        return f"Nothing better was found: {self.note or text}."
 
     @property
     def _last(self) -> Check | None:
@@ -266,12 +267,10 @@ def improve(
 ) -> Improvement:
     """Improve a model's policy in a twin of its plant, or with a simulator; the plant sees nothing.
 
-    Nearly optimal plans, those of :func:`headroom`, are made in a learnt model, from many starts at
-    once, and the actor's networks learn to do what they do, and what their feedback does nearby;
-    in a model of a simulator they then descend the costs of its episodes. A simulator decides by
-    new starts, in pairs with the MPC; a twin by every member, and by :meth:`PlantTwin.forecast`.
-    What is refused is taught, then parts of the correction are tried: ``docs/improve.md`` has the
-    steps and the tests.
+    Nearly optimal plans, those of :func:`headroom`, are made in a learnt model, and the actor's
+    networks learn to do what they do. A simulator decides by new starts, in pairs with the MPC; a
+    twin by every member, and by :meth:`PlantTwin.forecast`: ``docs/improve.md`` has the steps and
+    the tests.
 
     Where the actor keeps the problem's bounds, and no ``bounds_margin`` was given, it keeps as far
     from them as the MPC's model errs in 95 % of the steps. The model ends with the policy that was
@@ -285,17 +284,15 @@ def improve(
     ----------
     model : DDPG, TD3, SAC, TQC, PPO or LinearMPC
         With a YANN policy of the twin's problem; the most likely actions of the last three are
-        improved, and their spread stays. An MPC gets a DDPG model of its own, with
-        one network for all regions, which the result holds: ``result.model``,
-        ``result.export("controller.c")``.
+        improved, and their spread stays. An MPC gets a DDPG model of its own, with one network for
+        all regions: ``result.model``, ``result.export("controller.c")``.
     twin : PlantTwin, gymnasium.Env, str, callable or VecEnv
         A twin, which must be trusted; or a simulator, which shows theta of the model's problem, in
         plant units where that is, or what the policy's ``observation`` makes theta of. The
         problem's stage cost counts, and no reward: a :class:`CostMismatchWarning` says where that
         is another one. A function or an id makes as many as are played side by side, a given env
-        is copied. The processes of a SubprocVecEnv
-        play at once. Within ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, episodes
-        are spread over its workers; nothing else changes.
+        is copied. The processes of a SubprocVecEnv play at once. Within
+        ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, workers share the episodes.
     max_steps : int, optional
         Of a simulator, for everything. Where they do not suffice nothing is accepted; where they
         cannot, it ends after one episode. The result names how many are needed.
@@ -344,8 +341,8 @@ def improve(
             f"twin = {twin!r} must be a PlantTwin; or a simulator: a single gymnasium.Env, its id, "
             "or a function that makes one, or a VecEnv of them."
         )
-    for name in ("n_starts", "rounds", "updates"):
-        check_int(name, given[name])
+    for name, least in {"n_starts": 1, "rounds": 1, "updates": 1, "seed": 0}.items():
+        check_int(name, given[name], least)
     if max_steps is not None:
         check_int("max_steps", max_steps)
         if isinstance(twin, PlantTwin):
@@ -353,7 +350,6 @@ def improve(
                 f"max_steps = {max_steps} bounds the steps of a simulator, and a twin takes none. "
                 "Leave it out; n_starts, rounds and updates bound what a twin takes."
             )
-    check_int("seed", seed, 0)
     check_bool("confine", confine)
     with shown(progress_bar, parts=True), threadpool_limits(1):
         if isinstance(model, LinearMPC):
@@ -400,24 +396,29 @@ def fingerprint(state: dict[str, th.Tensor]) -> str:
     return found.hexdigest()
 
 
+@dataclass
 class _Progress:
-    """Lines that say what is done, and about how long the rest takes."""
+    """Lines that say what is done, and about how long the rest takes.
 
-    def __init__(self, rounds: int) -> None:
-        self.rounds = rounds  # that are left at most
-        self.confirmations = 0  # the same
+    So many ``rounds`` and ``confirmations`` are left at most.
+    """
+
+    rounds: int
+    confirmations: int = 0
+    simulator: Simulator | None = None
+
+    def __post_init__(self) -> None:
         self.write = Progress()
-        self.simulator: Simulator | None = None
-        self.ends: list[float] = []  # when the data were there, and when each round was over
+        self.ends = list[float]()  # when the data were there, and when each round was over
 
-    def __call__(self, text: str, pairs: int = 0, detail: bool = False) -> None:
-        """Write a line; ``pairs`` of a confirmation have been played. Changes are of the cost."""
+    def __call__(self, text: str, detail: bool = False) -> None:
+        """Write a line. Changes are of the cost."""
         left = 0.0
         if len(self.ends) > 1:
             each = (self.ends[-1] - self.ends[0]) / (len(self.ends) - 1)
             left = max(each * self.rounds - (time.monotonic() - self.ends[-1]), 0.0)
             if self.simulator:
-                episodes = 2 * (self.confirmations * LOOKS[-1] - pairs)
+                episodes = 2 * self.confirmations * LOOKS[-1]
                 left += self.simulator.seconds * episodes / max(self.simulator.played, 1)
         self.write(text, left, detail)
 
@@ -432,11 +433,6 @@ class _Progress:
         """Note the time, from which what is left follows."""
         self.rounds -= bool(self.ends)
         self.ends.append(time.monotonic())
-
-    def confirm(self, attempt: int) -> None:
-        """Count what is left from an attempt to confirm on."""
-        self.rounds = max(TRIES - 1 - attempt, 0)
-        self.confirmations = TRIES + 1 - attempt
 
 
 @dataclass
@@ -594,11 +590,11 @@ class _Work:
         self.note(found, how, found.verdict)
         return found
 
-    def note(self, found: Check, how: str, verdict: str, pairs: int = 0) -> None:
+    def note(self, found: Check, how: str, verdict: str) -> None:
         """Keep a candidate's check, and write a line with its number."""
         self.checks.append(found)
         change = change_in_percent(found.change)
-        self.say(f"candidate {len(self.checks)}, {how}: {change}, {verdict}", pairs)
+        self.say(f"candidate {len(self.checks)}, {how}: {change}, {verdict}")
 
     def _forecast(self, twin: PlantTwin, check: Check) -> Check:
         """Return a check with what the layer changes on the plant; it must surely gain."""
@@ -761,14 +757,15 @@ class _Work:
     def _confirm(self, simulator: Simulator, model: LearntModel, best: float) -> bool:
         """Let the simulator decide; teach what is lost, at most three times, then retreat."""
         for attempt in range(TRIES + 1):
-            self.say.confirm(attempt)
+            self.say.rounds = max(TRIES - 1 - attempt, 0)
+            self.say.confirmations = TRIES + 1 - attempt
             if attempt == TRIES:
                 self.scale(RETREATS[0], self.layer.state_dict())
             share = RULE.significance / (TRIES + 1)  # all tries together err with no more
             found, trial = confirm(self.act(), simulator, len(self.checks) + 1, self.say, share)
             if found.accepted and not found.change < best:
                 found = replace(found, accepted=False, reason="the model's own policy is as good")
-            self.note(found, f"confirmation, {found.starts_in_words}", found.verdict, LOOKS[-1])
+            self.note(found, f"confirmation, {found.starts_in_words}", found.verdict)
             if found.accepted:
                 self.accept(model)
                 return True

@@ -31,7 +31,7 @@ from sb3_yann.improvement.simulator import (
     task_of,
 )
 from sb3_yann.plan import PAUSE, Planning, TwinPlant, value_at_end
-from sb3_yann.rollout import Controller, Rows, Trajectories
+from sb3_yann.rollout import Controller, Rows, Trajectories, require_finite
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import as_episodes
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -284,9 +284,8 @@ def headroom(
         reward is another one.
     env_or_twin : gymnasium.Env, str, callable or PlantTwin
         A simulator that shows theta of the MPC and takes its inputs, in plant units where the MPC's
-        model has an operating point. It plays the same episode again from the same
-        seed and inputs, and is copied. Or a twin of the MPC's plant, each of
-        whose members has its share of the starts.
+        model has an operating point. It plays the same episode again from the same seed and inputs,
+        and is copied. Or a twin of the MPC's plant, whose members share the starts.
     n_starts : int, default 30
         Starts, from ``seed`` on.
     seed : int, default 0
@@ -399,12 +398,7 @@ class _Search:
     def play_mpc(self) -> None:
         """Play the MPC, and see that the env repeats an episode."""
         played = self.simulator.watch(self.seeds, checked=self.twin is None)
-        if not np.all(np.isfinite(played.costs)):
-            i = int(np.flatnonzero(~np.isfinite(played.costs))[0])
-            raise ValueError(
-                f"The MPC's episode from the seed {self.seeds[i]} costs {played.costs[i]}: what "
-                "the env shows must be finite numbers."
-            )
+        require_finite("the env", self.seeds, played.costs)
         self.base = played
         self.simulator.learn(played, self.seeds)
         if self.twin is None:

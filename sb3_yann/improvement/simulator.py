@@ -323,15 +323,11 @@ def of_law(problem: LinearMPC) -> Controller:
 
 @dataclass
 class Excited:
-    """The MPC with inputs that are moved at random, each for some steps.
-
-    They are moved by ``push`` half-widths at most, for a share ``often`` of the time.
-    """
+    """The MPC with inputs that are moved by ``push`` half-widths at most, each for some steps."""
 
     problem: LinearMPC
     seed: int
     push: float = PUSH
-    often: float = OFTEN
 
     def __post_init__(self) -> None:
         self.law = of_law(self.problem)
@@ -342,7 +338,7 @@ class Excited:
         every = (int(rows.max(initial=-1)) + 1, self.problem.model.n_inputs)
         moves, times = (np.random.default_rng([self.seed, t // HELD, i]) for i in range(2))
         moved = self.push * problem.u_half * moves.uniform(-1, 1, every)
-        moved *= times.random((len(moved), 1)) < self.often
+        moved *= times.random((len(moved), 1)) < OFTEN
         u = self.law(t, theta, rows) + moved[rows]
         return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))
 

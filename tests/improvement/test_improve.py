@@ -476,12 +476,14 @@ def test_of_long_episodes_parts_are_planned_and_the_whole_is_checked(monkeypatch
     assert {len(each.given) for each in planned} == {9}
     trial = confirmation.Trial.draw(twin_of(), 10, np.random.default_rng(0))
     assert trial.steps == max(map(len, twin_of().episodes)) == 20
-    assert len(trial.hard((trial.mpc[0] + 1e3, trial.mpc[1]))) == confirmation.HARDEST
-    costs, unsafe = (each.copy() for each in trial.mpc)
+    lost = trial.mpc._replace(costs=trial.mpc.costs + 1e3)
+    assert len(trial.hard(lost)) == confirmation.HARDEST
+    unsafe = trial.mpc.unsafe.copy()
     unsafe[12, [4, 5, 6, 8]] = 0.25, 0.25, 0.25, 0  # of the input, at one of the starts around
     place, speed = trial.starts[0, 12]
     where = f"outside the log, from x[0] = {place:.3g}, x[1] = {speed:.3g}, "
-    assert trial.check(1, (costs, unsafe)).reason == f"{where}u[0] exceeds its bound by 0.25"
+    found = trial.check(1, trial.mpc._replace(unsafe=unsafe))
+    assert found.reason == f"{where}u[0] exceeds its bound by 0.25"
 
 
 def test_a_fit_takes_the_way_of_most_plans_and_reaches_bounds() -> None:
@@ -517,7 +519,8 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
     rng = np.random.default_rng(5)
     at = twin_of().starts.draw_logged(500, rng)
     u = np.clip(problem().explicit()(at) + 0.1 * rng.standard_normal((500, 1)), -1, 1)
-    returns = -imitation._discounted(model.policy, twin_of(), model.actor.mu, at, u)
+    act = imitation.policy_of(model.actor.mu, problem())
+    returns = -imitation._discounted(model.policy, twin_of(), act, at, u)
     known = np.isfinite(returns)
 
     def error() -> float:

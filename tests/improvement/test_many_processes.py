@@ -25,7 +25,7 @@ def same(ours, theirs) -> bool:
 def test_workers_of_joblib_play_the_same_episodes() -> None:
     problem = model_of().policy.problem
     alone, shared = (Simulator(problem, Spring, 0) for _ in range(2))
-    for controller in (of_law(problem), Excited(problem, 0, 0.5, 0.7)):
+    for controller in (of_law(problem), Excited(problem, 0)):
         ours = alone.play(controller, SEEDS)
         with joblib.parallel_config("threading", n_jobs=2):  # processes: with dask, below
             theirs = shared.play(controller, SEEDS)
@@ -49,7 +49,7 @@ def test_a_vec_env_is_a_simulator(kind) -> None:
     problem = model_of().policy.problem
     alone = Simulator(problem, Spring, 0)
     shared = Simulator(problem, envs, 0)
-    for controller in (of_law(problem), Excited(problem, 0, 0.5, 0.7)):
+    for controller in (of_law(problem), Excited(problem, 0)):
         assert same(alone.play(controller, SEEDS), shared.play(controller, SEEDS))
     assert shared.steps == alone.steps
     envs.close()
