@@ -278,7 +278,6 @@ class SimulatedEpisodes(BaseCallback):
         seeds = [self._start(first + i, rng) for i, rng in enumerate(drawn)]
         explore = [_Exploration(self, rng) for rng in drawn]
         scaled: list[list[Array]] = [[] for _ in seeds]
-        space: Any = self.model.action_space
 
         def act(t: int, observations: NDArray[Any], rows: Rows) -> NDArray[Any]:
             actions, _ = self.policy.predict(
@@ -287,8 +286,7 @@ class SimulatedEpisodes(BaseCallback):
             own = np.asarray(self.policy.scale_action(actions), np.float64)
             for i, action in zip(rows, own, strict=True):
                 scaled[i].append(explore[i](action))
-            taken = self.policy.unscale_action(np.array([scaled[i][-1] for i in rows]))
-            return np.clip(taken.astype(space.dtype), space.low, space.high)  # to the last bit
+            return self.policy.unscale_action(np.array([scaled[i][-1] for i in rows]))
 
         with preserve_rng():
             played = rollout(act, self._pool, seeds)

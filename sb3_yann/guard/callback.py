@@ -19,7 +19,7 @@ from sb3_yann._archive import atomic_write
 from sb3_yann._validation import check_bool, check_int, check_options, check_range, warn
 from sb3_yann.audit.reward import CostAudit
 from sb3_yann.compare import AcceptanceRule
-from sb3_yann.env_pool import Source, as_source, name_of, require_like_training
+from sb3_yann.env_pool import EnvPool, Source, as_source, name_of, require_like_training
 from sb3_yann.evaluation.plots import plot_decisions
 from sb3_yann.guard.decide import GuardSettings, Player, decide, decide_at_end
 from sb3_yann.guard.start import (
@@ -162,7 +162,6 @@ class ImprovementGuard(BaseCallback):
     model: OffPolicyAlgorithm
     twin: PlantTwin | None = None
     player: Player
-    _handler: InterruptHandler | None = None
     _has_begun = False
     _audit: CostAudit | None = None
     _steps: Any = 0  # of each env's present episode, in this learn
@@ -262,9 +261,8 @@ class ImprovementGuard(BaseCallback):
         known = getattr(self.model, "guard_state", None)
         with preserve_rng():  # building an actor draws weights; a run that goes on has the same
             mpc = known.evidence.mpc if known else ActorCheckpoint.of_mpc(policy)
-        self.player = Player(self.model, policy, self.env, mpc)
+        self.player = Player(self.model, policy, EnvPool(self.env), mpc)
         self._saved: ActorCheckpoint | None = None
-        self._final: ActorCheckpoint | None = None
 
     def _on_training_start(self) -> None:
         check_place(self)
@@ -273,7 +271,7 @@ class ImprovementGuard(BaseCallback):
         warn_of_rare_trials(self.model, self.settings.eval_freq)
         self._has_begun = False
         self._steps = 0
-        self._final = None
+        self._final: ActorCheckpoint | None = None
         player = self.player
         settings = self.settings
         with preserve_rng():
@@ -327,27 +325,29 @@ class ImprovementGuard(BaseCallback):
     def _on_step(self) -> bool:
         if self._audit is not None and self._audit.finding is None:
             self._audit.on_step()
-            self._compare_rewards()
+            found: Any = self._audit.finding
+            if found is not None and found.matches and not self.player.pays_cost:
+                warn(
+                    f"The training env pays minus the cost of the MPC, and the guard's env "
+                    f"{self.settings.env} pays something else, by which policies are compared. "
+                    "Give the guard the env of the training, with the same StageCost.",
+                )
         dones = self.locals["dones"]
         state = self.state
         state.episodes += int(np.sum(dones))
-        self._warn_of_an_endless_episode(dones)
+        self._steps = np.where(dones, 0, self._steps + 1)
+        if np.any(self._steps == LONG_EPISODE):
+            warn(
+                f"An episode of the training env has not ended after {LONG_EPISODE} steps, and the "
+                "guard decides at the ends of episodes. Give it a limit, by "
+                "gymnasium.wrappers.TimeLimit.",
+            )
         last = state.last_trial
         if np.any(dones) and (last is None or state.episodes - last >= self.settings.eval_freq):
             state.last_trial = state.episodes
             self._try_candidate()
         self._save_accepted()
         return True
-
-    def _compare_rewards(self) -> None:
-        """Warn where the training env pays the MPC's cost, and the guard's env something else."""
-        found = None if self._audit is None else self._audit.finding
-        if found is not None and found.matches and not self.player.pays_cost:
-            warn(
-                f"The training env pays minus the cost of the MPC, and the guard's env "
-                f"{self.settings.env} pays something else, by which policies are compared. Give "
-                "the guard the env of the training, with the same StageCost.",
-            )
 
     def _try_candidate(self) -> None:
         """Accept the present policy, whole or in part, or refuse it.
@@ -434,15 +434,6 @@ class ImprovementGuard(BaseCallback):
             if not self.player.interrupted:
                 own.restore(policy)
 
-    def _warn_of_an_endless_episode(self, dones: Any) -> None:
-        self._steps = np.where(dones, 0, self._steps + 1)
-        if np.any(self._steps == LONG_EPISODE):
-            warn(
-                f"An episode of the training env has not ended after {LONG_EPISODE} steps, and the "
-                "guard decides at the ends of episodes. Give it a limit, by "
-                "gymnasium.wrappers.TimeLimit.",
-            )
-
     def _on_training_end(self) -> None:
         # The Zoo ends training after Ctrl-C as well, also before there is anything accepted.
         if not self._has_begun:
@@ -458,8 +449,7 @@ class ImprovementGuard(BaseCallback):
             self._saved = None  # an early one, the MPC's own of step 0, knows nothing of the run
             self._save_accepted()
             self.player.envs.close()
-            if self._handler is not None:
-                self._handler.remove()
+            self._handler.remove()
 
     def _end(self) -> None:
         """Try the last candidate, and confirm what is accepted on the final new starts."""

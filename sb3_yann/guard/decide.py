@@ -33,7 +33,7 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.control.wrapper_stack import require_state_shown
-from sb3_yann.env_pool import EnvPool, Source
+from sb3_yann.env_pool import EnvPool
 from sb3_yann.guard.state import Decision, DecisionKind, Evidence, Play
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import normalized
@@ -338,7 +338,11 @@ def _after_loss(evidence: Evidence, new: Starts, scores: Scores | None, play: Pl
     after, hard = _with_hard_starts(evidence, new, scores)
     count = slice(1 if scores is None else len(scores.costs))
     mpc = new.mpc.at(count)
-    for checkpoint, known in evidence.earlier():
+    passed = reversed(evidence.without_passed(evidence.accepted).passed)
+    earlier = [(each, evidence.scores.at(slice(0))) for each in passed]
+    if not evidence.accepted.has_networks_of(evidence.mpc):
+        earlier.insert(0, (evidence.accepted, evidence.scores))
+    for checkpoint, known in earlier:
         try:
             its = play(checkpoint, new.seeds[count])
         except Unplayable:
@@ -429,6 +433,7 @@ def _what_acts(evidence: Evidence, tried: ActorCheckpoint) -> str:
     return "an earlier policy is restored"
 
 
+@dataclass(eq=False)
 class Player:
     """Plays checkpoints in the guard's simulator; the policy stays as it is.
 
@@ -438,17 +443,14 @@ class Player:
     ``steps`` are those of the simulator that all episodes took.
     """
 
-    def __init__(
-        self, model: OffPolicyAlgorithm, policy: StartsAsMPC, env: Source, mpc: ActorCheckpoint
-    ) -> None:
-        self.model = model
-        self.policy = policy
-        self.mpc = mpc
-        self.envs = EnvPool(env)
-        self.max_input_step: Array | None = None
-        self.pays_cost = True
-        self.interrupted = False
-        self.steps = 0
+    model: OffPolicyAlgorithm
+    policy: StartsAsMPC
+    envs: EnvPool
+    mpc: ActorCheckpoint
+    max_input_step: Array | None = None
+    pays_cost: bool = True
+    interrupted: bool = False
+    steps: int = 0
 
     def __call__(self, checkpoint: ActorCheckpoint, seeds: Sequence[int]) -> Scores:
         """Return a checkpoint's scores; raise Unplayable if an action or the env is at fault."""
@@ -500,7 +502,7 @@ class Player:
         return np.asarray(seen.double().cpu().numpy())
 
     def _check(self, env: Any) -> None:
-        if isinstance(env, gym.Env):
+        if isinstance(env, gym.Env):  # others are copies of one that has no wrappers
             require_state_shown(env, self.policy.observation_given)
 
     def _act(self, t: int, observations: NDArray[Any], rows: Rows) -> NDArray[Any]:

@@ -7,7 +7,7 @@ import io
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
@@ -102,13 +102,6 @@ class Evidence:
         if len(scores.costs) < len(self.starts.seeds):
             return found
         return replace(found, reference=scores.costs[self.starts.n_hard :])
-
-    def earlier(self) -> Iterator[tuple[ActorCheckpoint, Scores]]:
-        """Yield the accepted policy and earlier ones, the latest first, with their known scores."""
-        if not self.accepted.has_networks_of(self.mpc):
-            yield self.accepted, self.scores
-        for each in reversed(self.without_passed(self.accepted).passed):
-            yield each, self.scores.at(slice(0))
 
     def without_passed(self, checkpoint: ActorCheckpoint) -> Evidence:
         """Return the evidence without an earlier checkpoint, which lost on new starts after all."""
