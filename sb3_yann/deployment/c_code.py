@@ -13,7 +13,6 @@ import uuid
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,15 +23,12 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, warn
 from sb3_yann.deployment import code
-from sb3_yann.deployment.code import ControllerArrays
+from sb3_yann.deployment.code import ControllerArrays, Tables
 from sb3_yann.deployment.controller import DRIVING, KEPT_ROUNDING, MODES, Controller, steps_of
 
 
 def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
-    """Return what the self-test in C is filled with: points and steps, and what they must give.
-
-    ValueError if a rounding changes all answers.
-    """
+    """Return what the self-test in C is filled with: points and steps, and what they must give."""
     controller = Controller(data)
     n_points = 48
     drawn = code.sample_observations(controller, 4 * n_points)
@@ -49,139 +45,124 @@ def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
             "precision='double'."
         )
     ranges = code.input_ranges(controller, controller.evaluate(drawn))
-    run = Run.with_estimator(data, obs) if "est_gain" in data else Run.of_readings(obs)
-    answers = run.play(controller)
+    run = _closed_loop(data, obs) if "est_gain" in data else _steps(obs)
+    answers = _play(run, controller)
     room_in_loop = 0.0
-    if run.plant:
+    if "C_of_plant" in run:
         # What roundings of the outputs do to the loop, code may do too.
-        moved = run.play(controller, 1e-6 if precision == "float" else 1e-13)
+        moved = _play(run, controller, 1e-6 if precision == "float" else 1e-13)
         change = np.abs(moved["actions"] - answers["actions"]) / ranges
         room_in_loop = 10 * float(change.max())
-    numbers: dict[str, NDArray[Any]] = {
+    numbers: Tables = {
         "points": obs,
         "policy": controller.evaluate(obs),
         "law": controller.evaluate(obs, networks=False),
         "range_of": ranges,
-        "readings": run.readings,
-        "elapsed": run.elapsed,
-        **{key: each for key, each in run.plant.items() if each.size},
-        "lost": run.lost,
-        "starts_anew": run.starts_anew,
-        "requests": run.requests,
+        **{key: each for key, each in run.items() if each.size},
         **answers,
     }
     texts = [
         code.table("yann_real" if each.dtype.kind == "f" else "int", name, each, precision)
         for name, each in numbers.items()
     ]
-    n_outputs, n_states = run.plant["C_of_plant"].shape if run.plant else (0, 0)
+    n_outputs, n_states = run["C_of_plant"].shape if "C_of_plant" in run else (0, 0)
     return {
         "VECTORS": "\n".join(texts),
         "POINTS": str(len(obs)),
-        "STEPS": str(len(run.lost)),
+        "STEPS": str(len(run["lost"])),
         "STATES": str(n_states),
         "OUTPUTS": str(n_outputs),
-        "LOADS": str(len(run.plant.get("loads_of_plant", ()))),
+        "LOADS": str(len(run.get("loads_of_plant", ()))),
         "ROOM_INSIDE": f"{room:g}",
         "ROOM_OUTSIDE": f"{code.room_of(data, precision, inside=False):g}",
         "ROOM_IN_LOOP": f"{room_in_loop:.2g}",
     }
 
 
-@dataclass(frozen=True)
-class Run:
-    """Steps of a controller with lost readings, a late one, all modes and a second start."""
+def _steps(readings: Array, count: int = 60, **plant: NDArray[Any]) -> Tables:
+    """Return so many steps, each reading for four of them, with lost ones, a late one, all modes.
 
-    readings: Array  # (T, n_read); where there is a plant, its outputs are added to the first ones
-    elapsed: Array
-    lost: NDArray[np.bool_]  # the first reading is
-    requests: NDArray[np.int64]
-    starts_anew: NDArray[np.bool_]  # and takes the plant's input then
-    # x+ = step_of_plant [x; u; loads; 1] from start_of_plant, with outputs C_of_plant x; or empty
-    plant: dict[str, NDArray[Any]]
+    A second start takes the plant's input then. Where there is a plant, its outputs are added to
+    the first readings.
+    """
+    k = np.arange(count)
+    return {
+        "readings": readings[k // 4 % len(readings)],
+        "elapsed": np.where(k == 20, 3.0, 1.0),
+        **plant,
+        "lost": ((k >= 10) & (k < 13)) | ((k >= 30) & (k < 40)),  # the first reading is
+        "starts_anew": k == count - 15,
+        "requests": np.select([(k >= 50) & (k < 53), (k >= 56) & (k < 60)], [1, 2], 0),
+    }
 
-    @classmethod
-    def of_readings(cls, readings: Array, count: int = 60, **plant: NDArray[Any]) -> Run:
-        """Return so many steps, each reading for four of them."""
-        k = np.arange(count)
-        return cls(
-            readings=readings[k // 4 % len(readings)],
-            elapsed=np.where(k == 20, 3.0, 1.0),
-            lost=((k >= 10) & (k < 13)) | ((k >= 30) & (k < 40)),
-            requests=np.select([(k >= 50) & (k < 53), (k >= 56) & (k < 60)], [1, 2], 0),
-            starts_anew=k == count - 15,
-            plant=plant,
-        )
 
-    @classmethod
-    def with_estimator(cls, data: ControllerArrays, seen: Array) -> Run:
-        """Return a closed loop with the estimator's own model as the plant.
+def _closed_loop(data: ControllerArrays, seen: Array) -> Tables:
+    """Return steps of a closed loop with the estimator's own model as the plant.
 
-        It begins beside the operating point, with a load that the estimator must find; references
-        and measured loads change.
-        """
-        (size, q) = data["est_gain"].shape
-        source = data["source"]
-        rest = data["obs_rest"]
-        half = (data["box"][1] - data["box"][0]) / 2
-        x = data["est_first"] @ np.append(rest[:q], 1.0)
-        spread = np.zeros(size)
-        readings = np.tile(rest, (50, 1))
-        for column, place in enumerate(source):
-            if len(rest) <= place < len(rest) + size:
-                spread[place - len(rest)] = half[column]
-            elif place < len(rest):
-                steps = seen[np.arange(50) // 5 % len(seen), column]
-                readings[:, place] += 0.1 * (steps - rest[place])
-        noise = np.random.default_rng(0).normal(size=(50, q))
-        readings[:, :q] = 1e-3 * noise * (np.abs(data["est_C"]) @ spread)
-        scale, shift = data["est_input"]
-        step = data["est_next"].copy()
-        step[:, -1] += step[:, size : size + len(scale)] @ shift
-        step[:, size : size + len(scale)] *= scale
-        return cls.of_readings(
-            readings,
-            200,
-            step_of_plant=step,
-            C_of_plant=data["est_C"],
-            start_of_plant=x + 0.2 * spread,
-            loads_of_plant=data["est_loads"],
-        )
+    It begins beside the operating point, with a load that the estimator must find; references
+    and measured loads change. The plant is x+ = step_of_plant [x; u; loads; 1].
+    """
+    (size, q) = data["est_gain"].shape
+    rest = data["obs_rest"]
+    half = (data["box"][1] - data["box"][0]) / 2
+    x = data["est_first"] @ np.append(rest[:q], 1.0)
+    spread = np.zeros(size)
+    readings = np.tile(rest, (50, 1))
+    for column, place in enumerate(data["source"]):
+        if len(rest) <= place < len(rest) + size:
+            spread[place - len(rest)] = half[column]
+        elif place < len(rest):
+            steps = seen[np.arange(50) // 5 % len(seen), column]
+            readings[:, place] += 0.1 * (steps - rest[place])
+    noise = np.random.default_rng(0).normal(size=(50, q))
+    readings[:, :q] = 1e-3 * noise * (np.abs(data["est_C"]) @ spread)
+    scale, shift = data["est_input"]
+    step = data["est_next"].copy()
+    step[:, -1] += step[:, size : size + len(scale)] @ shift
+    step[:, size : size + len(scale)] *= scale
+    return _steps(
+        readings,
+        200,
+        step_of_plant=step,
+        C_of_plant=data["est_C"],
+        start_of_plant=x + 0.2 * spread,
+        loads_of_plant=data["est_loads"],
+    )
 
-    def play(self, controller: Controller, moved: float = 0.0) -> dict[str, NDArray[Any]]:
-        """Return actions (T, m), status and modes; outputs move by a part of their size."""
-        controller.reset()
-        generator = np.random.default_rng(2)
-        x = self.plant["start_of_plant"] if self.plant else np.zeros(0)
-        actions: list[Array] = []
-        status = []
-        modes = []
-        for k, reading in enumerate(self.readings.copy()):
-            given = reading.copy()
-            if self.plant:
-                y = self.plant["C_of_plant"] @ x
-                given[: len(y)] += y * (1 + moved * generator.choice([-1, 1], len(y)))
-            if self.lost[k]:
-                given[0] = np.nan
-            if self.starts_anew[k]:
-                controller.reset()
-            controller.request = MODES[self.requests[k]]
-            present = actions[-1] if self.starts_anew[k] else None
-            actions.append(controller(given, self.elapsed[k], present))
-            status.append(int(controller.status))
-            modes.append(MODES.index(controller.mode))
-            if self.plant:
-                loads = reading[self.plant["loads_of_plant"]]
-                x = self.plant["step_of_plant"] @ [*x, *actions[-1], *loads, 1.0]
-        return {"actions": np.array(actions), "status": np.array(status), "modes": np.array(modes)}
+
+def _play(run: Tables, controller: Controller, moved: float = 0.0) -> Tables:
+    """Return actions (T, m), status and modes; outputs move by a part of their size."""
+    controller.reset()
+    generator = np.random.default_rng(2)
+    x = run.get("start_of_plant")
+    actions: list[Array] = []
+    status = []
+    modes = []
+    for k, reading in enumerate(run["readings"]):
+        given = reading.copy()
+        if x is not None:
+            y = run["C_of_plant"] @ x
+            given[: len(y)] += y * (1 + moved * generator.choice([-1, 1], len(y)))
+        if run["lost"][k]:
+            given[0] = np.nan
+        if run["starts_anew"][k]:
+            controller.reset()
+        controller.request = MODES[run["requests"][k]]
+        present = actions[-1] if run["starts_anew"][k] else None
+        actions.append(controller(given, run["elapsed"][k], present))
+        status.append(int(controller.status))
+        modes.append(MODES.index(controller.mode))
+        if x is not None:
+            loads = reading[run["loads_of_plant"]]
+            x = run["step_of_plant"] @ [*x, *actions[-1], *loads, 1.0]
+    return {"actions": np.array(actions), "status": np.array(status), "modes": np.array(modes)}
 
 
 def c_files(data: ControllerArrays, precision: str, about: str, file: str) -> dict[str, str]:
     """Return the texts of the C files by their names."""
     lines = [f"  {line}" for line in code.signal_lines(data, "action")]
-    n_obs = len(data["obs_rest"])
-    n_seen = data["obs_matrix"].shape[1]
-    sizes = {"N_OBS": n_obs, "N_SEEN": n_seen, "N_INPUTS": len(data["action_scale"])}
+    sizes = {"N_OBS": len(data["obs_rest"]), "N_SEEN": data["obs_matrix"].shape[1]}
+    sizes["N_INPUTS"] = len(data["action_scale"])
     memory = ""
     if estimates := len(data.get("est_gain", ())):
         memory = f"    yann_real estimate[{estimates}]; /* states and disturbances */\n"
@@ -255,12 +236,8 @@ def _definitions(data: ControllerArrays, precision: str) -> str:
     flags |= {
         key.upper(): int(data[key]) for key in ("frozen_after", "hold", "recover", "transfer")
     }
-    tolerances = {
-        "late_after": data["late_after"],
-        "driving": DRIVING,
-        **code.search_tolerances(data, precision),
-    }
-    flags |= {key.upper(): code.literal(value, precision) for key, value in tolerances.items()}
+    reals = {"late_after": data["late_after"], "driving": DRIVING}
+    reals |= code.search_tolerances(data, precision)
     if walks:
         flags["WALK_FROM"] = int(data["walk_from"])
     if n_networks:
@@ -271,18 +248,17 @@ def _definitions(data: ControllerArrays, precision: str) -> str:
             "relu": "x > ZERO ? x : ZERO",
             "elu": f"x > ZERO ? x : expm1{suffix}(x)",
         }[str(data["activation"])]
-        fade_start, fade_end = data["fades"]
+        reals["fades_from"], reals["fades_to"] = data["fades"]
+        reals["kept_rounding"] = KEPT_ROUNDING
         flags |= {
             "N_LAYERS": n_layers,
             **{f"WIDTH_{i + 1}": width for i, width in enumerate(widths)},
             "WIDTH_LAST": widths[-1],
             "ACTIVATION": activation,
             "REACH": f"((real){code.literal(data['reach'], precision)})",
-            "FADES_FROM": code.literal(fade_start, precision),
-            "FADES_TO": code.literal(fade_end, precision),
-            "KEPT_ROUNDING": code.literal(KEPT_ROUNDING, precision),
             "N_KEPT": len(data["kept"]),
         }
+    flags |= {key.upper(): code.literal(value, precision) for key, value in reals.items()}
     index = f"int{8 * code.index_bytes(indices)}_t"
     lines = [f"#define {key} {value}" for key, value in flags.items()]
     lines += ["", *(code.table("real", key, each, precision) for key, each in numbers.items())]
@@ -307,11 +283,8 @@ def fmu_file(data: ControllerArrays, precision: str, about: str) -> bytes:
     """
     name = str(data["name"])
     identity = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"{precision} {about}")) + "}"
-    sources = {
-        file: text
-        for file, text in c_files(data, precision, about, name).items()
-        if not file.endswith("_selftest.c")
-    }
+    sources = c_files(data, precision, about, name)
+    del sources[f"{name}_selftest.c"]
     rest = ", ".join(code.literal(each, "double") for each in data["obs_rest"])
     entries = {
         "ABOUT": comment(about.splitlines()),

@@ -21,13 +21,10 @@ ROOM = {"double": 1e-12, "float": 1e-5}
 
 
 def room_of(data: ControllerArrays, precision: str, inside: bool = True) -> float:
-    """Return how far code of a controller may be off, in parts of an input's range.
-
-    Where the MPC has no solution, constraints that give way cost an online law more digits.
-    """
+    """Return how far code of a controller may be off, in parts of an input's range."""
     if "qp_gram" not in data:
         return ROOM[precision]
-    return 1e-9 if inside else 1e-6
+    return 1e-9 if inside else 1e-6  # constraints that give way cost digits
 
 
 def scale_within(
@@ -78,10 +75,7 @@ def search_tolerances(data: ControllerArrays, precision: str) -> dict[str, float
 def controller_tables(
     data: ControllerArrays, precision: str, walk: bool = True
 ) -> tuple[Tables, Tables]:
-    """Return the tables of numbers and those of indices, by their names in code.
-
-    Those of a search by a walk are last; without it, all regions are asked.
-    """
+    """Return the tables of numbers and those of indices, by their names; a walk's are last."""
     same = "A b box_middle box_per_half gains offsets obs_matrix obs_offset obs_rest seen_rest"
     same += " obs_min obs_max action_shift"
     numbers: Tables = {name: data[name] for name in same.split()}
@@ -191,10 +185,7 @@ class Cost:
 
 
 def signal_lines(data: ControllerArrays, output: str) -> list[str]:
-    """Return a line for each entry of an observation and of the output: name, unit and values.
-
-    The values tell deviations from the plant's own units.
-    """
+    """Return a line for each entry of an observation and of the output: name, unit and values."""
     labels = dict(data.get("labels", ()))
     lines = [f"A step is {data['dt']:g} {data.get('time_unit', '')}".rstrip() + "."]
     limits = zip(data["obs_names"], data["obs_rest"], data["obs_min"], data["obs_max"], strict=True)

@@ -415,10 +415,7 @@ class Controller:
         return action, low, high, inside, sound
 
     def _kept(self, theta: Array, law: Array, action: Array, low: Array, high: Array) -> Array:
-        """Return actions that break no row further than the law: by the row that they break most.
-
-        Those on it already stay to the bit.
-        """
+        """Return actions that break no row further than the law: by the row they break most."""
         kept = self.data["kept"]
         n = theta.shape[1]
         a = kept[:, :n]

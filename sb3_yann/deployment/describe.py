@@ -24,8 +24,7 @@ from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMAT
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
-from sb3_yann.policy.checkpoint import ActorCheckpoint
-from sb3_yann.policy.observations import AffineFeatures, keeps_entries
+from sb3_yann.policy.observations import AffineObservation, keeps_entries
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.units import ActionUnits
 
@@ -330,15 +329,12 @@ def _order_of_theta(policy: Any) -> NDArray[np.intp] | None:
     if not isinstance(policy, StartsAsMPC):
         return np.arange(policy.n_theta)
     n = policy.problem.n_theta
-    extractor = policy.actor.features_extractor
-    if not isinstance(extractor, AffineFeatures):
+    if (seen := policy.to_theta) is None:
         return np.arange(n)
-    matrix = extractor.matrix.cpu().numpy()  # (n_obs, n_theta)
-    offset = extractor.offset.cpu().numpy()
-    order = np.asarray(matrix.argmax(axis=1))
+    order = np.asarray(seen.matrix.argmax(axis=0))
     is_theta = np.array_equal(np.sort(order), np.arange(n))
-    is_theta &= np.array_equal(matrix, np.eye(n)[order])
-    return order if is_theta and np.allclose(offset, -policy.problem.theta_ss) else None
+    is_theta &= np.array_equal(seen.matrix.T, np.eye(n)[order])
+    return order if is_theta and np.allclose(seen.offset, -policy.problem.theta_ss) else None
 
 
 def _with_sources(problem: LinearMPC) -> list[str]:
@@ -360,13 +356,11 @@ def _unconfirmed(given: Exportable) -> str:
     policy = given.policy if isinstance(given, BaseAlgorithm) else None
     if not isinstance(policy, StartsAsMPC) or getattr(given, "improvements", False):
         return ""
-    if not ActorCheckpoint.of(policy).has_learned():
-        return ""
     state = getattr(given, "guard_state", None)
+    if policy.actor.mu.network.is_zero() or (state and state.accepted.is_actor_of(policy)):
+        return ""
     if state is None:
         return "Neither a guard nor improve has confirmed this policy."
-    if state.accepted.is_actor_of(policy):
-        return ""
     return (
         "The guard has not accepted this policy: it is a candidate, or was changed since. "
         "restore_accepted(model) gives the accepted one."
@@ -374,37 +368,25 @@ def _unconfirmed(given: Exportable) -> str:
 
 
 def _signal_maps(policy: Any, law: PiecewiseAffine) -> tuple[Array, Array, Array, Array]:
-    """Return matrix, offset, scale and shift.
-
-    Theta is ``matrix @ obs + offset``, an action ``scale * y + shift`` for y in [-1, 1].
-    """
-    n = law.n_theta
+    """Return theta's matrix and offset of obs, an action's scale and shift of y in [-1, 1]."""
+    seen = AffineObservation(np.eye(law.n_theta), -law.units.theta_ss)
     if isinstance(policy, StartsAsMPC):
-        extractor = policy.actor.features_extractor
+        seen = policy.to_theta or AffineObservation.identity(law.n_theta)
         box: Any = policy.action_space
-        matrix = np.eye(n)
-        offset = np.zeros(n)
-        if isinstance(extractor, AffineFeatures):
-            matrix = extractor.matrix.T.cpu().numpy()
-            offset = extractor.offset.cpu().numpy()
         low = np.asarray(box.low, np.float64)
         high = np.asarray(box.high, np.float64)
+        half = (high - low) / 2
         shift = (high + low) / 2
-        return matrix, offset, scale_within((high - low) / 2, shift, low, high), shift
-    theta_ss = law.units.theta_ss
-    u_ss = law.units.u_ss
-    finite, middle, half = _input_range(law)
-    low = np.where(finite, law.u_min, -1.0) + u_ss
-    high = np.where(finite, law.u_max, 1.0) + u_ss
-    shift = u_ss + middle
-    return np.eye(n), np.zeros(n) - theta_ss, scale_within(half, shift, low, high), shift
+    else:
+        finite, middle, half = _input_range(law)
+        low = np.where(finite, law.u_min, -1.0) + law.units.u_ss
+        high = np.where(finite, law.u_max, 1.0) + law.units.u_ss
+        shift = law.units.u_ss + middle
+    return seen.matrix, seen.offset, scale_within(half, shift, low, high), shift
 
 
 def _with_regions(law: Any) -> tuple[PiecewiseAffine, dict[str, Any]]:
-    """Return an explicit law, and the program of one that is solved online.
-
-    That is then a law of one region: the law without constraints, from which these take something.
-    """
+    """Return an explicit law, or that without constraints and the program of what these take."""
     if isinstance(law, PiecewiseAffine):
         return law, {}
     dual = law.dual
@@ -492,9 +474,8 @@ def _no_networks(law: PiecewiseAffine) -> dict[str, Any]:
 def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
     """Return the networks of a layer that are not zero, and which of them each region has."""
     network = layer.network
-    first = network.first.nodes.detach().double().cpu().numpy().sum(1)
-    rest = [each.detach().double().cpu().numpy() for each in network.weights()[1:]]
-    layers = [first, *rest]
+    nodes, *rest = (each.detach().double().cpu().numpy() for each in network.weights())
+    layers = [nodes.sum(1), *rest]
     pinned = network.pinned[:, 0].cpu().numpy() > 0
     if not all(np.all(np.isfinite(each)) for each in layers):
         raise ValueError(
@@ -506,18 +487,18 @@ def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
     number = np.full(len(zero), -1)
     number[kept] = np.arange(len(kept))
     per_region = isinstance(layer, YannLayer)
-    return {
-        **_no_networks(law),
+    found = _no_networks(law) | {
         "per_theta": 1 / layer.theta_half.double().cpu().numpy(),
         "network_of": number if per_region else np.full(law.n_regions, number[0]),
-        "n_layers": np.int64(len(layers) if len(kept) else 0),
-        **({f"layer{i}": each[kept] for i, each in enumerate(layers)} if len(kept) else {}),
         "pinned": pinned[kept],
         "activation": _activation(network.activation),
         "reach": np.inf if layer.reach is None else layer.reach,
         "confines": layer.confines.cpu().numpy(),
-        **({"kept": layer.constants[2]} if len(kept) else {}),
     }
+    if len(kept):
+        found |= {f"layer{i}": each[kept] for i, each in enumerate(layers)}
+        found |= {"n_layers": np.int64(len(layers)), "kept": layer.constants[2]}
+    return found
 
 
 def _activation(given: Any) -> str:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sb3_yann.deployment.code import ControllerArrays, action_scale, search_tolerances
 from sb3_yann.deployment.controller import ACTIVATIONS, KEPT_ROUNDING
+from sb3_yann.networks.yann import padded_rows
 
 
 def onnx_model(data: ControllerArrays, precision: str, digest: str) -> bytes:
@@ -166,14 +167,8 @@ def _locate(
     """Return the region (batch,) that theta violates least, and whether it holds it (batch, 1)."""
     op = graph.op
     constant = graph.constant
-    starts = data["starts"]
-    counts = np.diff([*starts, len(data["b"])])
-    A = np.zeros((len(starts), counts.max(), theta_size := data["A"].shape[1]))
-    b = np.full(A.shape[:2], np.inf)  # rows that never bind fill up the shorter regions
-    for i, (start, count) in enumerate(zip(starts, counts, strict=True)):
-        A[i, :count] = data["A"][start : start + count]
-        b[i, :count] = data["b"][start:][:count]
-    slack = op("MatMul", theta, constant(A.reshape(-1, theta_size).T))
+    A, b = padded_rows(data["starts"], data["A"], data["b"])
+    slack = op("MatMul", theta, constant(A.reshape(-1, A.shape[2]).T))
     slack = op("Sub", constant(b.reshape(1, -1)), slack)
     slack = op("Reshape", slack, constant(np.array([-1, *b.shape])))
     slack = op("ReduceMin", slack, axes=[2], keepdims=0)
@@ -195,9 +190,19 @@ def _correction(graph: _Graph, data: ControllerArrays, theta: str, region: str) 
     op = graph.op
     constant = graph.constant
     number = data["network_of"]
-    act = ACTIVATIONS[str(data["activation"])]
+    kind = str(data["activation"])
+    act = ACTIVATIONS[kind]
     used = op("Gather", constant(np.maximum(number, 0)), region)
     shared = bool(np.all(number == 0))
+
+    def activated(x: str) -> str:
+        if kind == "tanh":
+            return op("Tanh", x)
+        zero = constant(0.0)
+        if kind == "relu":
+            return op("Max", x, zero)
+        below = op("Sub", op("Exp", op("Min", x, zero)), constant(1.0))
+        return op("Where", op("Greater", x, zero), x, below)
 
     def of_row(table: NDArray[Any]) -> str:
         return constant(table) if shared else op("Gather", constant(table), used)
@@ -217,7 +222,7 @@ def _correction(graph: _Graph, data: ControllerArrays, theta: str, region: str) 
         x = op("Add", x, of_row(bias))
         if i < last:
             at_zero = np.where(pinned[:, None], act(bias), 0.0)
-            x = op("Sub", _activate(graph, x, data), of_row(at_zero))
+            x = op("Sub", activated(x), of_row(at_zero))
     sound = op("Not", graph.any(graph.not_finite(x)))
     counts = op("Unsqueeze", op("Gather", constant(number >= 0), region), constant(np.array([1])))
     still = op("And", op("Unsqueeze", op("Gather", constant(pinned), used),
@@ -265,15 +270,3 @@ def _kept(
     share = op("Min", op("ReduceMin", share, axes=[1], keepdims=1), constant(1.0))
     moved = graph.between(op("Add", law, op("Mul", share, way)), low, high)
     return op("Where", op("Greater", most, zero), moved, action)
-
-
-def _activate(graph: _Graph, x: str, data: ControllerArrays) -> str:
-    kind = str(data["activation"])
-    op = graph.op
-    if kind == "tanh":
-        return op("Tanh", x)
-    zero = graph.constant(0.0)
-    if kind == "relu":
-        return op("Max", x, zero)
-    below = op("Sub", op("Exp", op("Min", x, zero)), graph.constant(1.0))
-    return op("Where", op("Greater", x, zero), x, below)

@@ -14,29 +14,6 @@ from sb3_yann.deployment import code
 from sb3_yann.deployment.code import ControllerArrays, decimal
 from sb3_yann.deployment.controller import DRIVING, KEPT_ROUNDING
 
-ACTIVATE = {
-    "tanh": """k := 0;
-WHILE k <= 1 DO
-    small := MIN(ABS(pair[k]), 25.0);
-    small := 1.0 - 2.0 / (EXP(2.0 * small) + 1.0);
-    IF pair[k] < 0.0 THEN
-        small := -small;
-    END_IF;
-    IF pair[k] = pair[k] THEN
-        pair[k] := small;
-    END_IF;
-    k := k + 1;
-END_WHILE;""",
-    "relu": "pair[0] := MAX(pair[0], 0.0);\npair[1] := MAX(pair[1], 0.0);",
-    "elu": """k := 0;
-WHILE k <= 1 DO
-    IF pair[k] < 0.0 THEN
-        pair[k] := EXP(pair[k]) - 1.0;
-    END_IF;
-    k := k + 1;
-END_WHILE;""",
-}
-"""Of both entries of ``pair``; NaN stays NaN."""
 RESERVED = set(
     """
     ABS ACTION AND ARRAY AT BOOL BY BYTE CASE CONSTANT COS DATE DINT DO DT DWORD ELSE ELSIF EN
@@ -59,11 +36,10 @@ def st_text(data: ControllerArrays, precision: str, about: str) -> str:
     """Return a FUNCTION_BLOCK with the step of a controller."""
     interface, constants, variables, body = _parts(data, precision)
     top = "\n".join(f"  {line}".rstrip() for line in _comment(data, about))
-    declared = ["".join(f"    {line}\n" for line in lines) for lines in (constants, variables)]
+    constant, own = ("".join(f"    {line}\n" for line in each) for each in (constants, variables))
     return (
         f"(*\n{top}\n*)\nFUNCTION_BLOCK {data['name']}\n{interface}"
-        f"VAR CONSTANT\n{declared[0]}END_VAR\nVAR\n{declared[1]}END_VAR\n\n"
-        f"{body}END_FUNCTION_BLOCK\n"
+        f"VAR CONSTANT\n{constant}END_VAR\nVAR\n{own}END_VAR\n\n{body}END_FUNCTION_BLOCK\n"
     )
 
 
@@ -129,23 +105,25 @@ def _parts(data: ControllerArrays, precision: str) -> tuple[str, list[str], list
     entries = {"REAL_TYPE": kind, "HIDDEN": "h2" if flags["second"] else "h1"}
     entries |= {key: str(size) for key, size in sizes.items()}
     entries |= {f"{key}_LAST": str(size - 1) for key, size in sizes.items()}
-    texts = []
-    lines = ACTIVATE[str(data["activation"])]
-    for part in ("interface", "variables", "body"):
+    chosen = {flag for flag, is_there in flags.items() if is_there}
+
+    def filled(part: str) -> str:
         text = (files("sb3_yann.deployment") / "st" / f"{part}.st").read_text(encoding="ascii")
-        text = _chosen(text, {flag for flag, is_there in flags.items() if is_there})
-        text = re.sub(" *@ACTIVATE@", lambda at: textwrap.indent(lines, at[0][:-10]), text)
+        text = _chosen(text, chosen)
         for key, entry in entries.items():
             text = text.replace(f"@{key}@", entry)
-        texts.append(text)
-    interface, variables, body = texts
+        return text
+
+    lines = filled("activation").rstrip()  # of both entries of pair; NaN stays NaN
+    body = filled("body")
+    body = re.sub(" *@ACTIVATE@", lambda at: textwrap.indent(lines, at[0][:-10]), body)
     used = set(re.findall(r"\w+", body))
-    declared = [line.strip() for line in variables.splitlines() if line.strip()]
+    declared = map(str.strip, filled("variables").splitlines())
     constants, own = (
         [line for line in lines if line.partition(" : ")[0] in used]
         for lines in (_constants(data, precision, kind), declared)
     )
-    return interface, constants, own, body
+    return filled("interface"), constants, own, body
 
 
 def _chosen(text: str, flags: set[str]) -> str:
@@ -184,10 +162,9 @@ def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:
     numbers, indices = code.controller_tables(data, precision, walk=False)
     for name, values in numbers.items():
         kept = np.where(np.abs(values) < MIN_REAL, 0.0, np.clip(values, -MAX_REAL, MAX_REAL))
-        texts = [decimal(float(each), precision) for each in kept.flat]
-        lines.append(_array(name, kind, texts))
+        lines.append(_array(name, kind, [decimal(each, precision) for each in kept.flat]))
     for name, values in indices.items():
-        lines.append(_array(name, "DINT", [str(int(each)) for each in values.flat]))
+        lines.append(_array(name, "DINT", [str(each) for each in values.flat]))
     return lines
 
 

@@ -7,6 +7,7 @@ A ``plot_...`` takes matplotlib's Axes, or makes a new figure, and returns the A
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,10 +52,7 @@ MAX_REGIONS = 30  # in a picture of visits: those visited most
 
 
 def _entry_of(problem: LinearMPC, quantity: Quantity, inputs: bool = False) -> int:
-    """Return the entry of theta that a name or an index stands for; ValueError for none.
-
-    With ``inputs`` it is an entry of ``[theta, u]``.
-    """
+    """Return the entry of theta, or of [theta, u] with ``inputs``, of a name or an index."""
     names = [*problem.labels(), *(labels_of(problem.model)[1] if inputs else ())]
     if isinstance(quantity, str) and quantity in names:
         return names.index(quantity)
@@ -141,7 +139,7 @@ class _Plane:
             )
         law = problem.law()
         points = 121 if isinstance(law, PiecewiseAffine) else 41  # a program for each of them
-        self.grid = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+        self.grid = np.linspace(low, high, points, axis=1)
         shown = np.tile(problem.units.to_plant(problem.theta_rest), (points**2, 1))
         shown[:, chosen] = np.stack(np.meshgrid(*self.grid), axis=-1).reshape(-1, 2)
         self.theta = problem.units.to_deviations(shown)
@@ -422,10 +420,10 @@ def _draw_loops(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
 def _draw_differences(axes: Axes, problem: LinearMPC, runs: Runs, entry: int) -> None:
     """Draw by how much a quantity differs from the first controller's, from the same starts."""
     first, *others = (_rows(each, entry, problem.n_theta) for each in runs.values())
-    held = entry >= problem.n_theta
     for number, rows in enumerate(others, start=1):
         steps = min(first.shape[1], rows.shape[1])
-        _draw_rows(axes, rows[:, :steps] - first[:, :steps], problem.model.dt, number, held)
+        apart = rows[:, :steps] - first[:, :steps]
+        _draw_rows(axes, apart, problem.model.dt, number, entry >= problem.n_theta)
     _hide_rounding(axes, 1e-4 * float(np.nanmax(first) - np.nanmin(first)))
     axes.axhline(0, color="black", linewidth=0.8)
     plain = [*problem.labels(), *labels_of(problem.model)[1]][entry]
@@ -438,20 +436,14 @@ def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:
     """Return an entry of [theta, u] in each episode (episodes, steps), NaN after its end."""
     k = entry - n_theta
     parts, column = (episodes.actions, k) if k >= 0 else (episodes.observations, entry)
-    series = [each[:, column] for each in parts]
-    found = np.full((len(series), max(map(len, series))), np.nan)
-    for row, each in zip(found, series, strict=True):
-        row[: len(each)] = each
-    return found
+    series = (each[:, column] for each in parts)
+    return np.array([*zip_longest(*series, fillvalue=np.nan)]).T
 
 
 def _draw_rows(
     axes: Axes, rows: Array, dt: float, number: int, held: bool, name: str = "_nolegend_"
 ) -> None:
-    """Draw lines of a few episodes; of many the median, and the band of 80 % of them.
-
-    Inputs are ``held`` for a sample.
-    """
+    """Draw lines of a few episodes, ``held`` inputs as steps; of many median and band of 80 %."""
     time = dt * np.arange(rows.shape[1])
     color = COLORS[number % len(COLORS)]
     line: dict[str, Any] = {"color": color, "drawstyle": "steps-post" if held else "default"}
@@ -470,14 +462,13 @@ def _draw_rows(
 def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, data: Array) -> None:
     """Draw limits no farther from the data than these are apart; others would flatten them."""
     k = entry - problem.n_theta
+    sides: tuple[float, ...] = ()
+    kind = "bound of the input"
     if k >= 0:
         sides = problem.u_min[k], problem.u_max[k]
-        kind = "bound of the input"
     elif entry < problem.model.n_states:
         sides = problem.x_min[entry], problem.x_max[entry]
         kind = "soft limit" if problem.soft.penalty and problem.soft.x[entry] > 0 else "limit"
-    else:
-        return
     width = max(float(np.ptp(data)), 1e-9 * float(np.abs(data).max()))
     for value in sides:
         if data.min() - width <= value <= data.max() + width:
@@ -563,14 +554,11 @@ def plot_decisions(decisions: Sequence[Any], axes: Axes | None = None) -> Axes:
 def _range_of_costs(costs: Array, accepted: Array) -> tuple[float, float]:
     """Return the range of 0 and what was accepted, and of the candidates within two widths."""
     known = np.append(accepted[np.isfinite(accepted)], 0.0)
-    low = float(known.min())
-    high = float(known.max())
-    width = max(high - low, 0.02 * max(abs(low), abs(high)), 0.01)
-    near = costs[(costs >= low - 2 * width) & (costs <= high + 2 * width)]
-    low = min([low, *near])
-    high = max([high, *near])
-    room = 0.08 * max(high - low, width)
-    return low - room, high + room
+    width = max(float(np.ptp(known)), 0.02 * float(np.abs(known).max()), 0.01)
+    near = (costs >= known.min() - 2 * width) & (costs <= known.max() + 2 * width)
+    shown = np.append(known, costs[near])
+    room = 0.08 * max(float(np.ptp(shown)), width)
+    return float(shown.min()) - room, float(shown.max()) + room
 
 
 # ---- Headroom, and what a twin is worth ----

@@ -432,8 +432,7 @@ def refit_critic(policy: StartsAsMPC, twin: LearntModel, seed: int) -> None:
     first = first + 0.1 * problem.u_half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.deviations.u_min, problem.deviations.u_max)
     costs = _discounted(policy, twin, act, starts, first)
-    options = policy.critic_options
-    returns = options.offset_of_return(policy.gamma) - options.reward_scale * costs
+    returns = policy.critic.offset - policy.critic_options.reward_scale * costs
     known = np.isfinite(returns)
     if np.count_nonzero(known) < CRITIC_BATCH:  # too few to say anything
         return
@@ -480,7 +479,7 @@ def _fit_critic(
     unit = float(np.std(returns)) or 1.0
     if critic.scales_itself and policy.critic_updates == 0:
         critic.batch = points
-        critic.scale_values(critic.stage_cost_of_batch())
+        critic.scale_values()
     optimizer = th.optim.Adam(critic.parameters(), lr=1e-3)
     for k in range(CRITIC_UPDATES):
         for group in optimizer.param_groups:

@@ -10,7 +10,6 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import Array
 from sb3_yann.control.law import PiecewiseAffine
 
 
@@ -48,26 +47,30 @@ class PaperYann(nn.Module):
 
         # Rows of the suppression layer: (sign, region, output). It takes the indicators, the
         # signed laws and the nodes of the network; node j of a region serves output j mod m.
-        suppression = _largest(law) + width  # the nodes of a region add up to at most width
+        middle = (law.theta_max + law.theta_min) / 2
+        radius = (law.theta_max - law.theta_min) / 2
+        largest = np.abs(law.gains @ middle + law.offsets) + np.abs(law.gains) @ radius
+        suppression = largest.max() + width  # the nodes of a region add up to at most width
         active = np.tile(np.kron(np.eye(p), np.ones((m, 1))), (2, 1))
         share = np.array([[float(j % m == i) for j in range(width)] for i in range(m)])
         nodes = np.concatenate([s * np.kron(np.eye(p), share) for s in sign])
         suppress = np.hstack([suppression * active, np.eye(2 * p * m), nodes])
 
-        self.fixed = nn.ParameterDict(
-            {
-                "half_spaces": _fixed(-law.A),
-                "half_spaces_bias": _fixed(law.b),
-                "all_hold": _fixed(owner),
-                "all_hold_bias": _fixed(0.5 - counts),
-                "indicator": _fixed(np.eye(p)),
-                "laws": _fixed(gains),
-                "laws_bias": _fixed(offsets),
-                "suppress": _fixed(suppress),
-                "suppress_bias": _fixed(np.full(2 * p * m, -suppression)),
-                "add": _fixed(np.kron(sign[None], np.tile(np.eye(m), p))),
-            }
-        )
+        fixed = {
+            "half_spaces": -law.A,
+            "half_spaces_bias": law.b,
+            "all_hold": owner,
+            "all_hold_bias": 0.5 - counts,
+            "indicator": np.eye(p),
+            "laws": gains,
+            "laws_bias": offsets,
+            "suppress": suppress,
+            "suppress_bias": np.full(2 * p * m, -suppression),
+            "add": np.kron(sign[None], np.tile(np.eye(m), p)),
+        }
+        dtype = th.get_default_dtype()
+        values = {name: th.tensor(each, dtype=dtype) for name, each in fixed.items()}
+        self.fixed = nn.ParameterDict(values).requires_grad_(False)
         half = width // 2
         order = np.arange(width)
         order[: 2 * half] = np.roll(order[: 2 * half], half)  # an odd node is left to itself
@@ -86,8 +89,8 @@ class PaperYann(nn.Module):
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return u, shape (batch, m), for theta of shape (batch, n)."""
         w = self.fixed
-        holds = _step(theta @ w["half_spaces"].T + w["half_spaces_bias"])
-        active = _step(holds @ w["all_hold"].T + w["all_hold_bias"]) @ w["indicator"].T
+        holds = (theta @ w["half_spaces"].T + w["half_spaces_bias"] >= 0).to(theta)
+        active = (holds @ w["all_hold"].T + w["all_hold_bias"] >= 0).to(theta) @ w["indicator"].T
         laws = theta @ w["laws"].T + w["laws_bias"]
         weight = self.first_weight + self.first_weight[self.partner]
         bias = self.first_bias + self.first_bias[self.partner]
@@ -95,18 +98,3 @@ class PaperYann(nn.Module):
         joined = th.cat([active, laws, nodes], dim=1)
         u: th.Tensor = th.relu(joined @ w["suppress"].T + w["suppress_bias"]) @ w["add"].T
         return u
-
-
-def _largest(law: PiecewiseAffine) -> float:
-    """Return a bound on |K theta + r| of every region over the whole box."""
-    middle = (law.theta_max + law.theta_min) / 2
-    half = (law.theta_max - law.theta_min) / 2
-    return float(np.max(np.abs(law.gains @ middle + law.offsets) + np.abs(law.gains) @ half))
-
-
-def _fixed(value: Array) -> nn.Parameter:
-    return nn.Parameter(th.tensor(value, dtype=th.get_default_dtype()), requires_grad=False)
-
-
-def _step(x: th.Tensor) -> th.Tensor:
-    return (x >= 0).to(x.dtype)

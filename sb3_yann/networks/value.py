@@ -61,18 +61,6 @@ def with_one(points: th.Tensor, n: int) -> th.Tensor:
     return th.cat([points[:, :n], points.new_ones(len(points), 1), points[:, n:]], dim=1)
 
 
-class KeepsOne(nn.Module):
-    """The prediction of ``[theta, 1]`` by a model of theta."""
-
-    def __init__(self, model: PredictionModel) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
-        """Return the predicted next one, (batch, n + 1)."""
-        return th.cat([self.model(theta[:, :-1], u), theta[:, -1:]], dim=1)
-
-
 class LinearPrediction(nn.Module):
     """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`.
 
@@ -124,7 +112,27 @@ class QuadraticForm(nn.Module):
         return form
 
 
-class QuadraticStateActionValue(nn.Module):
+class _StateActionValue(nn.Module):
+    """A quadratic form plus a network, of rows ``[theta, a]``; a 1 follows theta in priced ones."""
+
+    to_input: th.Tensor
+    middle: th.Tensor
+    network_scale: th.Tensor
+    n_before_one: int
+    quadratic: QuadraticForm
+    network: ZeroOutputNetwork
+
+    def weights(self) -> tuple[nn.Parameter, ...]:
+        """Return all that is trained: the entries of the form, and the network's weights."""
+        modules: Any = self._modules  # an attribute of a module takes a microsecond to find
+        return (modules["quadratic"].entries, *modules["network"].weights())
+
+    def _completed(self, theta_and_action: th.Tensor) -> th.Tensor:
+        n = self.n_before_one
+        return with_one(theta_and_action, n) if n else theta_and_action
+
+
+class QuadraticStateActionValue(_StateActionValue):
     """``Q(theta, a) = -[theta; u]' M [theta; u] + network``: u now, the law ever after.
 
     The critic of Braniff & Tian, Section 4.2. ``u`` is the input in physical units for an action
@@ -150,10 +158,6 @@ class QuadraticStateActionValue(nn.Module):
     >>> q(th.tensor([[1.0, 2.0, 1.0]])).item()
     -6.0
     """
-
-    to_input: th.Tensor
-    middle: th.Tensor
-    network_scale: th.Tensor
 
     def __init__(
         self,
@@ -183,15 +187,13 @@ class QuadraticStateActionValue(nn.Module):
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
-        if self.n_before_one:
-            theta_and_action = with_one(theta_and_action, self.n_before_one)
-        z = theta_and_action * self.to_input + self.middle
+        z = self._completed(theta_and_action) * self.to_input + self.middle
         learnt = self.network((z * self.network_scale).float())
         q: th.Tensor = learnt - self.quadratic(z).float()
         return q
 
 
-class AfterstateValue(nn.Module):
+class AfterstateValue(_StateActionValue):
     """``Q(theta, a) = -(theta'Q theta + u'Ru + gamma V(f(theta, u)))``, V quadratic plus network.
 
     With the linear model for f, it starts as :class:`QuadraticStateActionValue`, to rounding. Only
@@ -223,9 +225,6 @@ class AfterstateValue(nn.Module):
     -7.0
     """
 
-    to_input: th.Tensor
-    middle: th.Tensor
-    network_scale: th.Tensor
     value_scale: th.Tensor
     W: th.Tensor
 
@@ -250,8 +249,6 @@ class AfterstateValue(nn.Module):
         self.model = untrained(model) if isinstance(model, nn.Module) else model
         require_prediction(self.model, n, m)
         self.n_before_one = n if len(P) > n else 0
-        if self.n_before_one:
-            self.model = _keeping_one(self.model)
         self.gamma = gamma
         self.quadratic = QuadraticForm(P, ranges.scale(len(P)))
         register_constants(
@@ -267,7 +264,7 @@ class AfterstateValue(nn.Module):
         self.network = ZeroOutputNetwork(
             len(P), n_outputs, hidden, activation=activation, pinned=kept
         )
-        self._constants: tuple[Array, Array, Array, Array]
+        self._constants: tuple[Array, ...] = ()
         self._constants_of: tuple[list[Any], tuple[th.Tensor, ...]] = ([], ())
 
     @property
@@ -283,15 +280,12 @@ class AfterstateValue(nn.Module):
         largest = 48  # parameters and inputs; beyond, BLAS is faster than loops
         linear = isinstance(modules.get("model"), LinearPrediction)
         weight: Any = self._buffers["W"]
-        if not linear or weight.dtype != th.float64 or len(weight) > largest:
-            return False
-        if self.n_outputs > 1:
-            return False
-        double: bool = modules["quadratic"].entries.dtype == th.float64
-        return double and modules["network"].compiles
+        double = weight.dtype == modules["quadratic"].entries.dtype == th.float64
+        fits = linear and double and len(weight) <= largest and self.n_outputs == 1
+        return fits and modules["network"].compiles
 
     @property
-    def constants(self) -> tuple[Array, Array, Array, Array]:
+    def constants(self) -> tuple[Array, ...]:
         """W, the model's [A B], the scale of the quadratic form, and others, for compiled code."""
         modules: Any = self._modules
         own: Any = self._buffers
@@ -305,9 +299,13 @@ class AfterstateValue(nn.Module):
         then, known = self._constants_of
         if then != now or not all(map(operator.is_, used, known)):
             W, A, B, root, *scaling = (each.numpy() for each in used)
+            AB = np.vstack([A, B]).T
+            if n := self.n_before_one:  # the 1 stays
+                AB = np.insert(AB, n, 0.0, axis=1)
+                AB = np.vstack([AB, np.eye(1, AB.shape[1], n)])
             self._constants = (
                 W.copy(),
-                np.ascontiguousarray(np.vstack([A, B]).T),
+                np.ascontiguousarray(AB),
                 np.outer(root, root) * self.gamma,
                 np.concatenate(scaling),
             )
@@ -318,20 +316,20 @@ class AfterstateValue(nn.Module):
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
         theta_and_action = self._completed(theta_and_action)
         if self.compiles and theta_and_action.device.type == "cpu":
-            return self._compiled(theta_and_action, self._weights())
+            from sb3_yann.networks._kernels.afterstate_value import value_on_cpu  # compiled once
+
+            network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
+            known = (*self.constants, network.pinned_array, self.gamma * self.scale)
+            return value_on_cpu(theta_and_action, self.weights(), known)
         theta, u = self._theta_and_input(theta_and_action)
-        stage = self._stage_cost(theta, u)
-        return -(stage + self.gamma * self.value(self.model(theta, u))).float()
+        following = self.model(theta[:, : self.n_before_one or None], u)
+        return -(self._stage_cost(theta, u) + self.gamma * self.value(following)).float()
 
     @th.no_grad()
     def mean_stage_cost(self, theta_and_action: th.Tensor) -> float:
         """Return the mean of the stage cost's absolute values, over rows ``[theta, a]``."""
         points = self._completed(theta_and_action)
         return float(self._stage_cost(*self._theta_and_input(points)).abs().mean())
-
-    def _completed(self, theta_and_action: th.Tensor) -> th.Tensor:
-        n = self.n_before_one
-        return with_one(theta_and_action, n) if n else theta_and_action
 
     def _theta_and_input(self, theta_and_action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
@@ -341,22 +339,6 @@ class AfterstateValue(nn.Module):
         z = th.cat([theta, u], 1)
         return ((z @ self.W) * z).sum(-1, keepdim=True)
 
-    def compiled_with_fixed_weights(self, theta_and_action: th.Tensor) -> th.Tensor:
-        """Return Q where :attr:`compiles`, with a gradient by the rows, but not by the weights."""
-        weights = tuple(each.detach() for each in self._weights())
-        return self._compiled(self._completed(theta_and_action), weights)
-
-    def _weights(self) -> tuple[th.Tensor, ...]:
-        modules: Any = self._modules  # an attribute of a module takes a microsecond to find
-        return (modules["quadratic"].entries, *modules["network"].weights())
-
-    def _compiled(self, points: th.Tensor, weights: tuple[th.Tensor, ...]) -> th.Tensor:
-        from sb3_yann.networks._kernels.afterstate_value import value_on_cpu  # compiled once
-
-        network: Any = self._modules["network"]
-        factor = self.gamma * self.scale
-        return value_on_cpu(points, weights, (*self.constants, network.pinned_array, factor))
-
     def value(self, theta: th.Tensor) -> th.Tensor:
         """Return V, the discounted cost to go in float64, shape (batch, 1), for (batch, n)."""
         if theta.shape[1] == self.n_before_one:
@@ -364,18 +346,6 @@ class AfterstateValue(nn.Module):
         learnt: th.Tensor = self.network((theta * self.network_scale).float())
         total: th.Tensor = self.quadratic(theta) + self.scale * learnt.double()
         return total
-
-
-def _keeping_one(model: PredictionModel) -> PredictionModel:
-    """Return the prediction of ``[theta, 1]``; a linear one stays one, which is compiled."""
-    if not isinstance(model, LinearPrediction):
-        return KeepsOne(model)
-    A = model.A.T.numpy()
-    B = model.B.T.numpy()
-    one = np.zeros((len(A) + 1, len(A) + 1))
-    one[:-1, :-1] = A
-    one[-1, -1] = 1.0
-    return LinearPrediction(one, np.vstack([B, np.zeros((1, B.shape[1]))]))
 
 
 def require_prediction(model: PredictionModel, n: int, m: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -39,7 +39,18 @@ class LawLayer(nn.Module):
     reach: float | None
     constants: tuple[Array, Array, Array, float]  # for compiled code
 
-    def __init__(self, law: Law, rate: ChangeBounds | None, kept: KeptSet | None) -> None:
+    HIDDEN: ClassVar[tuple[int, ...]]  # widths of a network, if nothing is said
+
+    def __init__(
+        self,
+        law: Law,
+        hidden: tuple[int, ...] | None = None,
+        activation: Activation = th.tanh,
+        max_correction: float | None = None,
+        pinned: bool = True,
+        rate: ChangeBounds | None = None,
+        kept: KeptSet | None = None,
+    ) -> None:
         super().__init__()
         # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
         import_module("sb3_yann.networks._kernels.yann_layer")
@@ -49,13 +60,13 @@ class LawLayer(nn.Module):
                 "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
             )
         self.base_law = law
-        self.rated = rate is not None
+        self.rated = rate is not None or law.moving is not None
         self.row_gradients = False
         middle = (law.u_max + law.u_min) / 2
         half_range = (law.u_max - law.u_min) / 2
         half = half_widths(law.theta_min, law.theta_max)
         self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
-        change: Array = np.empty((0, law.n_inputs))
+        change: Array = np.full((2, law.n_inputs), np.inf) * [[-1.0], [1.0]]
         self.moving = law.moving
         ends = None if law.clamped is None else th.as_tensor(np.array(law.clamped))
         self.register_buffer("clamped", ends, persistent=False)
@@ -68,12 +79,9 @@ class LawLayer(nn.Module):
             # In both directions a little is left for the rounding of actions and observations.
             room = np.maximum(np.stack([-rate[0], rate[1]]) / half_range - 1e-6, 0.0)
             change = room * [[-1.0], [1.0]]
+        if self.rated:
             register_constants(self, change=change)
         if self.moving is not None:  # bounds in theta: their entries below the change
-            self.rated = True
-            if rate is None:
-                change = np.full((2, law.n_inputs), np.inf) * [[-1.0], [1.0]]
-                register_constants(self, change=change)
             change = np.concatenate([change, self.moving])
         if self.rated or not isinstance(self, YannLayer):
             register_constants(self, middle=middle, half_range=half_range)
@@ -85,8 +93,21 @@ class LawLayer(nn.Module):
         self.rows = none if kept is None else _kept_in_actions(kept, middle, half_range)
         # Below zero the rows are left out.
         self.register_buffer("margin", th.tensor(0.0 if kept else -1.0, dtype=th.float64))
-        self.constants = (scaling, change, self.rows, np.inf)
+        self.constants = (scaling, change if self.rated else change[:0], self.rows, np.inf)
         self._keep_constants()
+        at_origin = self._register_law(law)
+        self.network = ZeroOutputNetwork(
+            law.n_theta,
+            law.n_inputs,
+            self.HIDDEN if hidden is None else hidden,
+            activation=activation,
+            pinned=th.as_tensor(at_origin & pinned),
+        )
+        self.limit(max_correction)
+
+    def _register_law(self, law: Any) -> NDArray[np.bool_]:
+        """Register what a layer keeps of the law; return which networks count at the origin."""
+        raise NotImplementedError
 
     @property
     def n_networks(self) -> int:
@@ -196,10 +217,7 @@ class LawLayer(nn.Module):
         return slopes
 
     def frozen(self) -> Callable[[Array], NDArray[Any]]:
-        """Return the layer of now as a function of theta (batch, n): (batch, m), both of numpy.
-
-        It is faster for small batches where there is compiled code: it does without torch.
-        """
+        """Return the layer of now as a function of theta (batch, n): (batch, m), without torch."""
         if self.network.compiles:
             from sb3_yann.networks._kernels.yann_layer import frozen_layer
 
@@ -271,10 +289,7 @@ def clamp_theta(theta: th.Tensor, ends: th.Tensor | None) -> th.Tensor:
 
 
 def _kept_in_actions(kept: KeptSet, middle: Array, half_range: Array) -> Array:
-    """Return rows [a, b, c, half-width] for actions in [-1, 1], b of length 1.
-
-    A row that no input moves is none.
-    """
+    """Return rows [a, b, c, half-width], that inputs move, for actions in [-1, 1]; |b| = 1."""
     m = len(middle)
     a, b, c = np.split(kept.ahead, [-m - 1, -1], axis=1)
     c = c - (b @ middle)[:, None]
@@ -319,6 +334,7 @@ class YannLayer(LawLayer):
     True
     """
 
+    HIDDEN = (16, 16)
     base_law: PiecewiseAffine
     gains: th.Tensor
     offsets: th.Tensor
@@ -326,29 +342,22 @@ class YannLayer(LawLayer):
     half_space_b: th.Tensor
     resting: th.Tensor
 
-    def __init__(
-        self,
-        law: PiecewiseAffine,
-        hidden: tuple[int, ...] = (16, 16),
-        activation: Activation = th.tanh,
-        max_correction: float | None = None,
-        pinned: bool = True,
-        rate: ChangeBounds | None = None,
-        kept: KeptSet | None = None,
-    ) -> None:
-        super().__init__(law, rate, kept)
+    def _register_law(self, law: PiecewiseAffine) -> NDArray[np.bool_]:
+        middle = (law.u_max + law.u_min) / 2
+        half_range = (law.u_max - law.u_min) / 2
+        own, rows, ends = law.open_rows
+        A, b = padded_rows(law.starts, rows, np.where(own, ends, np.inf))
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
-        register_constants(self, **_law_in_actions(law))
-        at_origin = np.minimum.reduceat(law.b, law.starts) >= -law.tolerance
-        self.network = ZeroOutputNetwork(
-            law.n_theta,
-            law.n_inputs,
-            hidden,
-            activation=activation,
-            pinned=th.as_tensor(at_origin & pinned),
+        register_constants(
+            self,
+            gains=law.gains / half_range[:, None],
+            offsets=(law.offsets - middle) / half_range,
+            resting=np.clip(-middle / half_range, -1, 1),
+            half_space_A=A.T.reshape(law.n_theta, -1),  # the first of every region, the second, ...
+            half_space_b=b.T.ravel(),
         )
-        self.limit(max_correction)
+        return np.asarray(np.minimum.reduceat(law.b, law.starts) >= -law.tolerance)
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -402,29 +411,18 @@ class YannLayer(LawLayer):
             self.get_buffer(name).copy_(ours)
 
 
-def _law_in_actions(law: PiecewiseAffine) -> dict[str, Array]:
-    """Return the law for actions in [-1, 1], as the layer keeps it.
+def padded_rows(starts: NDArray[np.int64], rows: Array, ends: Array) -> tuple[Array, Array]:
+    """Return half-spaces of regions, (p, q_max, n) and (p, q_max), from those in a row.
 
-    The half-spaces are (n, q_max p) and (q_max p,): the first of every region, the second, ...
+    Regions with fewer than q_max are filled up with half-spaces that never bind.
     """
-    middle = (law.u_max + law.u_min) / 2
-    half_range = (law.u_max - law.u_min) / 2
-    # Regions with fewer than q_max are filled up with half-spaces that never bind, as the box's do.
-    counts = np.diff([*law.starts, law.n_halfspaces])
-    A = np.zeros((law.n_theta, counts.max(), law.n_regions))
-    b = np.full((counts.max(), law.n_regions), np.inf)
-    own, rows, ends = law.open_rows
-    ends = np.where(own, ends, np.inf)
-    for i, (start, count) in enumerate(zip(law.starts, counts, strict=True)):
-        A[:, :count, i] = rows[start : start + count].T
-        b[:count, i] = ends[start : start + count]
-    return {
-        "gains": law.gains / half_range[:, None],
-        "offsets": (law.offsets - middle) / half_range,
-        "resting": np.clip(-middle / half_range, -1, 1),
-        "half_space_A": A.reshape(law.n_theta, -1),
-        "half_space_b": b.ravel(),
-    }
+    counts = np.diff([*starts, len(ends)])
+    used = np.arange(counts.max()) < counts[:, None]
+    A: Array = np.zeros((*used.shape, rows.shape[1]))
+    b: Array = np.full(used.shape, np.inf)
+    A[used] = rows
+    b[used] = ends
+    return A, b
 
 
 class SharedYannLayer(LawLayer):
@@ -455,26 +453,14 @@ class SharedYannLayer(LawLayer):
     True
     """
 
+    HIDDEN = (64, 64)
     samples: th.Tensor
 
-    def __init__(
-        self,
-        law: Law,
-        hidden: tuple[int, ...] = (64, 64),
-        activation: Activation = th.tanh,
-        max_correction: float | None = None,
-        pinned: bool = True,
-        rate: ChangeBounds | None = None,
-        kept: KeptSet | None = None,
-    ) -> None:
-        super().__init__(law, rate, kept)
+    def _register_law(self, law: Law) -> NDArray[np.bool_]:
         law(np.zeros(law.n_theta))  # compiled now, not in the midst of learn
         theta = sample_points(law)
         register_constants(self, samples=np.hstack([theta, self._actions(theta)]))
-        self.network = ZeroOutputNetwork(
-            law.n_theta, law.n_inputs, hidden, activation=activation, pinned=th.tensor([pinned])
-        )
-        self.limit(max_correction)
+        return np.array([True])
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -526,10 +512,7 @@ class SharedYannLayer(LawLayer):
 
 
 def sample_points(law: Law) -> Array:
-    """Return points (rows, n) in the box of a law, most of them near its middle.
-
-    Far from there many laws have the same answer: a bound.
-    """
+    """Return points (rows, n) in a law's box, most near its middle: afar many laws are a bound."""
     bounded = np.isfinite(law.theta_min) & np.isfinite(law.theta_max)
     middle = np.where(bounded, law.theta_max / 2 + law.theta_min / 2, 0.0)
     shares = np.random.default_rng(0).uniform(-1, 1, (32, law.n_theta))

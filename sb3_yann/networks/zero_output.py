@@ -22,29 +22,13 @@ FEW = 32
 """Stacks of up to this size are multiplied as a whole."""
 
 
-class PairedLinear(nn.Module):
-    """``x -> W_1 x + b_1 + W_2 x + b_2`` for a pair of nodes of opposite sign: zero at first."""
+class _Layer(nn.Module):
+    """Holds the parameter of a layer, by its name."""
 
-    def __init__(self, drawn: th.Tensor) -> None:
+    def __init__(self, **parameters: th.Tensor) -> None:
         super().__init__()
-        self.nodes = nn.Parameter(th.stack([drawn, -drawn], 1))
-
-    def matrix(self) -> th.Tensor:
-        """Return weights and, as the last column, biases: (n_stacked, out_features, n + 1)."""
-        return self.nodes.sum(1)
-
-
-class StackedLinear(nn.Module):
-    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names."""
-
-    def __init__(self, drawn: th.Tensor) -> None:
-        super().__init__()
-        drawn[..., -1] = 0  # Theorem 2: the biases of later layers start at zero
-        self.weight = nn.Parameter(drawn)
-
-    def matrix(self) -> th.Tensor:
-        """Return weights and, as the last column, biases: (n_stacked, out_features, n + 1)."""
-        return self.weight
+        for name, value in parameters.items():
+            self.register_parameter(name, nn.Parameter(value))
 
 
 class Rows:
@@ -147,16 +131,22 @@ class ZeroOutputNetwork(nn.Module):
         outputs = (*hidden, out_features)
         sizes = zip(outputs, inputs, strict=True)
         first, *rest = (th.empty(len(pinned), m, n + 1).uniform_(-0.01, 0.01) for m, n in sizes)
-        self.first = PairedLinear(first)
-        self.rest = nn.ModuleList(map(StackedLinear, rest))
+        for each in rest:
+            each[..., -1] = 0  # Theorem 2: the biases of later layers start at zero
+        self.first = _Layer(nodes=th.stack([first, -first], 1))
+        self.rest = nn.ModuleList(_Layer(weight=each) for each in rest)
         self.register_buffer("pinned", pinned.float()[:, None])
         names_of_tanh = (th.tanh, nn.functional.tanh)
         is_tanh = isinstance(activation, nn.Tanh) or activation in names_of_tanh
         self.has_loops = len(hidden) == 2 and is_tanh
 
-    def layers(self) -> list[PairedLinear | StackedLinear]:
-        """Return the layers, the first of them paired."""
-        return [self.first, *(each for each in self.rest if isinstance(each, StackedLinear))]
+    def matrices(self) -> list[th.Tensor]:
+        """Return each layer's weights and, as the last column, biases: (n_stacked, out, n + 1).
+
+        The first layer's nodes come in pairs, whose sum is zero at first.
+        """
+        nodes, *rest = self.weights()
+        return [nodes.sum(1), *rest]
 
     def weights(self) -> tuple[nn.Parameter, ...]:
         """Return the parameters, layer by layer."""
@@ -185,8 +175,8 @@ class ZeroOutputNetwork(nn.Module):
     @th.no_grad()
     def is_zero(self) -> bool:
         """Return whether nothing has been learnt: the output is zero whatever the input is."""
-        biases = [weight[..., -1] for weight in self.rest.parameters()]
-        return not any(bool(th.any(each != 0)) for each in (self.first.matrix(), *biases))
+        first, *rest = self.matrices()
+        return not any(bool(each.any()) for each in (first, *(weight[..., -1] for weight in rest)))
 
     def forward(self, x: th.Tensor, index: th.Tensor | None = None) -> th.Tensor:
         """Return (batch, out_features) for x (batch, in_features).
@@ -201,17 +191,13 @@ class ZeroOutputNetwork(nn.Module):
         rows = Rows(index, len(self.pinned), x.dtype)
         pinned = rows.each(lambda pinned: pinned, self.pinned)
         at_zero = (x == 0).all(-1, keepdim=True) & (pinned > 0)
-        *hidden, last = self.layers()
-        for layer in hidden:
-            matrix = layer.matrix()
-            weight = matrix[..., :-1]
+        *hidden, last = self.matrices()
+        for matrix in hidden:
             bias = matrix[..., -1]
-            x = self.activation(rows.affine(weight, bias, x)) - rows.each(
+            x = self.activation(rows.affine(matrix[..., :-1], bias, x)) - rows.each(
                 lambda bias, pinned: pinned * self.activation(bias), bias, self.pinned
             )
-        matrix = last.matrix()
-        bias = (1 - self.pinned) * matrix[..., -1]
-        output: th.Tensor = rows.affine(matrix[..., :-1], bias, x)
+        output: th.Tensor = rows.affine(last[..., :-1], (1 - self.pinned) * last[..., -1], x)
         # Many kernels round s differently at the end of a row of memory: s(b) - s(b) is not 0.
         return output.masked_fill(at_zero, 0.0)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -94,14 +94,6 @@ class CriticOptions:
         """Whether the scale of the values comes from what is learnt from."""
         return self.value_scale is None and self.kind == "afterstate"
 
-    def offset_of_return(self, gamma: float) -> float:
-        """Return what ``reward_offset`` adds up to; ValueError if that is no finite number."""
-        if self.reward_offset == 0:
-            return 0.0
-        if not gamma < 1:
-            raise ValueError(f"reward_offset = {self.reward_offset!r} needs a discount below 1.")
-        return float(self.reward_offset) / (1 - gamma)
-
 
 def as_critic_options(critic: str | CriticOptions | Mapping[str, Any]) -> CriticOptions:
     """Return the options of a critic from its kind, a mapping of some of them, or themselves."""
@@ -119,8 +111,7 @@ class YannActor(KeepsPrecision, SeesTheta, Actor):
         The MPC whose law the actor starts from.
     net_arch : list of int
         Widths of each network.
-    activation_fn : type, default torch.nn.Tanh
-    max_correction, pin_equilibrium, law, networks, keep_bounds, bounds_margin
+    activation_fn, max_correction, pin_equilibrium, law, networks, keep_bounds, bounds_margin
         As in :class:`YannPolicy`.
     **sb3_kwargs
         Other arguments of SB3's `Actor`: spaces and features extractor.
@@ -185,14 +176,11 @@ class YannActor(KeepsPrecision, SeesTheta, Actor):
             if self.named and not th.is_grad_enabled():  # the sensor is back, and no batch is it
                 self.named = ""
             return actions
-        return self._without_what_is_not_finite(obs)
-
-    def _without_what_is_not_finite(self, obs: th.Tensor) -> th.Tensor:
         lost = ~obs.flatten(1).isfinite()
         kept = obs.masked_fill(lost.view_as(obs), 0.0)
         theta = self.extract_features(kept, self.features_extractor)
         theta = without_entries(theta, lost, self.features_extractor)
-        actions: th.Tensor = self.mu(theta)
+        actions = self.mu(theta)
         whole = (~lost.any(1, keepdim=True)) & actions.detach().isfinite().all(1, keepdim=True)
         problem: LinearMPC = self.options["problem"]  # type: ignore[assignment]
         named = problem.model.state_names and keeps_entries(self.features_extractor)
@@ -227,11 +215,10 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
     gamma : float
         Discount of the return that the critic puts out.
     options : CriticOptions
-    pin_equilibrium : bool, default True
+    pin_equilibrium, activation_fn
         As in :class:`YannPolicy`.
     net_arch : list of int
         Widths of each critic's network.
-    activation_fn : type, default torch.nn.Tanh
     n_critics : int, default 2
     n_outputs : int, default 1
         Of each critic: quantiles of the return.
@@ -265,7 +252,9 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         super().__init__(net_arch=[], **sb3_kwargs)
         self.gamma = gamma
         self.scale = float(options.reward_scale)
-        self.offset = options.offset_of_return(gamma)
+        if options.reward_offset and not gamma < 1:
+            raise ValueError(f"reward_offset = {options.reward_offset!r} needs a discount below 1.")
+        self.offset = options.reward_offset and float(options.reward_offset) / (1 - gamma)
         self.scales_itself = options.scales_itself
         self.batch: th.Tensor | None = None  # the latest points to learn from
         common: dict[str, Any] = {
@@ -294,19 +283,23 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         theta = self.extract_features(obs, self.features_extractor)  # never trained
         points = th.cat([theta, actions], dim=1)
         if th.is_grad_enabled():
-            self._know_scale(points)
+            self.know_scale(points)
         return self.values(points)
 
-    def _know_scale(self, points: th.Tensor) -> None:
+    def know_scale(self, points: th.Tensor) -> None:
+        """Take the factor of the networks, not known yet, from points ``[theta, action]``."""
         if self.scales_itself:
             self.batch = points.detach()
-            first = cast("Any", self.q_networks[0])
+            first: Any = self.q_networks[0]
             if not first.value_scale > 0:
-                self.scale_values(self.stage_cost_of_batch())
+                self.scale_values()
 
-    def know_scale(self, obs: th.Tensor, actions: th.Tensor) -> None:
-        """Take the factor of the networks from what is learnt from, where it is not known."""
-        self._know_scale(th.cat([self.extract_features(obs, self.features_extractor), actions], 1))
+    def scale_values(self) -> None:
+        """Set the factor of networks that are zero to the batch's stage cost for good, if any."""
+        networks: list[Any] = self.q_networks
+        if (cost := self.stage_cost_of_batch()) > 0:
+            for q_network in networks:
+                q_network.value_scale.fill_(cost / self.share_of_a_step)
 
     def state_value(self, obs: th.Tensor) -> th.Tensor:
         """Return the first critic's value of states under the law, (batch, 1), in rewards."""
@@ -315,31 +308,25 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         return self._in_rewards(-first.value(theta.double()).float())
 
     @property
-    def unit(self) -> float:
-        """Size of the values that are learnt, in rewards."""
-        first: Any = self.q_networks[0]
-        return float(self.scale * first.scale)
+    def share_of_a_step(self) -> float:
+        """What one step is of the sum of equal stage costs, discounted for good."""
+        return max(1 - self.gamma, 1 / MAX_VALUE_SAMPLES)
 
     def stage_cost_of_batch(self) -> float:
         """Return the mean stage cost of the latest points to learn from."""
         first: Any = self.q_networks[0]
         return 0.0 if self.batch is None else float(first.mean_stage_cost(self.batch))
 
-    def scale_values(self, stage_cost: float) -> None:
-        """Set the factor of networks that are zero to that cost for good, where it is known."""
-        for q_network in cast("list[Any]", self.q_networks if stage_cost > 0 else []):
-            q_network.value_scale.fill_(stage_cost / max(1 - self.gamma, 1 / MAX_VALUE_SAMPLES))
-
     def rescale(self, stage_cost: float, optimizer: th.optim.Optimizer | None = None) -> float:
         """Double or halve the factor where that cost for good is beyond; return the factor.
 
         What the networks put out stays as it is, and their last layer's moments stay true.
         """
-        scale: float = cast("Any", self.q_networks[0]).scale
-        wanted = stage_cost / max(1 - self.gamma, 1 / MAX_VALUE_SAMPLES)
-        exponent = round(math.log2(wanted / scale)) if wanted > 0 else 0
-        factor = 2.0**exponent
-        for q_network in cast("list[Any]", self.q_networks if factor != 1 else []):
+        networks: list[Any] = self.q_networks
+        scale: float = networks[0].scale
+        wanted = stage_cost / self.share_of_a_step
+        factor = 2.0 ** (round(math.log2(wanted / scale)) if wanted > 0 else 0)
+        for q_network in networks if factor != 1 else []:
             q_network.value_scale.mul_(factor)
             last = q_network.network.weights()[-1]
             last.data.div_(factor)
@@ -358,20 +345,15 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         if not recurse:
             return super().parameters(recurse)
         networks: list[Any] = self.q_networks
-        return (each for q in networks for each in (q.quadratic.entries, *q.network.weights()))
+        return (each for q_network in networks for each in q_network.weights())
 
     def _in_rewards(self, q: th.Tensor) -> th.Tensor:
         return q if (self.scale, self.offset) == (1, 0) else self.scale * q + self.offset
 
     def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return the first critic's Q, (batch, 1), with a gradient by the actions alone."""
-        q_network = self.q_networks[0]
-        if isinstance(q_network, AfterstateValue) and q_network.compiles:
-            with th.no_grad():
-                theta = self.extract_features(obs, self.features_extractor)
-            points = th.cat([theta, actions], dim=1)
-            return self._in_rewards(q_network.compiled_with_fixed_weights(points))
-        trained = [each for each in q_network.parameters() if each.requires_grad]
+        first: Any = self.q_networks[0]
+        trained = [each for each in first.weights() if each.requires_grad]
         try:
             for parameter in trained:
                 parameter.requires_grad_(False)
@@ -382,10 +364,7 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
 
 
 def layer_for(law: Law, networks: str | None) -> Any:
-    """Return the class of layers around a law; by default per region where there are regions.
-
-    ValueError where a network for each region is asked of a law that has none.
-    """
+    """Return the class of layers around a law; ValueError for regions that it does not have."""
     if networks is not None:
         check_choice("networks", networks, NETWORKS)
     if isinstance(law, PiecewiseAffine):
@@ -401,60 +380,23 @@ def layer_for(law: Law, networks: str | None) -> Any:
 def _initial_value(
     problem: LinearMPC, gamma: float, options: CriticOptions, common: dict[str, Any]
 ) -> nn.Module:
-    is_priced = problem.price.counts
+    n = problem.n_theta
+
+    def form_of(terms: Value) -> Array:
+        """Return the form of ``[theta; u]``, with prices that of ``[theta; 1; u]``."""
+        if not problem.price.counts:
+            return terms.P
+        last = len(terms.P)
+        order = [*range(n), last, *range(n, last)]
+        return terms.form[np.ix_(order, order)]
+
     if options.kind == "state_action":
-        terms = problem.state_action_terms(gamma)
-        M = _with_one(terms, problem.n_theta) if is_priced else terms.P
+        M = form_of(problem.state_action_terms(gamma))
         return networks.QuadraticStateActionValue(M, **common)
     model = options.prediction_model
     if model is None:
         model = networks.LinearPrediction(*problem.prediction)
-    W = problem.stage_matrix
-    terms = problem.value_terms(gamma)
-    P = terms.form if is_priced else terms.P
-    if is_priced:
-        stage = Value(W, problem.stage_slope, problem.deviations.price.constant)
-        W = _with_one(stage, problem.n_theta)
+    stage = Value(problem.stage_matrix, problem.stage_slope, problem.deviations.price.constant)
+    W = form_of(stage)
+    P = form_of(problem.value_terms(gamma))
     return AfterstateValue(W, P, model, gamma, scale=options.value_scale, **common)
-
-
-def _with_one(terms: Value, n: int) -> Array:
-    """Return the form of ``[theta; 1; u]``, with theta (n,), of terms of ``[theta; u]``."""
-    last = len(terms.P)
-    order = [*range(n), last, *range(n, last)]
-    return terms.form[np.ix_(order, order)]
-
-
-EPS = 1e-8
-"""Of Adam, for gradients in units of the values' scale."""
-SCALE_CHECK = 10
-RECENT = 0.1
-"""Updates after which the values' scale is checked; share of that batch in the mean cost."""
-
-
-def follow_scale(
-    actor: YannActor,
-    critic: YannCritic,
-    target: YannCritic,
-    mean: th.Tensor,
-    taken: int,
-    eps: float,
-) -> None:
-    """Let the factor of the critic's networks follow the mean stage cost, by factors of two.
-
-    What they put out stays, to the bit: Pop-Art (van Hasselt et al., *Learning values across
-    many orders of magnitude*, 2016). ``mean`` is the mean stage cost until now, which takes in that
-    of the critic's batch, after every tenth of ``taken`` updates.
-    """
-    if taken % SCALE_CHECK:
-        return
-    cost = critic.stage_cost_of_batch()
-    share = max(SCALE_CHECK / (taken + SCALE_CHECK), RECENT)
-    mean.add_(share * (cost - mean))
-    if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
-        target.load_state_dict(critic.state_dict())
-    scale = critic.rescale(float(mean), critic.optimizer)
-    target.rescale(float(mean))
-    for optimizer, power in ((actor.optimizer, 1), (critic.optimizer, 2)):
-        for group in optimizer.param_groups:
-            group["eps"] = eps * (critic.scale * scale) ** power

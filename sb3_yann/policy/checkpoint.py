@@ -74,19 +74,16 @@ class ActorCheckpoint:
 
     def has_diverged(self) -> bool:
         """Return whether a trainable parameter is not a finite number, or too large."""
-        largest = [each.abs().max() for each in self.networks().values()]
-        return not all(bool(each <= DIVERGED_SIZE) for each in largest)  # nor does nan pass
+        small = [bool((each.abs() <= DIVERGED_SIZE).all()) for each in self.networks().values()]
+        return not all(small)  # nor does nan pass
 
     def has_learned(self) -> bool:
         """Return whether the networks correct the MPC anywhere."""
-        for name, value in self.networks().items():
-            if not name.endswith(".nodes"):
-                if th.any(value[..., -1] != 0):  # biases of later layers
-                    return True
-                continue
-            if th.any(value.sum(dim=1) != 0):  # pairs of opposite sign
-                return True
-        return False
+        return any(
+            # Pairs of opposite sign, and biases of later layers.
+            bool((value.sum(1) if name.endswith(".nodes") else value[..., -1]).any())
+            for name, value in self.networks().items()
+        )
 
     def is_actor_of(self, policy: StartsAsMPC) -> bool:
         """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
@@ -99,10 +96,7 @@ class ActorCheckpoint:
         return not self.changed_regions(other).any()
 
     def changed_regions(self, other: ActorCheckpoint) -> NDArray[np.bool_]:
-        """Return in which regions both may act differently, shape (regions,).
-
-        Where their networks count in different boxes of theta, in all.
-        """
+        """Return in which regions (regions,) both may act differently: all, in different boxes."""
         return self.changed_networks(other) | (not self.is_confined_as(other))
 
     def changed_networks(self, other: ActorCheckpoint) -> NDArray[np.bool_]:
@@ -117,15 +111,10 @@ class ActorCheckpoint:
         return _have_same_box(self.actor, other.actor)
 
     def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:
-        """Return a copy with the networks of some regions, and their moments, from another.
-
-        They count in the same box of theta as before.
-        """
+        """Return a copy, box and all, with another's networks of some regions and their moments."""
         index = th.tensor(sorted(regions), dtype=th.long)
         mixed = copy.deepcopy(self)
-        for name in ("actor", "target"):
-            ours = getattr(mixed, name)
-            theirs = getattr(other, name)
+        for ours, theirs in ((mixed.actor, other.actor), (mixed.target, other.target)):
             for key in self.networks():
                 ours[key][index] = theirs[key][index]
         ours = mixed.optimizer["state"]
@@ -140,14 +129,9 @@ class ActorCheckpoint:
         return mixed
 
     def part_way(self, other: ActorCheckpoint, share: float) -> ActorCheckpoint:
-        """Return a copy whose networks' weights are a share of the way to another's.
-
-        The optimizer is the other's.
-        """
+        """Return a copy with weights a share of the way to another's, and the other's optimizer."""
         mixed = replace(copy.deepcopy(self), optimizer=copy.deepcopy(other.optimizer))
-        for name in ("actor", "target"):
-            ours = getattr(mixed, name)
-            theirs = getattr(other, name)
+        for ours, theirs in ((mixed.actor, other.actor), (mixed.target, other.target)):
             for key in self.networks():
                 ours[key] = th.lerp(ours[key], theirs[key], share)
         return mixed
@@ -174,18 +158,17 @@ def all_or_nothing(policy: StartsAsMPC) -> Iterator[None]:
 
 def whole_policy(policy: StartsAsMPC) -> tuple[Tensors, list[Any]]:
     """Return a copy of a policy's weights, and of its optimizers' states."""
-    optimizers = policy.actor.optimizer, policy.critic.optimizer
     weights = {name: each.clone() for name, each in policy.state_dict().items()}
-    return weights, [copy.deepcopy(each.state_dict()) for each in optimizers]
+    networks = policy.actor, policy.critic
+    return weights, [copy.deepcopy(each.optimizer.state_dict()) for each in networks]
 
 
 def restore_whole(policy: StartsAsMPC, whole: tuple[Tensors, list[Any]]) -> None:
     """Give a policy back what :func:`whole_policy` copied."""
     weights, states = whole
     policy.load_state_dict(weights)
-    optimizers = policy.actor.optimizer, policy.critic.optimizer
-    for optimizer, state in zip(optimizers, states, strict=True):
-        optimizer.load_state_dict(copy.deepcopy(state))
+    for network, state in zip((policy.actor, policy.critic), states, strict=True):
+        network.optimizer.load_state_dict(copy.deepcopy(state))
 
 
 def _have_same_box(ours: Tensors, theirs: Tensors) -> bool:
@@ -242,8 +225,7 @@ def retarget(model: Model, mpc: LinearMPC, env: Any = None) -> Model:
     check_type("model", model, BaseAlgorithm, "a model with a YannPolicy")
     policy = require_yann_policy(model.policy, "retarget")
     check_type("mpc", mpc, LinearMPC, "a LinearMPC")
-    old = policy.problem
-    _require_same_theta(old, mpc)
+    _require_same_theta(policy.problem, mpc)
     names = inspect.signature(type(model).__init__).parameters
     own = {name: getattr(model, name) for name in names if hasattr(model, name)}
     own["policy"] = type(policy)
@@ -259,13 +241,11 @@ def retarget(model: Model, mpc: LinearMPC, env: Any = None) -> Model:
     lost = [what for what, is_there in learnt.items() if is_there]
     actor: Any = found.policy.actor
     layer = policy.actor.mu
-    kept = actor.mu
-    if layer.network.is_zero():
-        pass
-    elif not isinstance(layer, SharedYannLayer) or not isinstance(kept, SharedYannLayer):
-        lost.insert(0, "the networks of single regions, which the new law does not have")
-    else:
-        _hand_over(layer, kept)
+    if not layer.network.is_zero():
+        if isinstance(layer, SharedYannLayer) and isinstance(actor.mu, SharedYannLayer):
+            _hand_over(layer, actor.mu)
+        else:
+            lost.insert(0, "the networks of single regions, which the new law does not have")
     _hand_over_spread(model, policy.actor, found, actor)
     target: Any = found.policy.actor_target
     target.load_state_dict(actor.state_dict())

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from sb3_yann._validation import Array, check_array, check_int, warn
+from sb3_yann._validation import check_int, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.wrapper_stack import SHOW_THETA
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
@@ -92,12 +91,6 @@ def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> 
     return found
 
 
-SB3_KWARGS = (
-    "features_extractor_class features_extractor_kwargs normalize_images "
-    "share_features_extractor optimizer_class optimizer_kwargs"
-).split()
-
-
 def require_algorithm(algorithm: BaseAlgorithm | None, kinds: tuple[type, ...]) -> None:
     """Raise unless an algorithm is one of those that train a policy."""
     if algorithm is not None and not isinstance(algorithm, kinds):
@@ -124,9 +117,10 @@ def as_gamma(gamma: float | None, algorithm: BaseAlgorithm | None) -> float:
     )
 
 
-def refuse_another_gamma(algorithm: BaseAlgorithm, gamma: float) -> NoReturn:
+def require_gamma(algorithm: Any, gamma: float) -> None:
     """Raise ValueError for a discount that is not the one which the critic was built for."""
-    now = algorithm.gamma  # type: ignore[attr-defined]
+    if (now := algorithm.gamma) == gamma:
+        return
     name = type(algorithm).__name__
     raise ValueError(
         f"gamma of the {name} was set to {now} after its policy was built for {gamma}: the critic "
@@ -148,11 +142,9 @@ def warn_of_another_gamma(algorithm: BaseAlgorithm, gamma: float) -> None:
 
 
 def require_sb3_kwargs(given: dict[str, Any], own: list[str], theirs: tuple[str, ...]) -> None:
-    """Raise unless all keywords that are not the policy's ``own`` are SB3's, and make sense.
-
-    ``theirs`` are those of SB3's policy that others have not.
-    """
-    known = [*SB3_KWARGS, *theirs]
+    """Raise unless all keywords but the policy's ``own`` are SB3's, or of its policy ``theirs``."""
+    known = "features_extractor_class features_extractor_kwargs normalize_images".split()
+    known += ["share_features_extractor", "optimizer_class", "optimizer_kwargs", *theirs]
     if unknown := [name for name in given if name not in known]:
         raise TypeError(
             f"YannPolicy takes no {', '.join(map(repr, unknown))}. Its own policy_kwargs are "
@@ -246,16 +238,13 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
 
 def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits:
     """Return how the env takes inputs; raise unless its bounds are those of the problem."""
-    if not np.issubdtype(action_space.dtype, np.floating):
-        dtype = action_space.dtype
+    if not np.issubdtype(dtype := action_space.dtype, np.floating):
         raise TypeError(f"action_space has dtype {dtype}: inputs are real, use numpy.float32.")
     if not action_space.is_bounded():
         raise ValueError(f"action_space = {action_space} must have finite bounds.")
     units = ActionUnits.of(problem, action_space.low, action_space.high)
     if units is not None:
         return units
-    low = problem.u_min.tolist()
-    high = problem.u_max.tolist()
     u_ss = problem.model.u_ss
     advice = (
         "They must be the same: build the LinearMPC with the bounds of the env, or rescale actions "
@@ -266,9 +255,9 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
             f"The env takes deviations from u_ss = {u_ss.tolist()}, and the MPC is in plant units: "
             "leave x_ss and u_ss out of its model, or take the env in plant units."
         )
-    space = f"[{action_space.low.tolist()}, {action_space.high.tolist()}]"
     raise ValueError(
-        f"The action space is {space}, but the MPC has u_min = {low} and u_max = {high}. {advice}"
+        f"The action space is [{action_space.low.tolist()}, {action_space.high.tolist()}], but the "
+        f"MPC has u_min = {problem.u_min.tolist()} and u_max = {problem.u_max.tolist()}. {advice}"
     )
 
 
@@ -279,8 +268,7 @@ def require_theta(
     shape = observation_space.shape
     if observation is None and shape == (problem.n_theta,):
         return
-    names = ", ".join(problem.labels())
-    takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
+    takes = f"takes theta of shape ({problem.n_theta},), that is {', '.join(problem.labels())}"
     states_alone = shape == (problem.model.n_states,) != (problem.n_theta,)
     if observation is None or (states_alone and observation.n_obs == problem.n_theta):
         more = 0 if shape is None or len(shape) != 1 else shape[0] - problem.n_theta
@@ -318,19 +306,6 @@ def as_net_arch(
                 f"layers, such as {known[name]}."
             )
     return {**known, **value}
-
-
-def as_box(
-    low: ArrayLike | None, high: ArrayLike | None, size: int
-) -> tuple[Array, Array] | tuple[None, None]:
-    """Return the edges of a box of theta, each (size,), or None for both."""
-    if low is None and high is None:
-        return None, None
-    given: dict[str, Any] = {"low": low, "high": high}
-    bottom, top = (check_array(name, edge, (size,)) for name, edge in given.items())
-    if np.any(bottom > top):
-        raise ValueError(f"low = {low!r} must not be above high = {high!r}.")
-    return bottom, top
 
 
 FIXED = LawLayer, AfterstateValue, QuadraticStateActionValue, AffineFeatures

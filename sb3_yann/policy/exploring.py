@@ -133,8 +133,8 @@ class Explores(StartsAsMPC):
 
     def make_actor(self, features_extractor: Any = None) -> SpreadActor:
         """Return an actor whose most likely action is the law's."""
-        given = {"initial_std": self.initial_std}
-        actor: SpreadActor = self._actor(SpreadActor, features_extractor, **given)
+        own = {"initial_std": self.initial_std}
+        actor: SpreadActor = self._actor(SpreadActor, features_extractor, **own)
         return actor
 
     def says_that_it_explores(self) -> None:
@@ -327,7 +327,6 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         for i, network in enumerate((self.actor, self.critic)):
             vars(network)["optimizer"] = OptimizerGroup(self.optimizer, i)
         self._register_counters()
-        self._attach_hooks()
 
     @property
     def critic_target(self) -> YannCritic:  # type: ignore[override]
@@ -347,9 +346,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
 
     def get_distribution(self, obs: Any) -> TruncatedNormal:  # type: ignore[override]
         """Return the distribution of actions in [-1, 1]."""
-        actor: Any = self.actor
-        distribution: TruncatedNormal = actor.distribution(obs)
-        return distribution
+        return self.actor_target.distribution(obs)
 
     def predict_values(self, obs: Any) -> th.Tensor:
         """Return the values of states, (batch, 1)."""
@@ -369,19 +366,21 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         self, obs: Any, actions: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Return values, the logarithm of the actions' density, and the entropy."""
-        self.critic.know_scale(obs, actions)
+        critic: Any = self.critic
+        theta = critic.extract_features(obs, critic.features_extractor)
+        critic.know_scale(th.cat([theta, actions], 1))
         distribution = self.get_distribution(obs)
         values = self.predict_values(obs)
         if values.requires_grad:
             # The error of values in their own unit: one gradient of both networks is clipped, and
             # in units of rewards the critic's would leave nothing of the actor's.
-            unit = self.critic.unit
+            unit = critic.scale * critic.q_networks[0].scale
             values.register_hook(lambda each: each / unit**2)  # type: ignore[no-untyped-call]
         return values, distribution.log_prob(actions), distribution.entropy()
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        distribution = self.get_distribution(observation)
-        return distribution.mode() if deterministic else distribution.sample()
+        actions: th.Tensor = self.actor(observation, deterministic)
+        return actions
 
 
 PPO.policy_aliases["YannPolicy"] = YannPPOPolicy

@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from torch import nn
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_type
 from sb3_yann.control import LinearMPC, with_extra
 
 
@@ -65,13 +65,7 @@ class AffineObservation(ReadOnlyArrays):
 
     @classmethod
     def normalized(cls, mean: ArrayLike, std: ArrayLike) -> AffineObservation:
-        """Return ``theta = std * obs + mean``: the env shows ``(theta - mean) / std``.
-
-        Parameters
-        ----------
-        mean, std : array_like, shape (n,), in units of theta
-            No entry of ``std`` is zero.
-        """
+        """Return ``theta = std * obs + mean``: the env shows ``(theta - mean) / std``, (n,)."""
         middle = check_array("mean", mean, ("n",))
         spread = check_array("std", std, (len(middle),))
         if np.any(spread == 0):
@@ -82,15 +76,7 @@ class AffineObservation(ReadOnlyArrays):
     def rescaled(
         cls, low: ArrayLike, high: ArrayLike, to: tuple[float, float] = (-1.0, 1.0)
     ) -> AffineObservation:
-        """Return the map of an env that shows [low, high] as the interval ``to``.
-
-        Parameters
-        ----------
-        low, high : array_like, shape (n,)
-            In units of theta.
-        to : pair of float, default (-1, 1)
-            As ``min_obs`` and ``max_obs`` of `gymnasium.wrappers.RescaleObservation`.
-        """
+        """Return the map of an env that shows [low, high], (n,), as `RescaleObservation` does."""
         bottom = check_array("low", low, ("n",))
         top = check_array("high", high, (len(bottom),))
         start, end = check_array("to", to, (2,))
@@ -124,10 +110,7 @@ class AffineObservation(ReadOnlyArrays):
 
     @classmethod
     def newest_frame(cls, size: int, frames: int) -> AffineObservation:
-        """Return ``theta = `` the newest of the last ``frames`` observations of ``size`` entries.
-
-        It comes last in SB3's `VecFrameStack` and in gymnasium's `FrameStackObservation`.
-        """
+        """Return ``theta = `` the newest, last, of ``frames`` observations of ``size`` entries."""
         frames = check_int("frames", frames)
         size = check_int("size", size)
         return cls.pick(range((frames - 1) * size, frames * size), frames * size)
@@ -170,8 +153,7 @@ class AffineObservation(ReadOnlyArrays):
             raise ValueError(
                 f"The inner map puts out {inner.n_theta} entries, the outer one takes {self.n_obs}."
             )
-        offset = self.matrix @ inner.offset + self.offset
-        return AffineObservation(self.matrix @ inner.matrix, offset)
+        return AffineObservation(self.matrix @ inner.matrix, self(inner.offset))
 
     def __hash__(self) -> int:
         """Return a hash that equal maps share."""
@@ -190,15 +172,12 @@ def as_observation(given: ObservationSpec | None, problem: LinearMPC) -> AffineO
     """Return the map from what an env shows to theta in plant units, None for the identity."""
     if given is None or isinstance(given, AffineObservation):
         return given
-    if isinstance(given, Mapping):
-        if set(given) != {"center", "scale"}:
-            raise ValueError(f"observation = {dict(given)} must have a 'center' and a 'scale'.")
-        center = check_array("observation['center']", given["center"], (problem.n_theta,))
-        return AffineObservation.normalized(center, given["scale"])
-    raise TypeError(
-        f"observation = {given!r} must be an AffineObservation, a mapping with 'center' and "
-        "'scale', or None: an env shows plant units."
-    )
+    wanted = "an AffineObservation, a mapping with 'center' and 'scale', or None"
+    check_type("observation", given, Mapping, f"{wanted}: an env shows plant units")
+    if set(given) != {"center", "scale"}:
+        raise ValueError(f"observation = {dict(given)} must have a 'center' and a 'scale'.")
+    center = check_array("observation['center']", given["center"], (problem.n_theta,))
+    return AffineObservation.normalized(center, given["scale"])
 
 
 def to_deviations(given: AffineObservation | None, problem: LinearMPC) -> AffineObservation | None:
@@ -229,12 +208,13 @@ def with_extra_shown(
             f"The observation has {len(low)} entries, the last {extra} of them extra signals; "
             f"theta is made of {theta.n_obs} others. See extra= and observation=."
         )
-    rest = np.setdiff1d(np.arange(found.n_theta), found.extra[-extra:])
+    entries = found.extra[-extra:]
+    rest = np.setdiff1d(np.arange(found.n_theta), entries)
     matrix = np.zeros((found.n_theta, len(low)))
     offset = np.zeros(found.n_theta)
     matrix[rest, :size] = theta.matrix
     offset[rest] = theta.offset
-    matrix[found.extra[-extra:], size:] = np.eye(extra)
+    matrix[entries, size:] = np.eye(extra)
     same = observation is None and np.array_equal(matrix, np.eye(len(low)))
     return found, None if same else AffineObservation(matrix, offset)
 
@@ -276,10 +256,8 @@ def require_same_statistics(model: BaseAlgorithm) -> None:
     if normalize is None:
         return
     require_frozen(normalize)
-    known = getattr(model, "vec_normalize_statistics", None)
-    if known is None or not normalize.norm_obs:
-        return
-    if not all(map(np.array_equal, known, statistics_of(normalize))):
+    known = getattr(model, "vec_normalize_statistics", None) if normalize.norm_obs else None
+    if known and not all(map(np.array_equal, known, statistics_of(normalize))):
         raise ValueError(
             "The statistics of VecNormalize are others than when the model was made, and the "
             "policy undoes those: it would take one state for another. Put them back "
@@ -300,8 +278,7 @@ def _rows(name: str, entries: Sequence[int], size: int) -> Array:
     """Return the rows (k, size) of the identity that pick so many entries of an observation."""
     size = check_int("size", size)
     found = [*entries] if isinstance(entries, Iterable) else [None]
-    whole = all(isinstance(each, int | np.integer) for each in found)
-    if not whole or not all(0 <= each < size for each in found):
+    if not all(isinstance(each, int | np.integer) and 0 <= each < size for each in found):
         given = found if isinstance(entries, Iterable) else entries
         raise ValueError(f"{name} = {given!r} must be a list of indices from 0 to {size - 1}.")
     return np.eye(size)[found]
@@ -325,24 +302,18 @@ class AffineFeatures(BaseFeaturesExtractor):
         return th.addmm(self.offset, observations.flatten(1).double(), self.matrix)
 
 
-def without_entries(
-    theta: th.Tensor, lost: th.Tensor, extractor: BaseFeaturesExtractor | nn.Module
-) -> th.Tensor:
-    """Return theta at the operating point where it depends on entries that are lost.
-
-    ``lost`` (batch, n_obs) names those of the observations.
-    """
+def without_entries(theta: th.Tensor, lost: th.Tensor, extractor: nn.Module) -> th.Tensor:
+    """Return theta at the operating point where it depends on lost entries (batch, n_obs)."""
     if isinstance(extractor, AffineFeatures):
         lost = lost.double() @ (extractor.matrix != 0).double() > 0
     return theta.masked_fill(lost | ~theta.isfinite(), 0.0)
 
 
-def keeps_entries(extractor: BaseFeaturesExtractor | nn.Module) -> bool:
+def keeps_entries(extractor: nn.Module) -> bool:
     """Tell whether each entry of theta is that of the observation, in whatever units."""
     if not isinstance(extractor, AffineFeatures):
         return True
-    matrix = extractor.matrix
-    return matrix.shape[0] == matrix.shape[1] and bool(th.equal(matrix, matrix.diag().diag()))
+    return bool(th.equal(extractor.matrix, extractor.matrix.diag().diag()))
 
 
 class SeesTheta(BaseModel):

@@ -22,6 +22,7 @@ from torch import nn
 
 from sb3_yann._validation import (
     Array,
+    check_array,
     check_bool,
     check_choice,
     check_discount,
@@ -35,12 +36,10 @@ from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import checks, sb3_hooks
 from sb3_yann.policy.actor_critic import (
-    EPS,
     CriticOptions,
     YannActor,
     YannCritic,
     as_critic_options,
-    follow_scale,
     layer_for,
 )
 from sb3_yann.policy.checks import require_own_problem, resolve_problem
@@ -65,6 +64,11 @@ OF_THE_LAYER = (
     "max_correction", "pin_equilibrium", "law", "networks", "keep_bounds", "bounds_margin",
 )  # fmt: skip
 """Keywords of an actor, and of its policy, that are of its layer around the law."""
+EPS = 1e-8
+"""Of Adam, for gradients in units of the values' scale."""
+SCALE_CHECK = 10
+RECENT = 0.1
+"""Updates after which the values' scale is checked; share of that batch in the mean cost."""
 if TYPE_CHECKING:
     _AnyPolicy = TD3Policy
 else:
@@ -118,7 +122,9 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         checks.require_box("observation_space", observation_space, observation is not None)
         checks.require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
-        self.saved_kwargs = sb3_hooks.own_policy_kwargs(algorithm)
+        self.saved_kwargs: dict[str, Any] = {}  # those that an algorithm saves
+        if algorithm is not None:  # no longer the user's own dict
+            self.saved_kwargs = algorithm.policy_kwargs = dict(algorithm.policy_kwargs)
         if check_int("extra", extra, 0):
             shown = as_observation(observation, self.problem)
             self.problem, observation = with_extra_shown(
@@ -194,15 +200,12 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             wrapper_stack.require_theta_order(env, self.problem)
 
     def _meets_another_env(self) -> None:
-        """Do the same where `set_env` has given the algorithm another env since.
-
-        A discount that was changed since is refused.
-        """
+        """Do the same where `set_env` has given another env since; refuse another discount."""
         algorithm = self._algorithm
         if algorithm is None or algorithm.policy is not self:
             return
-        if not self.gamma_given and algorithm.gamma != self.gamma:
-            checks.refuse_another_gamma(algorithm, self.gamma)
+        if not self.gamma_given:
+            checks.require_gamma(algorithm, self.gamma)
         env = algorithm.get_env()
         if env is not None and (self._met is None or self._met() is not env):
             self._meets(algorithm, self.observation_space)
@@ -218,12 +221,12 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             self.actor.optimizer = RowAdam(self.actor.parameters(), lr=lr_schedule(1), **chosen)
             mu.row_gradients = True
         self._register_counters()
-        self._attach_hooks()
 
     def _register_counters(self) -> None:
         # A buffer travels with the parameters: a model that is loaded goes on where it was.
         self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))
         self.register_buffer("mean_stage_cost", th.zeros((), dtype=th.float64))
+        self._attach_hooks()
 
     def _attach_hooks(self) -> None:
         self.actor.optimizer.register_step_pre_hook(self._before_actor_step)
@@ -252,12 +255,30 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         self.batch_is_finite = not self._refuses("critic", optimizer)
         if self.batch_is_finite:
             if self.critic_options.scales_itself and self.lr_mult["critic"] > 0:
-                networks = self.actor, self.critic, self.critic_target
-                taken = int(self.critic_updates)
-                eps = self.optimizer_kwargs.get("eps", EPS)
-                follow_scale(*networks, self.mean_stage_cost, taken, eps)
+                self._follow_scale(int(self.critic_updates))
             self.critic_updates.add_(1)
         sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
+
+    def _follow_scale(self, taken: int) -> None:
+        """Let the factor of the critic's networks follow the mean stage cost, by factors of two.
+
+        What they put out stays, to the bit: Pop-Art (van Hasselt et al., *Learning values across
+        many orders of magnitude*, 2016). The mean takes in that of the batch after every tenth of
+        ``taken`` updates.
+        """
+        if taken % SCALE_CHECK:
+            return
+        mean = self.mean_stage_cost
+        share = max(SCALE_CHECK / (taken + SCALE_CHECK), RECENT)
+        mean.add_(share * (self.critic.stage_cost_of_batch() - mean))
+        if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
+            self.critic_target.load_state_dict(self.critic.state_dict())
+        scale = self.critic.scale * self.critic.rescale(float(mean), self.critic.optimizer)
+        self.critic_target.rescale(float(mean))
+        eps = self.optimizer_kwargs.get("eps", EPS)
+        for network, power in ((self.actor, 1), (self.critic, 2)):
+            for group in network.optimizer.param_groups:
+                group["eps"] = eps * scale**power
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -342,10 +363,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         return critic.to(self.device)
 
     def limit_correction(self, max_correction: float | None) -> None:
-        """Bound what the actor's networks may add to the law, as a fraction of the input range.
-
-        A model that is saved and loaded keeps this bound.
-        """
+        """Bound what networks may add, as a fraction of the input range; a saved model keeps it."""
         self.max_correction = _as_correction(max_correction)
         self.saved_kwargs["max_correction"] = self.max_correction
         for actor in (self.actor, self.actor_target):
@@ -357,18 +375,14 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
 
         They count in full within. Beyond they fade, and from a quarter of a half-width on the law
         acts alone. :func:`improve` sets it to what its episodes show. It is saved with the weights.
-
-        Parameters
-        ----------
-        low, high : array_like, shape (n_theta,)
-            Edges of the box, or None for both.
-
-        Raises
-        ------
-        ValueError
-            If an edge has another shape or is not finite, or ``low`` is above ``high``.
+        ``low`` and ``high`` (n_theta,) are the edges, ValueError for others and low above high.
         """
-        box = checks.as_box(low, high, self.problem.n_theta)
+        box: list[Any] = [None, None]
+        if low is not None or high is not None:
+            given: dict[str, Any] = {"low": low, "high": high}
+            box = [check_array(name, each, (self.problem.n_theta,)) for name, each in given.items()]
+            if np.any(np.greater(*box)):
+                raise ValueError(f"low = {low!r} must not be above high = {high!r}.")
         for actor in (self.actor, self.actor_target):
             actor.mu.confine(*box)
 
@@ -395,10 +409,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
 
 
 def _as_correction(value: float | None) -> float | None:
-    if value is None:
-        return None
     hint = "It is a fraction of the input range, or None."
-    return check_range("max_correction", value, 0, 1, hint=hint)
+    return None if value is None else check_range("max_correction", value, 0, 1, hint=hint)
 
 
 def _as_margin(value: float) -> float:

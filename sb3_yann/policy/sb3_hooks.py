@@ -33,23 +33,13 @@ def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         held = frame.f_locals
-        caller = held.get("self")
-        if frame.f_code.co_name == "_setup_model" and isinstance(caller, BaseAlgorithm):
-            return caller
+        building = held.get("self") if frame.f_code.co_name == "_setup_model" else None
         for each in held.values():
             if isinstance(each, BaseAlgorithm):
-                if getattr(each, "lr_schedule", None) is lr_schedule:
+                if each is building or getattr(each, "lr_schedule", None) is lr_schedule:
                     return each
         frame = frame.f_back
     return None
-
-
-def own_policy_kwargs(algorithm: BaseAlgorithm | None) -> dict[str, Any]:
-    """Return the keywords that an algorithm saves, to be changed; no longer the user's own dict."""
-    if algorithm is None:
-        return {}
-    algorithm.policy_kwargs = dict(algorithm.policy_kwargs)
-    return algorithm.policy_kwargs
 
 
 def multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
@@ -119,8 +109,7 @@ class FiniteRows:
         assert buffer is not None  # whoever calls has it
         self.rows += 1
         if self.keeps_place:
-            buffer.pos = 0
-            buffer.full = False
+            buffer.reset()
             self.keeps_place = False
         parts = (obs, next_obs, action, reward)
         total = sum(float(np.vdot(part, part)) for part in parts)
@@ -155,11 +144,11 @@ def _not_finite(buffer: ReplayBuffer, parts: tuple[Any, ...]) -> dict[tuple[str,
     found = {}
     names = ("observation", "observation", "action", "reward")
     for name, part in zip(names, parts, strict=True):
-        kept: NDArray[Any] = getattr(buffer, f"{name}s")
+        given = np.asarray(part).reshape(buffer.n_envs, -1)
         with np.errstate(over="ignore"):
-            values = np.asarray(part).astype(kept.dtype).reshape(buffer.n_envs, -1)
-        for i, j in zip(*np.nonzero(~np.isfinite(values)), strict=True):
-            found[name, int(i), int(j)] = np.asarray(part).reshape(values.shape)[i, j]
+            kept = given.astype(getattr(buffer, f"{name}s").dtype)
+        for i, j in np.argwhere(~np.isfinite(kept)).tolist():
+            found[name, i, j] = given[i, j]
     return found
 
 
@@ -175,10 +164,9 @@ def warn_of_random_actions(algorithm: Any) -> None:
 
 
 def warn_of_misread_states(policy: Any, algorithm: Any) -> None:
-    """Warn, once, where an env's first steps are the model's in other units or another order.
+    """Warn, once, where the first steps in a buffer are the model's in other units or order.
 
-    It reads what the replay buffer holds, at the start of a rollout: no step more is taken. A guard
-    and a `CostAudit` look themselves.
+    A guard and a `CostAudit` look themselves.
     """
     buffer = getattr(algorithm, "replay_buffer", None)
     if policy.states_checked or not isinstance(buffer, ReplayBuffer):
@@ -243,10 +231,7 @@ def warn_of_refused_step(
 
 
 def what_is_not_finite(lost: NDArray[np.bool_], names: Sequence[str] = ()) -> str:
-    """Say what an actor did without: entries of observations (batch, n), or its networks.
-
-    ``names`` are those of the entries, where they are known.
-    """
+    """Say what an actor did without: entries of observations (batch, n), or its networks."""
     if entries := np.flatnonzero(lost.any(0)).tolist():
         called = f" ({', '.join(names[i] for i in entries)})" if names else ""
         where = f"The observation is not finite in entries {entries}{called}"

@@ -84,19 +84,16 @@ def loops_part(subject: Subject) -> Part:
     count = len(subject.seeds)
     is_range = count > 2 and subject.seeds == (*range(first, first + count),)
     seeds = f"{first} to {subject.seeds[-1]}" if is_range else ", ".join(map(str, subject.seeds))
-    cost = "the sum of the MPC's stage cost: the env gives no reward."
+    own = sum(shares[0])
+    cost = "the sum of the MPC's stage cost: the env gives no reward"
     if is_rewarded(loops):
         cost = "minus the sum of the rewards"
-        own = sum(shares[0])
         if abs(mpc.costs.mean() - own) > OTHER_REWARD * abs(own):
-            cost += (
-                f", which is not the MPC's stage cost: that is {own:.6g} on average with the MPC"
-            )
-        cost += "."
+            cost += f", which is not the MPC's stage cost: that is {own:.6g} on average with it"
     how = (
         f"{count} episodes of {subject.env_name}, seeds {seeds}, each played by the MPC "
         "and by the policy from the same start, without any noise of actions. A cost is "
-        f"{cost}{of_estimates(subject.problem)}"
+        f"{cost}.{of_estimates(subject.problem)}"
     )
     if _in_twin(subject):
         how += " The env is a twin, fitted to the plant's log: the plant has played none of them."
@@ -113,12 +110,10 @@ def loops_part(subject: Subject) -> Part:
         "policy less the MPC, from the same starts."
     )
     gains = "What the policy costs more than the MPC at each start; below zero it costs less."
-    each = zip(
-        subject.seeds, mpc.costs, policy.costs, mpc.violations, policy.violations, strict=True
-    )
+    found = mpc.costs, policy.costs, mpc.violations, policy.violations
     single = [
         [str(seed), f"{a:.6g}", f"{b:.6g}", _change(a, b), str(v), str(w)]
-        for seed, a, b, v, w in each
+        for seed, a, b, v, w in zip(subject.seeds, *found, strict=True)
     ]
     head = ["seed", "MPC", "policy", "change", "MPC: violations", "policy: violations"]
     apart = np.abs(policy.costs - mpc.costs) > COST_ROUNDING * np.abs(mpc.costs)
@@ -291,10 +286,11 @@ def distance_part(subject: Subject) -> Part:
         points["steps of the closed loops"] = np.concatenate(visited)
     rows = []
     for where, of in points.items():
-        apart = _distance(subject, of)
+        of = of[np.isfinite(of).all(axis=1)]
+        apart = np.abs(plots.inputs_of(problem, policy, of) - subject.law(of))
         for k, name in enumerate(with_units(problem.model)[1]):
             own = apart[:, k]
-            share = 50 * apart[:, k].max() / problem.u_half[k]
+            share = 50 * own.max() / problem.u_half[k]
             values = own.mean(), np.percentile(own, 95), own.max()
             rows.append([name, where, *map(number, values), f"{share:.2f}"])
     bound = policy.max_correction
@@ -348,12 +344,6 @@ def distance_part(subject: Subject) -> Part:
     kind = "look" if float(share) > FAR else "note"
     findings = make_finding(inside, text), Finding(kind, largest)
     return Part("Where and how far the policy leaves the MPC", join(content), findings)
-
-
-def _distance(subject: Subject, theta: Array) -> Array:
-    """Return the distance of the policy's inputs from the law's (batch, m)."""
-    finite = theta[np.isfinite(theta).all(axis=1)]
-    return np.abs(plots.inputs_of(subject.problem, subject.policy, finite) - subject.law(finite))
 
 
 def _pictures(subject: Subject) -> list[Html]:
@@ -414,17 +404,17 @@ def guard_part(subject: Subject) -> Part:
             "The policy is NOT the one that the guard accepted last: it is a candidate, or was "
             "changed since. restore_accepted(model) gives the accepted one."
         )
-    rows = []
-    for name, value in state.settings.items():
-        is_range = isinstance(value, range)
-        rows.append([name, f"{value.start} to {value.stop - 1}" if is_range else str(value)])
+    own = {name.replace("_", " "): value for name, value in state.settings.items()}
     if subject.guard is not None:
         given = subject.guard.settings
-        names = ("n_new_starts", "n_final_starts", "eval_freq", "patience", "keep_if_worse")
-        rows += [[name, str(getattr(given, name))] for name in names]
+        for name in ("n_new_starts", "n_final_starts", "eval_freq", "patience", "keep_if_worse"):
+            own[name.replace("_", " ")] = getattr(given, name)
         rule = asdict(given.rule).items()
-        rows += [[f"rule: {name}", str(v)] for name, v in rule if name not in state.settings]
-    settings = [[name if ":" in name else name.replace("_", " "), text] for name, text in rows]
+        own |= {f"rule: {name}": value for name, value in rule if name not in state.settings}
+    settings = [
+        [name, f"{value.start} to {value.stop - 1}" if isinstance(value, range) else str(value)]
+        for name, value in own.items()
+    ]
     parts = [
         paragraph(text),
         lines(summary_of(state, subject.policy)),
@@ -445,13 +435,11 @@ def _decisions(decisions: Sequence[Decision]) -> list[Html]:
     head = ["", "episode", "verdict", "candidate", "accepted", "MPC", "restored", "reason"]
     rows = []
     for k, each in enumerate(decisions, start=1):
-        reasons = [each.reason]
-        if each.regions:
-            reasons.append(f"accepted in regions {', '.join(map(str, each.regions))}")
-        if 0 < each.share < 1:
-            reasons.append(f"accepted {each.share:g} of the way")
+        regions = f"accepted in regions {', '.join(map(str, each.regions))}" * bool(each.regions)
+        way = f"accepted {each.share:g} of the way" * (0 < each.share < 1)
+        reasons = "; ".join(filter(None, [each.reason, regions, way]))
         row = [str(k), str(each.episode), each.verdict, *each.costs_in_words()]
-        rows.append([*row, "yes" if each.restored else "", "; ".join(filter(None, reasons))])
+        rows.append([*row, "yes" if each.restored else "", reasons])
     text = f"All {len(decisions)} decisions, with mean costs over the guard's starts."
     return [tag("h3", "Every decision"), paragraph(text), table(head, rows)]
 
@@ -492,21 +480,14 @@ def improve_part(subject: Subject) -> Part:
     else:
         text = "The policy is NOT the one that improve accepted last: it was changed since."
         finding = make_finding(False, text)
-    rows = [
-        [str(k), f"{each.where}: {each.source}", str(each.episodes), str(len(each.checks))]
-        for k, each in enumerate(found, start=1)
-    ]
-    tried = [
-        [
-            f"{k}.{j}",
-            of.starts_in_words,
-            change_in_percent(of.change),
-            change_in_percent(of.worst),
-            of.verdict,
-        ]
-        for k, each in enumerate(found, start=1)
-        for j, of in enumerate(each.checks, start=1)
-    ]
+    rows = []
+    tried = []
+    for k, each in enumerate(found, start=1):
+        rows.append([str(k), f"{each.where}: {each.source}", str(each.episodes)])
+        rows[-1].append(str(len(each.checks)))
+        for j, of in enumerate(each.checks, start=1):
+            changes = map(change_in_percent, (of.change, of.worst))
+            tried.append([f"{k}.{j}", of.starts_in_words, *changes, of.verdict])
     settings = [[k, str(v), IMPROVE_SETTINGS.get(k, "")] for k, v in found[-1].settings.items()]
     how = (
         "Episodes are those of the log that the twin was fitted to, or those that were played in "

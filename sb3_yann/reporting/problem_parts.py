@@ -49,11 +49,10 @@ def plant_part(subject: Subject) -> Part:
     problem = subject.problem
     model = subject.problem.model
     states, inputs, loads = with_units(model)
-    point = [[name, "state", number(x)] for name, x in zip(states, model.x_ss, strict=True)]
-    point += [[name, "input", number(u)] for name, u in zip(inputs, model.u_ss, strict=True)]
-    for i, load in enumerate(loads):
-        kind = "estimated disturbance" if i in model.estimated else "disturbance"
-        point.append([load, kind, number(model.d_ss[i])])
+    kinds = ["state"] * len(states) + ["input"] * len(inputs)
+    kinds += ["estimated " * (i in model.estimated) + "disturbance" for i in range(len(loads))]
+    rest = map(number, [*model.x_ss, *model.u_ss, *model.d_ss])
+    point = [*zip([*states, *inputs, *loads], kinds, rest, strict=True)]
     ends = zip(problem.labels(units=True), problem.theta_min, problem.theta_max, strict=True)
     box = [[name, number(low), number(high)] for name, low, high in ends]
     soft = problem.soft.penalty
@@ -65,10 +64,10 @@ def plant_part(subject: Subject) -> Part:
         ["where the MPC has no solution", problem.infeasible.replace("_", " ")],
         ["penalty of a unit of a broken soft bound", number(soft) if soft else "no soft bounds"],
     ]
-    prices = [*zip([*states, *inputs], [*problem.price.x, *problem.price.u], strict=True)]
     if max(problem.blocks) > 1:
         facts.append(["samples for which a move is held", ", ".join(map(str, problem.blocks))])
     if problem.price.counts:
+        prices = zip([*states, *inputs], [*problem.price.x, *problem.price.u], strict=True)
         facts.append(["prices in a sample", ", ".join(f"{k}: {number(p)}" for k, p in prices if p)])
     content = join(
         [
@@ -145,10 +144,10 @@ def constraints_part(subject: Subject) -> Part:
 
 def _unseen(subject: Subject) -> list[str]:
     """Return the bounded states and outputs that an estimator tells from others."""
-    if subject.env is None:
-        return []
-    with one_env(subject.env) as env:
-        between = below(env, EstimateState)
+    between = None
+    if subject.env is not None:
+        with one_env(subject.env) as env:
+            between = below(env, EstimateState)
     if between is None:
         return []
     C = between.observer.C
@@ -171,26 +170,25 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
         f"MPC; {policy.summed.mean():.3g} and {mpc.summed.mean():.3g} summed over an episode, on "
         "average."
     )
+    names = BoundNames.of(problem)
     if is_worse:
         worst = int(np.argmax(policy.largest - mpc.largest))
-        which = np.asarray(policy.worst)[worst]
-        names = BoundNames.of(problem)
+        size = policy.largest[worst]
         text += (
-            f" In episode {worst} the policy exceeds them by {policy.largest[worst]:.3g}, the MPC "
-            f"by {mpc.largest[worst]:.3g}: {names.in_words(which, policy.largest[worst])} with the "
+            f" In episode {worst} the policy exceeds them by {size:.3g}, the MPC by "
+            f"{mpc.largest[worst]:.3g}: {names.in_words(policy.worst[worst], size)} with the "
             "policy."
         )
     passed = None if np.any(policy.largest > 0) else True
     found = [make_finding(False if is_worse else passed, text)]
     if problem.soft.penalty:
-        old, new = (
-            np.mean([costs_of(problem, *pair)[0] for pair in loops[who].pairs])
-            for who in (OF_MPC, OF_POLICY)
-        )
         # A steep penalty multiplies what rounding moves a state by.
         rounding = FLOAT32_ROUNDING * problem.theta_half
         moved = [(x + np.copysign(rounding, x), u) for x, u in loops[OF_MPC].pairs]
-        rounded = np.mean([costs_of(problem, *pair)[0] for pair in moved])
+        old, new, rounded = (
+            np.mean([costs_of(problem, *pair)[0] for pair in pairs])
+            for pairs in (loops[OF_MPC].pairs, loops[OF_POLICY].pairs, moved)
+        )
         most = max(old * (1 + COST_ROUNDING), rounded)
         costs_more = new > most and policy.penalty.mean() > mpc.penalty.mean()
         text = (
@@ -200,18 +198,14 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
         )
         over = np.where(policy.largest > 0, 0.0, policy.any_bound)
         worst = int(np.argmax(over))
-        which = np.asarray(policy.worst)[worst]
-        if words := BoundNames.of(problem).in_words(which, over[worst]):
+        if words := names.in_words(policy.worst[worst], over[worst]):
             text += f" In episode {worst} {words} with the policy."
         found.append(make_finding(not costs_more, text))
     return tuple(found)
 
 
 def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, str, int, str, Any]]:
-    """Yield label, key, limits, the entry of these, kind, and values in an episode, of all bounds.
-
-    All of it is in plant units.
-    """
+    """Yield label, key, limits, their entry, kind, values in an episode, of each bound."""
     model = problem.model
     C = problem.outputs.C
     labels = with_units(model)
@@ -257,20 +251,15 @@ def law_part(subject: Subject) -> Part:
         )
     count, error, doubtful = _error_of_law(subject)
     off = _error_inside_policy(subject)
-    content = [
-        paragraph(how),
-        paragraph(
-            f"For this report it was compared with an independent quadratic program at "
-            f"{len(subject.samples)} random points of its box: {count} have a solution, the "
-            f"largest difference of an input is {error:.1e} of half its range, and {doubtful} "
-            "points are solvable by one only."
-        ),
-        paragraph(
-            "The law inside the policy, without what it has learnt, differs by at most "
-            f"{off:.1e} of half the range."
-        ),
-        _regions(subject),
-    ]
+    compared = (
+        f"For this report it was compared with an independent quadratic program at "
+        f"{len(subject.samples)} random points of its box: {count} have a solution, the "
+        f"largest difference of an input is {error:.1e} of half its range, and {doubtful} "
+        "points are solvable by one only."
+    )
+    inside = "The law inside the policy, without what it has learnt, differs by at most "
+    inside += f"{off:.1e} of half the range."
+    content = [*map(paragraph, (how, compared, inside)), _regions(subject)]
     findings = (
         make_finding(
             error <= 1e-6 and doubtful == 0,
@@ -299,10 +288,7 @@ def _regions(subject: Subject) -> Html:
 
 
 def _error_of_law(subject: Subject) -> tuple[int, float, int]:
-    """Return how many points have a solution, the law's error, and points in doubt.
-
-    Points within rounding of the border, solvable for one and not for the other, do not count.
-    """
+    """Return how many points have a solution, the law's error, and points in doubt."""
     problem = subject.problem
     law = subject.law
     program = ActiveConstraints(problem).units
@@ -313,6 +299,7 @@ def _error_of_law(subject: Subject) -> tuple[int, float, int]:
     for theta, u, is_inside in zip(subject.samples, inputs, inside, strict=True):
         U = program.scaled.solve((theta - program.center) / program.half)
         if (U is not None) != is_inside:
+            # Points within rounding of the border do not count.
             near = 1e-6 * problem.theta_half * np.vstack([np.eye(len(theta)), -np.eye(len(theta))])
             doubtful += not np.any(law.in_domain(theta + near) != is_inside)
         elif U is not None:
@@ -330,4 +317,4 @@ def _error_inside_policy(subject: Subject) -> float:
     middle = (problem.deviations.u_max + problem.deviations.u_min) / 2
     scaled = (subject.law(subject.samples) - middle) / problem.u_half
     off = np.abs(own.cpu().numpy() - scaled)[subject.law.in_domain(subject.samples)]
-    return float(off.max()) if off.size else 0.0
+    return float(off.max(initial=0.0))

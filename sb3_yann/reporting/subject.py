@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
+from importlib.resources import files
 from io import BytesIO
 from string import Template
 from typing import TYPE_CHECKING, Any
@@ -37,83 +38,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-STYLE = """
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { background: #fff; color: #1a1a1a; font: 16px/1.5 system-ui, -apple-system, "Segoe UI",
-  Roboto, "Helvetica Neue", Arial, sans-serif; margin: 0 auto; max-width: 62rem;
-  padding: 1.5rem 2rem 4rem; }
-h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .3rem; }
-h2 { border-top: 2px solid #0072b2; font-size: 1.25rem; margin: 2.6rem 0 .6rem;
-  padding-top: .5rem; }
-h3 { font-size: 1.02rem; margin: 1.5rem 0 .4rem; }
-h1, h2, h3, p, li { overflow-wrap: anywhere; }
-td, th { overflow-wrap: break-word; }
-p { margin: .5rem 0; max-width: 46rem; }
-.said { color: #555; }
-nav ol { columns: 2; margin: .3rem 0; padding-left: 1.6rem; }
-a { color: #00527f; }
-.wide { margin: .7rem 0; overflow-x: auto; }
-table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
-th, td { border-bottom: 1px solid #ddd; padding: .25rem .7rem .25rem 0; text-align: left;
-  vertical-align: top; }
-th { border-bottom: 1.5px solid #888; font-weight: 600; }
-td.number, th.number { text-align: right; }
-td.number { white-space: nowrap; }
-pre { background: #f6f6f6; font: .82rem/1.4 ui-monospace, Menlo, Consolas, monospace;
-  overflow-x: auto; padding: .7rem .9rem; white-space: pre-wrap; }
-figure { margin: 1rem 0; }
-figcaption { color: #555; font-size: .88rem; max-width: 46rem; }
-img { display: block; height: auto; max-width: 100%; }
-.passed, .failed, .look, .note { font-weight: 600; white-space: nowrap; }
-.passed { color: #00694b; } .failed { color: #a83c00; }
-.look { color: #7a5c00; } .note { color: #555; }
-.sign td { height: 3.2rem; min-width: 11rem; vertical-align: bottom; }
-@media (max-width: 640px) {
-  body { font-size: 15px; padding: 1rem .9rem 3rem; }
-  nav ol { columns: 1; }
-  img { max-width: none; width: max(100%, 34rem); }
-}
-@media print {
-  @page { margin: 16mm 14mm; size: A4; }
-  body { font-size: 10pt; max-width: none; padding: 0; }
-  nav { display: none; }
-  a { color: inherit; text-decoration: none; }
-  .wide, pre { overflow: visible; }
-  table { font-size: 8.5pt; }
-  td.number { white-space: normal; }
-  h2, h3 { break-after: avoid; }
-  figure, tr, .sign { break-inside: avoid; }
-}
-"""
-PAGE = Template(
-    """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
-<title>$title</title>
-<style>$style</style>
-</head>
-<body>
-$body
-</body>
-</html>
-"""
-)
-
-
 class Html(str):
     """Text that is HTML already."""
 
 
 def clean(value: Any) -> Html:
-    """Return a value as HTML: escaped, unless it is that already.
-
-    What is no text, such as control characters, becomes a replacement character.
-    """
+    """Return a value as escaped HTML, unless it is that already; what is no text is replaced."""
     if isinstance(value, Html):
         return value
     return Html(escape("".join(c if c in "\n\t" or is_text(c) else "\ufffd" for c in str(value))))
@@ -186,7 +116,8 @@ def picture(draw: Callable[[], Axes | Figure], caption: str) -> Html:
 
 def page(title: str, body: Iterable[Any]) -> str:
     """Return the whole page."""
-    return PAGE.substitute(title=clean(title), style=STYLE, body=join(body))
+    template = (files("sb3_yann.reporting") / "page.html").read_text(encoding="ascii")
+    return Template(template).substitute(title=clean(title), body=join(body))
 
 
 TRIED = 5  # states for each seed that an env is asked to begin in
@@ -196,12 +127,9 @@ OF_MPC = "MPC"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the summary: a verdict, and a text.
+    """One line of the summary: a verdict, and a text."""
 
-    The verdict is "passed", "failed", "look" where a person has to decide, or "note".
-    """
-
-    verdict: str
+    verdict: str  # "passed", "failed", "look" where a person has to decide, or "note"
     text: str
 
 
@@ -354,8 +282,8 @@ class Subject:
         rng = np.random.default_rng(0)
         bounds = self.problem.deviations
         middle = (bounds.theta_min + bounds.theta_max) / 2
-        half = (bounds.theta_max - bounds.theta_min) / 2
-        middle, half = np.where(np.isfinite(half), [middle, half], [[0.0], [1.0]])
+        middle = np.where(np.isfinite(bounds.theta_max - bounds.theta_min), middle, 0.0)
+        half = self.problem.theta_half
         return np.asarray(middle + half * rng.uniform(-1, 1, (500, len(half))))
 
     @cached_property

@@ -65,7 +65,7 @@ def test_shared_network_leaves_no_jump_whatever_its_weights(
         with th.no_grad():
             change = layer(th.as_tensor(other[kept])) - layer(th.as_tensor(one[kept]))
         slope = 1.0  # of the network, in half-widths of the box
-        for matrix in (layer.network.first.matrix(), *layer.network.rest.parameters()):
+        for matrix in layer.network.matrices():
             slope *= float(matrix.detach()[..., :-1].abs().sum(-1).max())
         most = 2 * step * (2 * steepest(mpc.explicit()) + slope) + 1e-6 * (1 + slope)
         assert np.all(np.abs(change.double().numpy()) <= most)

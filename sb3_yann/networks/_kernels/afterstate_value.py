@@ -52,11 +52,8 @@ def _forms(
     ----------
     points : ndarray, shape (batch, n + m)
         Rows ``[theta, a]``; y is the same with inputs for actions, and ``z = AB y``.
-    W, AB, M : ndarray, shapes (n + m, n + m), (n, n + m) and (n, n)
     scaling : ndarray, shape (n + 2 m,)
         Factors of z for the network; half the ranges of the inputs; their middles.
-    nodes : ndarray, shape (1, 2, h1, n + 1)
-    pinned : ndarray, shape (1,)
     total, y, z, x, hidden : ndarray
         What is written; total and z are zero before.
     """
@@ -234,16 +231,10 @@ ValueConstants = tuple[Array, Array, Array, Array, Single, float]
 def value_on_cpu(
     points: th.Tensor, weights: tuple[th.Tensor, ...], constants: ValueConstants
 ) -> th.Tensor:
-    """Return an afterstate value (batch, 1), with a gradient by points and weights.
+    """Return an afterstate value (batch, 1), with a gradient by points (batch, n + m) and weights.
 
-    Parameters
-    ----------
-    points : Tensor, shape (batch, n + m)
-    weights : tuple of Tensor
-        Entries of the quadratic form; nodes, second and last of the network.
-    constants : tuple
-        W, [A B], the scale of the quadratic form, the scaling of :func:`_forms`, which networks
-        are pinned, and the factor of the network.
+    Weights are entries of the quadratic form; nodes, second and last of the network. Constants are
+    W, [A B], the scale of the form, the scaling of :func:`_forms`, pinned, the network's factor.
     """
     size = len(constants[0])
     if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
@@ -255,10 +246,7 @@ def value_on_cpu(
 
 
 class _Pass:
-    """A forward pass, and what its backward pass needs.
-
-    The second layer, nearly all of the arithmetic, is left to torch's products of matrices.
-    """
+    """A forward pass, and what its backward pass needs. Torch multiplies the second layer."""
 
     def __init__(
         self, constants: ValueConstants, points: th.Tensor, weights: tuple[th.Tensor, ...]

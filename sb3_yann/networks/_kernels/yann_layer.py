@@ -287,17 +287,8 @@ def layer_on_cpu(
 ) -> th.Tensor:
     """Return the actions (batch, m) of a layer, with a gradient by its weights.
 
-    Parameters
-    ----------
-    pack : callable
-        From theta (batch, n) to what :func:`forward` takes of the law.
-    theta : Tensor or ndarray, shape (batch, n)
-    constants : tuple
-    weights : tuple of Tensor
-        Nodes, second and last.
-    pinned : ndarray, shape (p,)
-    by_row : bool
-        Whether gradients are sparse, with the rows of the regions in use.
+    ``pack`` makes of theta (batch, n) what :func:`forward` takes of the law. Weights are nodes,
+    second and last. ``by_row`` gradients are sparse, with the rows of the regions in use.
     """
     known = (*pack(_rows(theta, weights[0])), *constants)
     if th.is_grad_enabled():
