@@ -205,11 +205,12 @@ def _hidden_backward(
 
 @compiled(fastmath=True)
 def _all_backward(
-    back: Single, x: Single, out: Single, zero: Single, pinned: float, by_matrix: Single
+    back: Single, x: Single, out: Single, zero: Single, pinned: float, asked: bool, by: Single
 ) -> Single:
     """Write the gradient by a matrix as :func:`_hidden_backward` does, that all rows go through.
 
-    It is zero before. Return that by what is in tanh, (batch, outputs).
+    It is zero before, and stays so unless it is asked for. Return that by what is in tanh, (batch,
+    outputs).
     """
     one = np.float32(1)
     inputs = x.shape[1]
@@ -220,9 +221,9 @@ def _all_backward(
             b = zero[a]
             through[row, a] = back[row, a] * (one - (out[row, a] + b) * (out[row, a] + b))
             by_bias[a] += through[row, a] - pinned * back[row, a] * (one - b * b)
-    by_matrix[:, inputs] = by_bias
-    for at in range(0, len(x), BLOCK):
-        by_matrix[:, :inputs] += np.dot(through[at : at + BLOCK].T, x[at : at + BLOCK])
+    by[:, inputs] = by_bias
+    for at in range(0, len(x) if asked else 0, BLOCK):
+        by[:, :inputs] += np.dot(through[at : at + BLOCK].T, x[at : at + BLOCK])
     return through
 
 
@@ -233,6 +234,7 @@ def network_backward(
     used: Integers,
     slot: Integers,
     dense: bool,
+    asked: bool,
     nodes: Single,
     second: Single,
     last: Single,
@@ -242,11 +244,12 @@ def network_backward(
     by_nodes: Single,
     by_second: Single,
     by_last: Single,
-) -> None:
+) -> Single:
     """Write the gradients by nodes, second and last; the last two are zero before.
 
     Of all networks if ``dense``, else of those in use alone, in the order of ``used``. ``back``
-    (batch, m) is the gradient by the output; the others are as in :func:`network`.
+    (batch, m) is the gradient by the output; the others are as in :func:`network`. Those of a
+    network that is alone may not be ``asked`` for. Return its gradient by x, (batch, n).
     """
     batch, n = x.shape
     m = last.shape[1]
@@ -278,11 +281,14 @@ def network_backward(
         _hidden_backward(by_2, hidden1, hidden2, row, zero2, own, s, second, i, by_second, at, by_1)
         _hidden_backward(by_1, x, hidden1, row, zero1, own, s, first, s, by_first, at, by_x)
     if len(pinned) == 1:
-        through = _all_backward(by_2, hidden1, hidden2, zero2[0], pinned[0], by_second[0])
+        own = pinned[0]
+        through = _all_backward(by_2, hidden1, hidden2, zero2[0], own, asked, by_second[0])
         np.dot(through, matrices2[0, :-1].T, by_1)
-        _all_backward(by_1, x, hidden1, zero1[0], pinned[0], by_first[0])
+        through = _all_backward(by_1, x, hidden1, zero1[0], own, asked, by_first[0])
+        np.dot(through, matrices1[0, :-1].T, by_x)
     for s in range(by_first.shape[0]):
         for node in range(2):  # they enter the same sum
             for a in range(by_first.shape[1]):
                 for j in range(by_first.shape[2]):
                     by_nodes[s, node, a, j] = by_first[s, a, j]
+    return by_x

@@ -272,7 +272,7 @@ def backward(
             if (above and back[row, k] < 0) or (below and back[row, k] > 0):
                 back[row, k] = 0
     network_backward(
-        back, x, used, slot, dense, nodes, second, last, pinned,
+        back, x, used, slot, dense, True, nodes, second, last, pinned,
         hidden1, hidden2, by_nodes, by_second, by_last,
     )  # fmt: skip
 
