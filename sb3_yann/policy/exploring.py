@@ -17,7 +17,7 @@ from torch import nn
 from sb3_yann._validation import check_bool, check_range, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.policy.actor_critic import YannActor, YannCritic
-from sb3_yann.policy.policies import NOT_OURS, StartsAsMPC
+from sb3_yann.policy.policies import NOT_OURS, OF_THE_LAYER, StartsAsMPC
 from sb3_yann.policy.sb3_hooks import restore_learning_rate, single_precision
 
 MIN_LOG_STD = math.log(1e-4)
@@ -108,6 +108,8 @@ class Explores(StartsAsMPC):
     """What policies share whose algorithms explore by drawing actions."""
 
     OWN = "initial_std", "simulator"
+    ACTOR = SpreadActor
+    OF_ACTOR = (*OF_THE_LAYER, "initial_std")
 
     def __init__(
         self,
@@ -130,12 +132,6 @@ class Explores(StartsAsMPC):
     def actor_target(self) -> SpreadActor:  # type: ignore[override]
         """The actor: there is no other."""
         return self.actor  # type: ignore[return-value]
-
-    def make_actor(self, features_extractor: Any = None) -> SpreadActor:
-        """Return an actor whose most likely action is the law's."""
-        own = {"initial_std": self.initial_std}
-        actor: SpreadActor = self._actor(SpreadActor, features_extractor, **own)
-        return actor
 
     def says_that_it_explores(self) -> None:
         """Warn once where nothing says that the plant is a simulator, and no guard is at work."""

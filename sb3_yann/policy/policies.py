@@ -81,6 +81,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
     ALGORITHMS: ClassVar[tuple[type[BaseAlgorithm], ...]] = ()  # which train it
     OWN: ClassVar[tuple[str, ...]] = ()  # keywords beside those of `YannPolicy`
     THEIRS: ClassVar[tuple[str, ...]] = ("n_critics",)  # not all SB3 policies have
+    ACTOR: ClassVar[type[YannActor]] = YannActor
+    OF_ACTOR: ClassVar[tuple[str, ...]] = OF_THE_LAYER  # keywords of the policy that it takes too
     CRITIC: ClassVar[type[YannCritic]] = YannCritic
     guarded = False  # while an `ImprovementGuard` is at work
     states_checked = False  # once what an env shows was compared with the model
@@ -343,15 +345,11 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the law, with networks that are zero."""
-        actor: YannActor = self._actor(YannActor, features_extractor)
-        return actor
-
-    def _actor(self, kind: Any, features_extractor: Any, **own: Any) -> Any:
-        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor) | own
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         kwargs = {name: each for name, each in kwargs.items() if name not in NOT_OURS}
-        kwargs |= {name: getattr(self, name) for name in OF_THE_LAYER}
+        kwargs |= {name: getattr(self, name) for name in self.OF_ACTOR}
         with single_precision():
-            return kind(self.problem, **kwargs).to(self.device)
+            return self.ACTOR(self.problem, **kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
         """Return a critic that is the law's value on the linear model, with networks of zero."""
