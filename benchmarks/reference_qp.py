@@ -37,9 +37,8 @@ class ReferenceQP:
         self.half = mpc.theta_half
         self.unit = mpc.u_half
         program = mpc.condensed()
-        steps = (len(program.c) - program.n_slacks) // len(self.unit)
-        reach = np.concatenate([np.tile(self.unit, steps), np.ones(program.n_slacks)])
-        self.program: ParametricQP = program.scaled(self.center, self.half, reach)
+        self.program: ParametricQP
+        self.program, _ = program.scaled(mpc.u_min, mpc.u_max, self.center)
         self.L = np.linalg.cholesky(self.program.H)
         self.back = np.linalg.inv(self.L).T
         self.length = np.linalg.norm(self.program.G, axis=1)

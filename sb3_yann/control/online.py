@@ -85,10 +85,9 @@ class OnlineLaw(PlantLaw):
     n_input_rows: int = 0
     feedback: Array | None = None
     _kind = "an OnlineLaw"
-    _derived = ("dual", "known", "program", "scaled", "half", "_first_rows", "_has_warned")
+    _derived = ("dual", "known", "program", "scaled", "_first_rows", "_has_warned")
 
     def __post_init__(self) -> None:
-        """Check the arrays against each other and store them as read-only float64."""
         F = check_array("F", self.F, ("v", "n"))
         v, n = F.shape
         G = check_array("G", self.G, ("rows", v))
@@ -168,17 +167,13 @@ class OnlineLaw(PlantLaw):
     @cached_property
     def dual(self) -> DualProgram:
         """The program as it is solved."""
-        return DualProgram.of(self.program, self.u_min, self.u_max)
+        return DualProgram.of(self.program, *self.scaled, self.u_min, self.u_max)
 
     @cached_property
     def scaled(self) -> tuple[ParametricQP, Array]:
-        """The program in units of the input range and theta's box, and those of U (v,)."""
-        return _scaled(self.program, self.u_min, self.u_max)
-
-    @cached_property
-    def half(self) -> Array:
-        """The half-widths of theta's box."""
-        return half_widths(self.theta_min, self.theta_max)
+        """The program in half-widths of the input range and theta's box, and those of U (v,)."""
+        scaled, reach = self.program.scaled(self.u_min, self.u_max, np.zeros(self.n_theta))
+        return moderated(scaled), reach
 
     @cached_property
     def known(self) -> KnownPoints:
@@ -237,7 +232,8 @@ class OnlineLaw(PlantLaw):
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
         """Write the input and active set where the compiled method has no certificate."""
         program, reach = self.scaled
-        U, multipliers = program.solve_with_multipliers(theta / self.half)
+        half = half_widths(self.theta_min, self.theta_max)
+        U, multipliers = program.solve_with_multipliers(theta / half)
         if U is None:
             return False
         members = np.flatnonzero(multipliers[self.dual.rows] > 0)
@@ -312,9 +308,10 @@ class DualProgram:
     n_variables: int
 
     @classmethod
-    def of(cls, program: ParametricQP, u_min: Array, u_max: Array) -> DualProgram:
-        """Return the dual form of a program whose first variables are the inputs (m,)."""
-        scaled, reach = _scaled(program, u_min, u_max)
+    def of(
+        cls, program: ParametricQP, scaled: ParametricQP, reach: Array, u_min: Array, u_max: Array
+    ) -> DualProgram:
+        """Return the dual form of a program, see `OnlineLaw.scaled`, whose first U are inputs."""
         half = half_widths(program.theta_min, program.theta_max)
         # Rows are of unit length in these units; theta itself comes in those of the plant.
         scaled = replace(scaled, F=scaled.F / half, S=scaled.S / half)
@@ -422,22 +419,10 @@ class KnownPoints:
         return u
 
 
-def _scaled(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[ParametricQP, Array]:
-    """Return the program in units of the input range and theta's box, and those of U (v,)."""
-    in_units, reach = _in_units(program, u_min, u_max)
-    return moderated(in_units), reach
-
-
-def _in_units(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[ParametricQP, Array]:
-    steps = (len(program.c) - program.n_slacks) // len(u_min)
-    reach = np.append(np.tile(half_widths(u_min, u_max), steps), np.ones(program.n_slacks))
-    half = half_widths(program.theta_min, program.theta_max)
-    return program.scaled(np.zeros(len(half)), half, reach), reach
-
-
 def steepness(program: ParametricQP, u_min: Array, u_max: Array) -> float:
     """Return how many times as much as by a default penalty the slacks of a program cost."""
-    ratio, _ = slack_costs(_in_units(program, u_min, u_max)[0])
+    scaled, _ = program.scaled(u_min, u_max, 0 * program.theta_min)
+    ratio, _ = slack_costs(scaled)
     return float(ratio.max()) / STEEP
 
 

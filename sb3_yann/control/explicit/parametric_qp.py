@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, half_widths
 
 ROW_NORM_TOL = 1e-7
 """Bounds that all inputs together move by less, in half-widths of the box of theta, are its own.
@@ -102,8 +102,6 @@ class ParametricQP:
 
     def without(self, entries: NDArray[np.intp]) -> ParametricQP:
         """Return the same program without entries of theta that nothing depends on."""
-        if not len(entries):
-            return self
         own: dict[str, Any] = {
             name: np.delete(getattr(self, name), entries, axis=-1)
             for name in ("F", "S", "theta_min", "theta_max")
@@ -121,21 +119,23 @@ class ParametricQP:
         with np.errstate(invalid="ignore"):  # 0 times inf
             moved = np.nan_to_num(np.abs(self.G) * u_size, nan=0.0, posinf=np.inf).sum(axis=1)
         short = (moved < ROW_NORM_TOL) & np.any(self.G, axis=1) & np.any(self.S, axis=1)
-        if not np.any(short):
-            return self
         w = self.w - np.where(short, moved, 0.0)
         return replace(self, G=np.where(short[:, None], 0.0, self.G), w=w)
 
-    def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
-        """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows.
+    def scaled(self, u_min: Array, u_max: Array, center: Array) -> tuple[ParametricQP, Array]:
+        """Return the program in half-widths, of unit rows, and those of U (v,), 1 for slacks.
 
-        It knows no ``feedback``: that is of the units of the plant.
+        Inputs have bounds (m,), theta counts from a center (n,). It knows no ``feedback``: that is
+        of the units of the plant.
         """
+        half = half_widths(self.theta_min, self.theta_max)
+        steps = (len(self.c) - self.n_slacks) // len(u_min)
+        reach = np.append(np.tile(half_widths(u_min, u_max), steps), np.ones(self.n_slacks))
         size = np.mean(np.diag(self.H) * reach**2)
         G = self.G * reach
         S = self.S * half
         length = row_norms(np.hstack([G, S]))
-        return replace(
+        program = replace(
             self,
             H=self.H * np.outer(reach, reach) / size,
             F=self.F * np.outer(reach, half) / size,
@@ -147,6 +147,7 @@ class ParametricQP:
             theta_max=(self.theta_max - center) / half,
             feedback=None,
         )
+        return program, reach
 
 
 def moderated(program: ParametricQP) -> ParametricQP:

@@ -90,15 +90,14 @@ class ProgramUnits:
         self.u_max = u_max
         self.center = (program.theta_max + program.theta_min) / 2
         self.half = half_widths(program.theta_min, program.theta_max)
-        steps = (len(program.c) - program.n_slacks) // m
-        reach = np.tile(half_widths(u_min, u_max), steps)
-        self.reach = np.append(reach, np.ones(program.n_slacks))
-        u_size = np.maximum(np.abs(u_min), np.abs(u_max)) / reach[:m]
+        scaled, self.reach = program.scaled(u_min, u_max, self.center)
+        u_size = np.maximum(np.abs(u_min), np.abs(u_max)) / self.reach[:m]
         if program.feedback is not None:  # v = u - feedback theta
             box = np.maximum(np.abs(program.theta_min), np.abs(program.theta_max))
-            u_size = u_size + np.abs(program.feedback) @ box / reach[:m]
-        u_size = np.append(np.tile(u_size, steps), np.full(program.n_slacks, np.inf))
-        scaled = program.scaled(self.center, self.half, self.reach).without_short_rows(u_size)
+            u_size = u_size + np.abs(program.feedback) @ box / self.reach[:m]
+        u_size = np.tile(u_size, (len(program.c) - program.n_slacks) // m)
+        u_size = np.append(u_size, np.full(program.n_slacks, np.inf))
+        scaled = scaled.without_short_rows(u_size)
         self.to_inputs = np.eye(m, len(program.c))
         self.equalities = None
         if not _has_interior_point(scaled):
