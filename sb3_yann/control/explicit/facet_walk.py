@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +37,6 @@ THINNEST = 1e-9
 PERTURBED = 1e-8
 """How far unit rows are moved out, in half-widths, so that one of several active sets is told:
 above the tolerance of the QP, 1e-11, and below the step across a facet, 1e-7."""
-OUTER = -1
-"""Stands for the constraint of a facet with nothing feasible beyond."""
-SHARED = -2
-"""Stands for the constraint of a facet that several constraints share."""
 
 
 def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
@@ -67,23 +63,17 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
 class CandidateRegion:
     """A critical region with what lies across its facets.
 
-    There ``A theta <= b`` and ``U = law [theta; 1]``, with law (v, n + 1). ``inside`` (n,) is a
-    point well inside, and ``labels`` hold the constraint of each row, or OUTER or SHARED.
-    ``exchanges`` are the active sets across rows of constraints that depend on the active ones.
+    There ``A theta <= b`` and ``U = law [theta; 1]``, with law (v, n + 1), and ``inside`` (n,) is a
+    point well inside. ``across`` are the active sets that share each facet if nothing degenerates,
+    an empty tuple where several constraints do, and None where nothing feasible lies beyond.
     """
 
     active: int
     law: Array
     A: Array
     b: Array
-    labels: list[int]
     inside: Array
-    exchanges: dict[int, tuple[int, ...]]
-
-    def across(self, row: int) -> tuple[int, ...]:
-        """Return the active sets that share a facet if nothing degenerates."""
-        label = self.labels[row]
-        return self.exchanges.get(label, (self.active ^ (1 << label),)) if label >= 0 else ()
+    across: list[tuple[int, ...] | None]
 
 
 class _Walk:
@@ -107,8 +97,8 @@ class _Walk:
                 b=one.b,
                 inside=one.inside,
                 across=tuple(
-                    next((rows[other] for other in one.across(k) if other in rows), None)
-                    for k in range(len(one.labels))
+                    next((rows[other] for other in each or () if other in rows), None)
+                    for each in one.across
                 ),
             )
             for active, one in self.found.items()
@@ -138,8 +128,8 @@ class _Walk:
             for one in self.conditions.regions(ahead):
                 self.timer.count()
                 self.found[one.active] = one
-                facets += [(one, row) for row in range(len(one.labels))]
-                following.update(*map(one.across, range(len(one.labels))))
+                facets += [(one, k) for k, each in enumerate(one.across) if each is not None]
+                following.update(*filter(None, one.across))
             ahead = sorted(following - self.visited)
             if not ahead:  # the facets across which these sets have no region
                 left = [(pair, self._across(*pair)) for pair in facets]
@@ -148,10 +138,9 @@ class _Walk:
 
     def _across(self, one: CandidateRegion, row: int) -> int | None:
         """Return the active set across a facet, None if it is known, or none is feasible there."""
-        across = one.across(row)
+        across = one.across[row] or ()
         known = any(active in self.found for active in across)
-        sure = known and self.conditions.degenerate.isdisjoint(across)
-        if sure or one.labels[row] == OUTER:
+        if known and self.conditions.degenerate.isdisjoint(across):
             return None
         self.timer.tick(effort_of_lp(*one.A.shape))
         middle, distance = largest_ball(one.A, one.b, row)
@@ -176,14 +165,13 @@ class _Walk:
 class _Factors:
     """QR factors of some active sets of one size: ``N[index]' = Q R``.
 
-    ``inverse`` and ``right`` are those of R and R', ``NQ`` is N Q, and ``depends`` marks the
-    constraints that are combinations of the active ones.
+    ``inverse`` is that of R, ``NQ`` is N Q, and ``depends`` marks the constraints that are
+    combinations of the active ones.
     """
 
     index: NDArray[np.intp]
     Q: Array
     inverse: Array
-    right: Array
     NQ: Array
     depends: NDArray[np.bool_]
 
@@ -213,8 +201,15 @@ class Conditions:
         # Active sets that depend on each other, or share their law with another one.
         self.degenerate: set[int] = set()
         self.units = row_units(self.N)
-        v = len(self.back)
-        self.least_distance = np.eye(v), np.zeros(v), self.N * self.units[:, None]
+        self.least_distance = replace(
+            program,
+            H=np.eye(len(self.back)),
+            F=0 * program.F,
+            c=0 * program.c,
+            G=self.N,
+            w=self.D[:, -1] + PERTURBED * self.apart,
+            S=self.D[:, :-1],
+        )
 
     def _bound_feasible_set(self, program: ParametricQP, moving: NDArray[np.intp]) -> None:
         """Set a point and the corners of the feasible theta, and the constraints that bound it."""
@@ -254,20 +249,13 @@ class Conditions:
         """
         if np.any(self.outer_A @ theta > self.outer_b + 1e-11):
             return None
-        rows = len(self.kept)
-        if rows == 0:
+        if not len(self.kept):
             return 0
         self.timer.tick(effort_of_qp(*self.N.shape))
-        import daqp
-
-        n = len(theta)
-        upper = (self.D[:, :n] @ theta + self.D[:, n] + PERTURBED * self.apart) * self.units
-        lower = np.full(rows, -1e30)
-        sense = np.zeros(rows, dtype=np.intc)
-        _, _, status, info = daqp.solve(*self.least_distance, upper, lower, sense, primal_tol=1e-11)
-        if status != 1:
+        U, multipliers = self.least_distance.solve_with_multipliers(theta)
+        if U is None:
             return None
-        multipliers = np.asarray(info["lam"])
+        multipliers = multipliers / self.units  # of rows of about unit length
         return as_bits(np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max())))
 
     def regions(self, wave: list[int]) -> Iterator[CandidateRegion]:
@@ -295,7 +283,11 @@ class Conditions:
         weak = constant[each, index] & (rows[each, index, -1] <= 1e-10 * noise[each, index])
         ok &= ~np.any(weak, axis=1)
         tight = constant & (np.abs(rows[..., -1]) <= 1e-10 * noise)
-        ruled_out = ok & self._ruled_out(factors, tight)
+        # Wrong with constraints moved apart, where others than the active ones are tight.
+        tight[each, index] = False
+        moved = np.swapaxes(factors.inverse, 1, 2) @ self.apart[index][:, :, None]
+        apart = self.apart - np.squeeze(factors.NQ @ moved, axis=2)
+        ruled_out = ok & np.any(tight & (apart < 0), axis=1)
         self.degenerate.update(actives[i] for i in np.flatnonzero(ruled_out))
         length[constant] = 1.0
         A = -rows[:, :, :-1] / length[:, :, None]
@@ -307,11 +299,23 @@ class Conditions:
             label = np.flatnonzero(needed[i])
             bounds = len(label) + len(self.outer_b)
             self.timer.tick(OF_REGION + bounds * effort_of_lp(bounds, A.shape[2]) / 2)
-            one = self._region(actives[i], laws[i], A[i, label], b[i, label], label)
-            if one is not None:
-                one.exchanges.update(self._exchanges(one, factors, i))
-                one.labels[:] = [OUTER if one.exchanges.get(k) == () else k for k in one.labels]
-                yield one
+            outer = np.concatenate([A[i, label], self.outer_A])
+            ends = np.concatenate([b[i, label], self.outer_b])
+            inside, radius, facets, some_equal = bounded_region(outer, ends, THINNEST)
+            if radius <= THINNEST:
+                continue
+            added = label[facets[facets < len(label)]]
+            across = self._across(actives[i], added, factors, i)
+            across += [None] * (len(facets) - len(added))
+            if some_equal:  # one facet for those that share it
+                same = equal_rows(outer[facets], ends[facets] - outer[facets] @ inside, radius)
+                keep = np.flatnonzero(np.argmax(same, axis=1) == np.arange(len(facets)))
+                twins = [[across[k] for k in np.flatnonzero(same[first])] for first in keep]
+                shared = [None if None in each else () for each in twins]
+                pairs = zip(twins, shared, strict=True)
+                across = [each[0] if len(each) == 1 else both for each, both in pairs]
+                facets = facets[keep]
+            yield CandidateRegion(actives[i], laws[i], outer[facets], ends[facets], inside, across)
 
     def _factored(self, members: list[int], size: int) -> tuple[_Factors, NDArray[np.bool_]]:
         """Return the QR factors of active sets of independent constraints, and which are that."""
@@ -327,12 +331,12 @@ class Conditions:
         left = np.linalg.norm(self.N - NQ @ np.swapaxes(Q, 1, 2), axis=2)
         depends = left <= DEPENDENT * self.length
         depends[np.arange(len(index))[:, None], index] = False
-        return _Factors(index, Q, inverse, np.swapaxes(inverse, 1, 2), NQ, depends), full
+        return _Factors(index, Q, inverse, NQ, depends), full
 
     def _rows(self, factors: _Factors) -> tuple[Array, Array, Array]:
         """Return laws; slacks, or multipliers of active rows, as [S w]; the size of their terms."""
         index = factors.index
-        W = factors.right @ self.D[index]
+        W = np.swapaxes(factors.inverse, 1, 2) @ self.D[index]
         rows = self.D - factors.NQ @ W
         width = np.linalg.norm(W, axis=(1, 2))[:, None]
         noise = np.linalg.norm(self.D, axis=1) + np.linalg.norm(factors.NQ, axis=2) * width
@@ -341,53 +345,19 @@ class Conditions:
         noise[each, index] = np.linalg.norm(factors.inverse, axis=2) * width
         return self.back @ (factors.Q @ W - self.Y), rows, noise
 
-    def _ruled_out(self, factors: _Factors, tight: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Tell which active sets are wrong with constraints moved apart, where others are tight."""
-        index = factors.index
-        tight[np.arange(len(index))[:, None], index] = False
-        if not np.any(tight):
-            return np.zeros(len(index), dtype=bool)
-        moved = np.squeeze(factors.NQ @ (factors.right @ self.apart[index][:, :, None]), axis=2)
-        return np.asarray(np.any(tight & (self.apart - moved < 0), axis=1))
+    def _across(
+        self, active: int, added: NDArray[np.intp], factors: _Factors, i: int
+    ) -> list[tuple[int, ...] | None]:
+        """Return the active sets beyond constraints, None where nothing feasible lies there.
 
-    def _exchanges(
-        self, one: CandidateRegion, factors: _Factors, i: int
-    ) -> dict[int, tuple[int, ...]]:
-        """Return the active sets across constraints that the active ones make up.
-
-        One of those with a positive factor leaves.
+        Of those that a constraint is made up of, one with a positive factor leaves.
         """
         index = factors.index[i]
-        added = [k for k in one.labels if k >= 0 and factors.depends[i, k]]
-        if not added:
-            return {}
-        made_of = factors.NQ[i, added] @ factors.right[i] * self.length[index]
+        made_of = factors.NQ[i, added] @ factors.inverse[i].T * self.length[index]
         leaves = made_of > DEPENDENT * self.length[added, None]
-        return {
-            k: tuple(one.active ^ (1 << k) ^ (1 << int(j)) for j in index[leave])
-            for k, leave in zip(added, leaves, strict=True)
-        }
-
-    def _region(
-        self, active: int, law: Array, A: Array, b: Array, label: NDArray[np.intp]
-    ) -> CandidateRegion | None:
-        """Return a region without what does not bound it, None where it has no interior."""
-        A = np.concatenate([A, self.outer_A])
-        b = np.concatenate([b, self.outer_b])
-        inside, radius, rows, some_equal = bounded_region(A, b, THINNEST)
-        if radius <= THINNEST:
-            return None
-        A = A[rows]
-        b = b[rows]
-        labels = [int(label[k]) if k < len(label) else OUTER for k in rows]
-        if some_equal:
-            same = equal_rows(A, b - A @ inside, radius)
-            keep = np.flatnonzero(np.argmax(same, axis=1) == np.arange(len(rows)))
-            for k in keep:
-                twins = [labels[twin] for twin in np.flatnonzero(same[k])]
-                if len(twins) > 1:
-                    labels[k] = OUTER if OUTER in twins else SHARED
-            A = A[keep]
-            b = b[keep]
-            labels = [labels[k] for k in keep]
-        return CandidateRegion(active, law, A, b, labels, inside, {})
+        found: list[tuple[int, ...] | None] = []
+        for k, leave in zip(added.tolist(), leaves, strict=True):
+            flipped = active ^ (1 << k)
+            exchanged = tuple(flipped ^ (1 << j) for j in index[leave].tolist())
+            found.append(exchanged or None if factors.depends[i, k] else (flipped,))
+        return found
