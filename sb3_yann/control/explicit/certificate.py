@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
@@ -90,9 +90,17 @@ class Certificate:
                 self._fail(f"the law of region {i} is not optimal inside it", middle)
             self.timer.advance()
         refined = list(regions)
-        for i, conditions in self._conditions():
-            refined[i] = self._checked(i, conditions)
-            self.timer.advance()
+        v, n = self.program.F.shape
+        rows = len(self.program.w)
+        sets = [region.active_set for region in regions]
+        for size, members in batches(
+            map(len, sets), lambda size: (v + size) * (v + size + rows + n + 1)
+        ):
+            self.timer.tick(len(members) * effort_of_conditions(rows + n, v + size, v + size))
+            found = optimality(self.program, [sets[k] for k in members])
+            for i, conditions in zip(members, found, strict=True):
+                refined[i] = self._checked(i, conditions)
+                self.timer.advance()
         self._require_agreement()
         self._require_no_doubles()
         return refined
@@ -106,19 +114,6 @@ class Certificate:
         gains = laws[..., :-1]
         off = np.einsum("kvn,kn->kv", gains, points) + laws[..., -1] - inputs @ self.to_inputs.T
         return np.asarray(np.abs(off).max(axis=1) - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1))
-
-    def _conditions(self) -> Iterator[tuple[int, Optimality]]:
-        """Yield the KKT conditions of each region."""
-        sets = [region.active_set for region in self.regions]
-        v, n = self.program.F.shape
-        rows = len(self.program.w)
-
-        for size, members in batches(
-            map(len, sets), lambda size: (v + size) * (v + size + rows + n + 1)
-        ):
-            self.timer.tick(len(members) * effort_of_conditions(rows + n, v + size, v + size))
-            found = optimality(self.program, [sets[k] for k in members])
-            yield from zip(members, found, strict=True)
 
     def _checked(self, i: int, kkt: Optimality) -> Region:
         """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
@@ -174,13 +169,12 @@ class Certificate:
     def _require_neighbors(self, i: int, same: NDArray[np.bool_], kkt: Optimality) -> None:
         """Raise if a facet of region i has no neighbor; ``same`` says which conditions are it."""
         outer = len(self.outer)
-        covered = set()
-        for row, each in np.argwhere(same).tolist():
+        for row, known in enumerate(same):
             # A bound of theta, or a constraint.
-            if each < outer or all(a in self.by_set for a in kkt.across(each - outer)):
-                covered.add(row)
-        for row in range(len(same)):
-            if row not in covered:
+            if not any(
+                each < outer or all(a in self.by_set for a in kkt.across(each - outer))
+                for each in np.flatnonzero(known).tolist()
+            ):
                 self._require_covered_across(self.regions[i], row)
 
     def _require_covered_across(self, region: Region, row: int) -> None:
@@ -195,7 +189,7 @@ class Certificate:
             U, multipliers = self.program.solve_with_multipliers(point)
             if U is None:
                 return
-            at = self.by_set.get(_active_sets(multipliers[None])[0])
+            at = self.by_set.get(as_bits(np.flatnonzero(multipliers > 1e-11)))
             if at is not None:
                 other = self.regions[at]
                 if min(np.min(other.b - other.A @ x) for x in (point, middle)) >= -INSIDE_TOL:
@@ -206,39 +200,29 @@ class Certificate:
             if np.any(self._slacks(middle)[slacks >= -INSIDE_TOL] >= -INSIDE_TOL):
                 return
 
-    def _slacks(self, point: Array) -> Array:
-        """Return how far inside each region a point lies."""
-        return np.asarray(np.minimum.reduceat(self.b - self.A @ point, self.starts))
+    def _slacks(self, points: Array) -> Array:
+        """Return how far inside each region points (..., n) lie."""
+        return np.asarray(np.minimum.reduceat(self.b - points @ self.A.T, self.starts, axis=-1))
 
     def _require_agreement(self) -> None:
         """Raise unless QPs at random points of the box agree with the regions."""
         n = self.program.F.shape[1]
-        feasible = []
-        for point in np.random.default_rng(1).uniform(-1, 1, (50 * n, n)):
-            self.timer.tick(self.qp_effort)
-            U, found = self.program.solve_with_multipliers(point)
-            if U is not None:
-                feasible.append((point, U, found))
-        if not feasible:
-            return
-        points, inputs, multipliers = (np.array(each) for each in zip(*feasible, strict=True))
-        meant = np.array([self.by_set.get(each, -1) for each in _active_sets(multipliers)])
-        held = meant >= 0
-        for i in np.unique(meant[held]):
-            region = self.regions[i]
-            at = np.flatnonzero(meant == i)
-            held[at] = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE_TOL
-            error = self._error(np.full(len(at), i), points[at], inputs[at])
-            wrong = at[held[at] & (error > LAW_TOL)]
-            if len(wrong):
-                self._fail(f"the law of region {i} violates the KKT conditions", points[wrong[0]])
-        for k in np.flatnonzero(~held):  # the nearest region holds it, and has the right law
-            slacks = self._slacks(points[k])
-            nearest = int(np.argmax(slacks))
-            if slacks[nearest] < -INSIDE_TOL:
-                self._fail("no region covers a feasible parameter", points[k])
-            if self._error(np.array([nearest]), points[k, None], inputs[k, None])[0] > LAW_TOL:
-                self._fail(f"the law of region {nearest} violates the KKT conditions", points[k])
+        for points in np.random.default_rng(1).uniform(-1, 1, (n, 50, n)):
+            self.timer.tick(50 * self.qp_effort)
+            solved = [(point, self.program.solve(point)) for point in points]
+            feasible = [(point, U) for point, U in solved if U is not None]
+            if not feasible:
+                continue
+            at, inputs = (np.array(each) for each in zip(*feasible, strict=True))
+            slacks = self._slacks(at)
+            nearest = np.argmax(slacks, axis=1)
+            k = int(np.argmin(slacks.max(axis=1)))
+            if slacks[k, nearest[k]] < -INSIDE_TOL:
+                self._fail("no region covers a feasible parameter", at[k])
+            error = self._error(nearest, at, inputs)
+            k = int(np.argmax(error))
+            if error[k] > LAW_TOL:
+                self._fail(f"the law of region {nearest[k]} violates the KKT conditions", at[k])
 
     def _require_no_doubles(self) -> None:
         """Raise if a region lies in another: both have then the same law, whatever their sets."""
@@ -262,9 +246,3 @@ class Certificate:
             "bring states and weights to similar magnitudes, or use online(), which needs no "
             "regions."
         )
-
-
-def _active_sets(multipliers: Array) -> list[int]:
-    """Return the sets of constraints with multipliers, one for each row, as whole numbers."""
-    bits = np.packbits(multipliers > 1e-11, axis=1, bitorder="little")
-    return [int.from_bytes(row.tobytes(), "little") for row in bits]
