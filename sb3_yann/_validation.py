@@ -368,6 +368,12 @@ def _frozen(array: Array) -> Array:
     return array
 
 
+def finite_sizes(*sides: Array) -> Array:
+    """Return the largest finite size among the sides (k,) of each range, 0 where there is none."""
+    sizes = np.abs(sides)
+    return np.asarray(np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0))
+
+
 def half_widths(lower: Array, upper: Array) -> Array:
     """Return half the width of each range, and 1 where it is infinite: a unit to measure in."""
     half = (upper - lower) / 2

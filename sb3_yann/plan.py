@@ -227,12 +227,9 @@ class Task:
 
     def _mixed_penalty(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
         """Return the same by theta and u (..., n_theta + m) of what is beyond MixedBounds."""
-        problem = self.problem
-        over = mixed_beyond(problem.deviations, thetas, inputs, -INSIDE)
-        rows = np.zeros((len(problem.mixed.F), problem.n_theta + problem.model.n_inputs))
-        rows[:, problem.layout.state] = problem.mixed.F
-        rows[:, problem.n_theta :] = problem.mixed.G
-        return self._squares(over, rows / mixed_half(problem)[:, None])
+        over = mixed_beyond(self.problem.deviations, thetas, inputs, -INSIDE)
+        scaled = self.problem.bounded["mixed"].rows / mixed_half(self.problem)[:, None]
+        return self._squares(over, scaled)
 
     def _squares(self, over: Array, rows: Array) -> tuple[Array, Array]:
         weight = 2 * self.weight

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
+from sb3_yann._validation import Array, ReadOnlyArrays, finite_sizes, half_widths
 
 FLOAT32_ROUNDING = 1e-6
 """Half-widths, or a relative difference, that float32 observations and actions make."""
@@ -169,8 +169,7 @@ def same_bounds(
     bounds = np.array(wanted)
     if found.shape != bounds.shape:
         return False
-    finite = np.where(np.isfinite(bounds), np.abs(bounds), 0).max(0)
-    size = np.where(np.isfinite(half), half, finite)
+    size = np.where(np.isfinite(half), half, finite_sizes(*bounds))
     kind = np.asarray(given[0]).dtype
     digits = np.finfo(kind).eps if np.issubdtype(kind, np.floating) else 0.0
     room = 2e-6 * size + digits * np.abs(found)

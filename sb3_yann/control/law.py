@@ -323,7 +323,6 @@ class PiecewiseAffine(PlantLaw):
     _derived = ("packed", "_at")
 
     def __post_init__(self) -> None:
-        """Check the arrays against each other and store them as read-only float64."""
         gains = check_array("gains", self.gains, ("p", "m", "n"))
         p, m, n = gains.shape
         A = check_array("A", self.A, ("q", n))
@@ -380,8 +379,6 @@ class PiecewiseAffine(PlantLaw):
         self, entries: NDArray[np.intp], theta_min: Array, theta_max: Array
     ) -> PiecewiseAffine:
         """Return the law of a theta that also holds ``entries``, which it ignores, and its box."""
-        if not len(entries):
-            return self
         at = entries - np.arange(len(entries))
         return replace(
             self,

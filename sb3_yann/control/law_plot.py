@@ -146,13 +146,7 @@ def slices(law: Any, entries: tuple[int, int], at: Array) -> dict[int, Array]:
     The box is clipped by one half-plane after the other (Sutherland and Hodgman, *Communications of
     the ACM* 17, 1974).
     """
-    low = law.theta_min[[*entries]]
-    high = law.theta_max[[*entries]]
-    if not np.all(np.isfinite([low, high])):
-        raise ValueError(
-            f"The law's box is not bounded in entries {list(entries)} of theta: there is no frame "
-            "to draw. Choose others, or solve the problem for a bounded theta_min and theta_max."
-        )
+    low, high = _frame(law, entries)
     fixed = np.array(at, np.float64)
     fixed[[*entries]] = 0.0
     box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
@@ -164,6 +158,18 @@ def slices(law: Any, entries: tuple[int, int], at: Array) -> dict[int, Array]:
         if len(polygon) > 2 and area(polygon) > 1e-9 * float(np.prod(high - low)):
             found[i] = polygon
     return found
+
+
+def _frame(law: Any, entries: Sequence[int]) -> tuple[Array, Array]:
+    """Return the ends of the box of theta in some entries."""
+    low = law.theta_min[[*entries]]
+    high = law.theta_max[[*entries]]
+    if not np.all(np.isfinite([low, high])):
+        raise ValueError(
+            f"The law's box is not bounded in entries {list(entries)} of theta: there is no frame "
+            "to draw. Choose others, or solve the problem for a bounded theta_min and theta_max."
+        )
+    return low, high
 
 
 def area(polygon: Array) -> float:
@@ -194,13 +200,7 @@ def _clipped(polygon: Array, rows: Array, levels: Array) -> Array:
 
 def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axes:
     """Draw the inputs over the only parameter."""
-    (low,) = law.theta_min
-    (high,) = law.theta_max
-    if not np.all(np.isfinite([low, high])):
-        raise ValueError(
-            "The law's box is not bounded: there is no frame to draw. Solve the problem for a "
-            "bounded theta_min and theta_max."
-        )
+    low, high = (float(side[0]) for side in _frame(law, [0]))
     zero = law.units.theta_ss[0]
     inputs = with_units(law.model)[1] if law.model else [f"u[{k}]" for k in range(law.n_inputs)]
     ends = np.unique(np.clip(law.b / law.A[:, 0], low, high)[law.A[:, 0] != 0])

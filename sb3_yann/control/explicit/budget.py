@@ -10,11 +10,6 @@ import numpy as np
 from sb3_yann._progress import bar
 from sb3_yann._validation import check_int, check_positive
 
-_ADVICE = (
-    "Their number grows with the horizon and the bounds: shorten the horizon, leave out bounds "
-    "that hardly matter, make theta_min and theta_max narrower, or raise the limit."
-)
-
 
 class ExplicitLimitError(RuntimeError):
     """The search for the regions of a law ran into ``time_limit`` or ``region_limit``.
@@ -28,15 +23,6 @@ class ExplicitLimitError(RuntimeError):
     def __init__(self, message: str, n_regions: int) -> None:
         super().__init__(message)
         self.n_regions = n_regions
-
-
-def require_few(n_regions: int, region_limit: int | None) -> None:
-    """Raise ExplicitLimitError if a law that is there has too many regions."""
-    if region_limit is not None and n_regions > region_limit:
-        raise ExplicitLimitError(
-            f"The law has {n_regions} regions, more than region_limit = {region_limit}. {_ADVICE}",
-            n_regions,
-        )
 
 
 class BudgetTimer:
@@ -86,10 +72,10 @@ class BudgetTimer:
         self._done = f" {done}"
         self._bar = bar(name, total=steps)
 
-    def advance(self, more: int = 1, effort: float = 0.0) -> None:
-        """Count steps of a stage; raise ExplicitLimitError if the time is over."""
-        self._bar.update(more)
-        self.tick(effort)
+    def advance(self) -> None:
+        """Count a step of a stage; raise ExplicitLimitError if the time is over."""
+        self._bar.update()
+        self.tick()
 
     def tick(self, effort: float = 0.0) -> None:
         """Count effort ahead; raise ExplicitLimitError if it is too much, or time is over."""
@@ -105,7 +91,12 @@ class BudgetTimer:
 
     def _stop(self, what: str) -> NoReturn:
         found = f"{self.found} regions were found in {time.monotonic() - self._start:.1f} s"
-        raise ExplicitLimitError(f"{what}: {found}{self._done}. {_ADVICE}", self.found)
+        raise ExplicitLimitError(
+            f"{what}: {found}{self._done}. Their number grows with the horizon and the bounds: "
+            "shorten the horizon, leave out bounds that hardly matter, make theta_min and "
+            "theta_max narrower, or raise the limit.",
+            self.found,
+        )
 
 
 OF_REGION = 6e-4

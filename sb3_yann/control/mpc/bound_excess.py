@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, Mask
-from sb3_yann.control.linear_system import labels_of, labels_of_outputs
+from sb3_yann._validation import Array, Mask, finite_sizes
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.units import FLOAT32_ROUNDING
 
@@ -42,8 +41,8 @@ class Bounds:
         n = problem.model.n_states
         size = (problem.theta_max - problem.theta_min)[:n] / 2
         # Without a box the size of a bound is the unit: one that is fixed would be hidden.
-        ends = np.abs([problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]])
-        ends = np.max(np.where(np.isfinite(ends), ends, 0.0), axis=0)
+        box = problem.theta_min[:n], problem.theta_max[:n]
+        ends = finite_sizes(problem.x_min, problem.x_max, *box)
         size = np.where(np.isfinite(size) & (size > 0), size, np.where(ends > 0, ends, 1.0))
         C = np.vstack([np.eye(len(size)), outputs.C])
         lowest = np.concatenate([np.maximum(problem.x_min, low), outputs.y_min])
@@ -113,27 +112,24 @@ class BoundNames(NamedTuple):
     @classmethod
     def of(cls, problem: LinearMPC) -> BoundNames:
         """Return those of a problem."""
-        model = problem.model
         bounds = Bounds.of(problem)
-        states, inputs = labels_of(model)
-        units = [*(model.units or [""] * (len(states) + len(inputs)))]
-        of_states = [*zip(states, units, strict=False)]
-        of_inputs = [*zip(inputs, units[len(states) :], strict=False)]
-        outputs = labels_of_outputs(problem.outputs.C, model.state_names)
-        every = [*of_states, *((name, dict(of_states).get(name, "")) for name in outputs)]
-        found = [each for each, used in zip(every, bounds.used, strict=True) if used]
-        found += of_inputs
-        half = [*bounds.half, *problem.u_half]
-        if problem.layout.n_previous:
-            found += [(f"the change of {name} in a step", unit) for name, unit in of_inputs]
-            half += [*problem.u_half]
-        mixed = problem.mixed
-        soft = np.append(bounds.softness > 0, np.zeros(len(half) - len(bounds.half), dtype=bool))
-        soft = np.append(soft, mixed.soft > 0)
-        found += [(f"mixed[{i}]", "") for i in range(len(mixed.F))]
-        half += [*mixed_half(problem)]
-        called, measured = zip(*found, strict=True)
-        return cls(called, measured, tuple(map(float, half)), tuple(soft.tolist()))
+        of = problem.bounded
+        units = dict(zip((*of["x"].names, *of["u"].names), problem.model.units, strict=False))
+        names = np.array([*of["x"].names, *of["y"].names], object)[bounds.used].tolist()
+        inputs = of["u"].names
+        changing = inputs if problem.layout.n_previous else []
+        measured = [*names, *inputs, *changing, *of["mixed"].names]
+        changes = [f"the change of {each} in a step" for each in changing]
+        rates = problem.u_half[: len(changing)]
+        half = np.concatenate([bounds.half, problem.u_half, rates, mixed_half(problem)])
+        hard = np.zeros(len(inputs) + len(changing))
+        soft = np.concatenate([bounds.softness, hard, problem.mixed.soft]) > 0
+        return cls(
+            (*names, *inputs, *changes, *of["mixed"].names),
+            tuple(units.get(each, "") for each in measured),
+            tuple(half.tolist()),
+            tuple(soft.tolist()),
+        )
 
     def in_words(self, worst: float, largest: float) -> str:
         """Return which bound is exceeded most, and by how much in its unit; empty for none."""

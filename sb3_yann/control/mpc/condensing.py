@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -12,7 +11,6 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.linear_system import labels_of, labels_of_outputs
 from sb3_yann.control.mpc.problem import MPCProblem
 
 GROWTH = 1e3
@@ -25,7 +23,7 @@ OFF = 1e-8
 
 
 class _Prediction:
-    """``theta_k = powers[k] theta + forced[k] V`` for k = 0 ... N.
+    """``[theta_k; u_k] = forced V + free theta`` for k = 0 ... N, where no input is at the end.
 
     The input of a block that begins at step s is ``u = K theta_s + v``. ``feedback`` is K
     (m, n_theta). Without any the variables V are the inputs.
@@ -33,79 +31,27 @@ class _Prediction:
 
     def __init__(self, problem: MPCProblem, feedback: Array | None) -> None:
         A, B = problem.prediction
-        n = problem.n_theta
-        m = problem.model.n_inputs
+        n, m = B.shape
         K = np.zeros((m, n)) if feedback is None else feedback
-        self.powers: list[Array] = [np.eye(n)]
-        self.forced: list[Array] = [np.zeros((n, len(problem.blocks) * m))]
-        self.inputs: list[tuple[Array, Array]] = []  # rows of V and theta that make up u_k
-        self.previous = problem.layout.previous
+        forced: Array = np.zeros((n, len(problem.blocks) * m))
+        free: Array = np.eye(n)
+        self.steps: list[tuple[Array, Array]] = []
         for block, length in enumerate(problem.blocks):
-            rows = K @ self.forced[-1]
-            rows[:, block * m : (block + 1) * m] += np.eye(m)
-            held = rows, K @ self.powers[-1]
+            held = K @ forced
+            held[:, block * m : (block + 1) * m] += np.eye(m)
+            start = K @ free
             for _ in range(length):
-                self.inputs.append(held)
-                self.powers.append(A @ self.powers[-1] + B @ held[1])
-                self.forced.append(A @ self.forced[-1] + B @ held[0])
+                self.steps.append((np.vstack([forced, held]), np.vstack([free, start])))
+                forced = A @ forced + B @ held
+                free = A @ free + B @ start
+        self.steps.append((np.vstack([forced, 0 * held]), np.vstack([free, 0 * start])))
         self.starts = np.cumsum((0, *problem.blocks[:-1]))
 
     def of(self, rows: Array, k: int) -> tuple[Array, Array]:
-        """Return what makes up ``rows theta_k``."""
-        return rows @ self.forced[k], rows @ self.powers[k]
-
-    def rate(self, k: int) -> tuple[Array, Array]:
-        """Return what makes up ``u_k - u_{k-1}``."""
-        inputs, start = self.inputs[k]
-        return inputs - self.forced[k][self.previous], start - self.powers[k][self.previous]
-
-
-Limits = tuple[Array, Array, Array, Array]
-
-
-class _Rows:
-    """Collects constraints ``G U - unit slack <= w + S theta`` with a name for each."""
-
-    def __init__(self, slacks: Sequence[str]) -> None:
-        self.slacks = list(slacks)
-        self.parts: list[tuple[Array, Array, Array]] = []
-        self.names: list[str] = []
-
-    def add(
-        self,
-        names: str | Sequence[str],
-        G: Array,
-        w: Array,
-        S: Array,
-        softness: Array | None = None,
-        kind: str = "",
-    ) -> None:
-        """Add rows, of one name or with a name for each."""
-        soft = np.zeros((len(w), len(self.slacks)))
-        if kind in self.slacks and softness is not None:
-            soft[:, self.slacks.index(kind)] = -softness
-        self.parts.append((np.hstack([G, soft]), w, S))
-        self.names += [names] * len(w) if isinstance(names, str) else names
-
-    def add_bounds(
-        self, names: Sequence[str], made: tuple[Array, Array], limits: Limits, *softness: Any
-    ) -> None:
-        """Add rows for ``low <= G U + S theta <= high``, with a name for each.
-
-        Limits are low and high, and how these change with theta.
-        """
-        upper, lower = ([f"{name} at its {k} bound" for name in names] for k in ("upper", "lower"))
-        (G, S) = made
-        (low, high, low_moves, high_moves) = limits
-        self.add(upper, G, high, high_moves - S, *softness)
-        self.add(lower, -G, -low, S - low_moves, *softness)
-
-    def stacked(self) -> tuple[Array, Array, Array, tuple[str, ...]]:
-        """Return G, w, S and the names of the rows that bound something."""
-        G, w, S = (np.concatenate(each) for each in zip(*self.parts, strict=True))
-        bounded = np.isfinite(w)
-        names = tuple(name for name, keep in zip(self.names, bounded, strict=True) if keep)
-        return G[bounded], w[bounded], S[bounded], names
+        """Return what makes up ``rows [theta_k; u_k]``."""
+        used = np.any(rows, axis=0)
+        forced, free = self.steps[k]
+        return rows[:, used] @ forced[used], rows[:, used] @ free[used]
 
 
 def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
@@ -175,23 +121,15 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     """
     errors = problem.settled.error_system
     gamma = problem.gamma
-    A = errors.model.A
-    B = errors.model.B
+    n, m = errors.model.B.shape
+    step = np.block([[errors.model.A, errors.model.B], [np.zeros((m, n)), np.eye(m)]])
     P = problem.terminal.cost
-    cross = np.zeros(B.shape) if errors.cross is None else errors.cross
+    cross = np.zeros((n, m)) if errors.cross is None else errors.cross
     weight = np.block([[errors.Q, cross], [cross.T, errors.R]])
     count = len(program.c) - program.n_slacks
-    m = problem.model.n_inputs
     try:
         for length in reversed(problem.blocks):
-            if length > 1:
-                gain, P = _held(A, B, weight, P, gamma, length)
-                continue
-            gain = lqr.gain(errors.model, errors.R, P, gamma, errors.cross)
-            # As a sum of squares: of a large terminal cost a difference would leave rounding.
-            law = np.vstack([np.eye(len(A)), -gain])
-            closed = A - B @ gain
-            P = law.T @ weight @ law + gamma * closed.T @ P @ closed
+            gain, P = _held(step, weight, P, gamma, length)
         factor = linalg.cho_factor(program.H[:count, :count])
     except (np.linalg.LinAlgError, ValueError):  # not definite, or numbers that overflow
         return np.nan
@@ -205,30 +143,31 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     return float(np.nan_to_num(np.abs(own - exact) * unit, nan=np.inf).max()) / largest
 
 
-def _held(
-    A: Array, B: Array, weight: Array, P: Array, gamma: float, length: int
-) -> tuple[Array, Array]:
+def _held(step: Array, weight: Array, P: Array, gamma: float, length: int) -> tuple[Array, Array]:
     """Return the gain of an input that is held for a block, and the cost with it.
 
-    The stage cost is ``[z; v]' weight [z; v]``, that at the end ``z' P z``.
+    ``[z; v]`` takes a ``step`` and costs ``[z; v]' weight [z; v]``, at the end ``z' P z``.
     """
-    n, m = B.shape
-    step = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])
-    total = linalg.block_diag(P, np.zeros((m, m)))
-    for _ in range(length):
+    n = len(P)
+    total = weight + gamma * step[:n].T @ P @ step[:n]
+    for _ in range(length - 1):
         total = weight + gamma * step.T @ total @ step
     gain = linalg.cho_solve(linalg.cho_factor(total[n:, n:]), total[n:, :n])
+    # As a sum of squares: of a large terminal cost a difference would leave rounding.
     law = np.vstack([np.eye(n), -gain])
-    return gain, law.T @ total @ law
+    cost = np.zeros((n, n))
+    for k in range(length):
+        cost = cost + gamma**k * law.T @ weight @ law
+        law = step @ law
+    return gain, cost + gamma**length * law[:n].T @ P @ law[:n]
 
 
 def _condensed(problem: MPCProblem, feedback: Array | None) -> tuple[ParametricQP, tuple[str, ...]]:
     """Return the program in ``v = u - feedback theta`` of each block, and what each row bounds."""
     prediction = _Prediction(problem, feedback)
-    softness = {"x": problem.soft.x, "y": problem.soft.y, "mixed": problem.mixed.soft}
-    slacks = [kind for kind, units in softness.items() if np.any(units)]
+    slacks = [kind for kind in ("x", "y", "mixed") if np.any(problem.bounded[kind].softness)]
     H, F, c = _cost(problem, prediction)
-    G, w, S, names = _constraints(problem, prediction, slacks, softness)
+    G, w, S, names = _constraints(problem, prediction, slacks)
     penalty = np.full(len(slacks), problem.soft.penalty)
     H = (H + H.T) / 2
     c = np.concatenate([c, penalty])
@@ -246,83 +185,71 @@ def _condensed(problem: MPCProblem, feedback: Array | None) -> tuple[ParametricQ
 def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array, Array]:
     """Return H, F and c of ``1/2 V'HV + (F theta + c)'V``, whence the factors 2."""
     N = problem.horizon
-    gamma = problem.gamma
     steady = problem.steady_states
     layout = problem.layout
     settled = problem.settled
-    every = np.eye(problem.n_theta)
-    state = every[layout.state]
-    to_input = steady.u @ every[layout.now]
-    states = state - steady.x @ every[layout.now]
-    to_error = settled.error_system.to_error @ every[layout.settles]
-    price = problem.price
-    size = len(problem.blocks) * problem.model.n_inputs
+    theta, u = np.split(np.eye(problem.n_theta + problem.model.n_inputs), [problem.n_theta])
+    now = theta[layout.now]
+    terms = [(u - steady.u @ now, problem.R, k) for k in range(N)]
+    terms += [(theta[layout.state] - steady.x @ now, problem.Q, k) for k in range(1, N)]
+    at_end = settled.error_system.to_error @ theta[layout.settles]
+    terms.append((at_end, problem.terminal.cost, N))
+    if np.any(problem.rate.R_du):
+        terms += [(problem.bounded["du"].rows, problem.rate.R_du, k) for k in prediction.starts]
+    size = len(problem.blocks) * len(u)
     H: Array = np.zeros((size, size))
     F: Array = np.zeros((size, problem.n_theta))
     c: Array = np.zeros(size)
-    for k in range(N):
-        inputs, start = prediction.inputs[k]
-        weighted = 2 * gamma**k * inputs.T @ problem.R
-        H = H + weighted @ inputs
-        F = F + weighted @ (start - to_input @ prediction.powers[k])
-    for k in range(1, N + 1):
-        weight = gamma**k * (problem.terminal.cost if k == N else problem.Q)
-        forced, free = prediction.of(to_error if k == N else states, k)
-        weighted = 2 * forced.T @ weight
+    for rows, weight, k in terms:
+        forced, free = prediction.of(rows, k)
+        weighted = 2 * forced.T @ (problem.gamma**k * weight)
         H = H + weighted @ forced
         F = F + weighted @ free
-    for k in prediction.starts if np.any(problem.rate.R_du) else ():
-        inputs, start = prediction.rate(k)
-        weighted = 2 * gamma**k * inputs.T @ problem.rate.R_du
-        H = H + weighted @ inputs
-        F = F + weighted @ start
-    for k in range(N) if price.counts else ():
-        spent = price.u @ prediction.inputs[k][0] + price.x @ (state @ prediction.forced[k])
-        c = c + gamma**k * spent
+    for k in range(N) if problem.price.counts else ():
+        c = c + problem.gamma**k * prediction.of(problem.stage_slope[None], k)[0][0]
     return H, F, c
 
 
 def _constraints(
-    problem: MPCProblem, prediction: _Prediction, slacks: list[str], softness: dict[str, Array]
+    problem: MPCProblem, prediction: _Prediction, slacks: list[str]
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
+    """Return ``G V - unit slack <= w + S theta``, and what each row bounds."""
     N = problem.horizon
-    blocks = len(problem.blocks)
-    rows = _Rows(slacks)
-    called, inputs = labels_of(problem.model)
     limits = {kind: problem.limit_rows(kind) for kind in problem.limits}
-    first = zip(*(prediction.inputs[k] for k in prediction.starts), strict=True)
-    moved, free = (np.vstack(each) for each in first)
-    low, high, low_moves, high_moves = limits["u"]
-    of_blocks = np.tile(low, blocks), np.tile(high, blocks)
-    moving = np.tile(low_moves, (blocks, 1)), np.tile(high_moves, (blocks, 1))
-    rows.add_bounds(inputs * blocks, (moved, free), (*of_blocks, *moving))
+    parts: list[tuple[Array, Array, Array]] = []
+    names: list[str] = []
 
-    state = np.eye(problem.n_theta)[problem.layout.state]
+    def add(kind: str, *steps: int, used: Any = slice(None)) -> None:
+        """Add the upper bounds of a kind at some steps, then the lower ones."""
+        rows, softness, called = problem.bounded[kind]
+        made = [prediction.of(rows[used], k) for k in steps]
+        G, S = (np.concatenate(each) for each in zip(*made, strict=True))
+        low, high, L, H = (np.concatenate([each[used]] * len(steps)) for each in limits[kind])
+        soft = np.tile(softness[used], len(steps))[:, None] * [kind == each for each in slacks]
+        parts.append((np.hstack([G, 0 - soft]), high, H - S))
+        parts.append((np.hstack([-G, 0 - soft]), -low, S - L))
+        chosen = np.tile(np.array(called, object)[used], len(steps))
+        names.extend(f"{name} at its {k} bound" for k in ("upper", "lower") for name in chosen)
+
+    add("u", *prediction.starts)
     for k in range(1, N + 1):
-        rows.add_bounds(called, prediction.of(state, k), limits["x"], softness["x"], "x")
+        add("x", k)
     last, upper = problem.terminal.set
-    G, S = prediction.of(last, N)
-    rows.add("the terminal set", G, upper, -S)
+    inputs = problem.model.n_inputs
+    G, S = prediction.of(np.pad(last, ((0, 0), (0, inputs))), N)
+    parts.append((np.pad(G, ((0, 0), (0, len(slacks)))), upper, -S))
+    names += ["the terminal set"] * len(upper)
     for k in prediction.starts if problem.layout.n_previous else ():
-        rows.add_bounds(
-            [f"the rate of {each}" for each in inputs], prediction.rate(k), limits["du"]
-        )
-    C = problem.outputs.C @ state
-    for k in range(1, N + 1) if len(C) else ():
-        outputs = labels_of_outputs(problem.outputs.C, problem.model.state_names)
-        rows.add_bounds(outputs, prediction.of(C, k), limits["y"], softness["y"], "y")
-    mixed = problem.mixed
-    for k, used in mixed.at_steps(N) if len(mixed.F) else ():
-        G, S = prediction.of((mixed.F @ state)[used], k)
-        if k < N:
-            inputs_k, start = prediction.inputs[k]
-            G = G + mixed.G[used] @ inputs_k
-            S = S + mixed.G[used] @ start
-        names = [f"mixed[{i}]" for i in np.flatnonzero(used)]
-        low, high, low_moves, high_moves = (each[used] for each in limits["mixed"])
-        own = low, high, low_moves, high_moves
-        rows.add_bounds(names, (G, S), own, softness["mixed"][used], "mixed")
-    for kind in slacks:
-        none = np.zeros((1, moved.shape[1])), np.zeros(1), np.zeros((1, problem.n_theta))
-        rows.add(f"no violation of the soft bounds of {kind}", *none, np.ones(1), kind)
-    return rows.stacked()
+        add("du", k)
+    for k in range(1, N + 1) if len(problem.outputs.C) else ():
+        add("y", k)
+    acting = np.any(problem.mixed.G, axis=1)
+    for k in range(N + 1) if len(acting) else ():
+        add("mixed", k, used={0: acting, N: ~acting}.get(k, slice(None)))
+    none = np.zeros((len(slacks), G.shape[1])), np.zeros((len(slacks), problem.n_theta))
+    parts.append((np.hstack([none[0], 0 - np.eye(len(slacks))]), np.zeros(len(slacks)), none[1]))
+    names += [f"no violation of the soft bounds of {kind}" for kind in slacks]
+    G, w, S = (np.concatenate(each) for each in zip(*parts, strict=True))
+    bounded = np.isfinite(w)
+    kept = tuple(names[i] for i in np.flatnonzero(bounded))
+    return G[bounded], w[bounded], S[bounded], kept

@@ -155,12 +155,18 @@ class ThetaLayout:
 
         ``r_2`` is the reference two samples ahead.
         """
-        parts = [("x", range(self.n_states))]
-        for name, (_, count, ahead) in zip("rd", self._known_ahead, strict=True):
-            parts += [(f"{name}_{k}" if k else name, range(count)) for k in range(ahead + 1)]
-        parts.append(("d", range(self._loads, self.n_disturbances)))
-        found = [f"{name}[{i}]" for name, numbers in parts for i in numbers]
-        return (*found, *self.bounds, *(f"u_prev[{i}]" for i in range(self.n_previous)))
+        return tuple(f"{kind}{f'_{ahead}' * (ahead > 0)}[{i}]" for kind, i, ahead in self.entries)
+
+    @property
+    def entries(self) -> list[tuple[str, int, int]]:
+        """What each entry is, such as x, r, d, u_max, u_prev; its number; and how far ahead."""
+        found = [("x", i, 0) for i in range(self.n_states)]
+        for kind, (_, count, known) in zip("rd", self._known_ahead, strict=True):
+            found += [(kind, i, k) for k in range(known + 1) for i in range(count)]
+        found += [("d", i, 0) for i in range(self._loads, self.n_disturbances)]
+        bounds = (name[:-1].split("[") for name in self.bounds)
+        found += [(side, int(i), 0) for side, i in bounds]
+        return found + [("u_prev", i, 0) for i in range(self.n_previous)]
 
 
 def _after(part: slice, size: int) -> slice:
@@ -209,8 +215,6 @@ def steady_states(
     some reference or disturbance has no steady state, whatever the bounds.
     """
     n, m = model.B.shape
-    if len(C) + model.n_disturbances == 0:
-        return SteadyStates(np.zeros((n, 0)), np.zeros((m, 0)))
     unit = np.concatenate([x_unit, u_unit])
     equations = np.block([[model.A - np.eye(n), model.B], [C, np.zeros((len(C), m))]]) * unit
     row_unit = np.concatenate([x_unit, np.linalg.norm(equations[n:], axis=1)])

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sb3_yann import _validation as check
 from sb3_yann._validation import (
@@ -346,12 +346,6 @@ class MixedBounds(ReadOnlyArrays):
             raise ValueError(f"Row {k} of MixedBounds has no bound: pass low or high, or both.")
         units = _softness("MixedBounds.soft", self.soft, (low, high)) if count else self.soft
         return MixedBounds(F, G, low, high, np.ravel(units)[:count])
-
-    def at_steps(self, horizon: int) -> list[tuple[int, NDArray[np.bool_]]]:
-        """Return which rows (k,) hold at which step, 0 ... N."""
-        acting = np.any(self.G, axis=1)
-        masks = {0: acting, horizon: ~acting}
-        return [(k, masks.get(k, np.ones_like(acting))) for k in range(horizon + 1)]
 
 
 @dataclass(frozen=True, eq=False, init=False)

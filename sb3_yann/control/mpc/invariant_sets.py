@@ -37,10 +37,9 @@ def completed(problem: MPCProblem) -> Terminal:
         except ValueError:
             _require_weighted_inputs(problem)
             raise
-    elif len(cost) != len(errors.Q):
-        check_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
-    if np.shape(cost) == np.shape(errors.Q):
-        _require_weighted_inputs(problem, cost)
+    else:
+        check_array("Terminal.cost", cost, errors.Q.shape)
+    _require_weighted_inputs(problem, cost)
     if isinstance(half_spaces, str):
         F, g = invariant_set(problem.deviations.settled, cost)
         F = F @ np.eye(problem.n_theta)[problem.layout.settles]
@@ -114,27 +113,20 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Facets:
     moving = np.any(np.abs(steady) > 1e-12, axis=1)
     inside = steady[moving], (1 - STEADY_MARGIN) * bounds[moving]
     found = _reduced(_joined((rows, bounds), inside), box)
-    assert found is not None  # the origin lies inside of all
-    F, g = _until_nothing_new((rows, bounds), closed, found, box)
-    return F / half, g + F @ (rest / half)
-
-
-def _until_nothing_new(ahead: Facets, closed: Array, found: Facets, box: Facets) -> Facets:
-    """Add the bounds of later steps until those of one step say nothing new."""
-    later, bounds = ahead
-    for _ in range(MAX_STEPS):
-        later = later @ closed
-        new = _exceeded(found, (later, bounds), box) > 1e-9 * np.linalg.norm(later, axis=1)
-        if not np.any(new):
-            return found
-        more = _reduced(_joined(found, (later[new], bounds[new])), box)
-        assert more is not None
-        found = more
-        if len(found[1]) > MAX_FACETS:
+    later = rows
+    for step in range(MAX_STEPS):  # until the bounds of a later step say nothing new
+        assert found is not None  # the origin lies inside of all
+        if step and len(found[1]) > MAX_FACETS:
             raise ValueError(
                 f"The invariant terminal set has more than {MAX_FACETS} half-spaces. Give the "
                 "state more weight, sample more slowly, or pass a terminal set of your own."
             )
+        later = later @ closed
+        new = _exceeded(found, (later, bounds), box) > 1e-9 * np.linalg.norm(later, axis=1)
+        if not np.any(new):
+            F, g = found
+            return F / half, g + F @ (rest / half)
+        found = _reduced(_joined(found, (later[new], bounds[new])), box)
     raise ValueError(
         f"The invariant terminal set is not determined after {MAX_STEPS} steps: the closed loop "
         "of the terminal gain is too slow. Give the state more weight, or sample more slowly."
@@ -148,21 +140,13 @@ def hard_rows(
 
     They are of one sample. Bounds that change at run time are entries of theta.
     """
-    n = problem.n_theta
-    m = problem.model.n_inputs
-    theta, u = np.split(np.eye(n + m), [n])
-    x = theta[problem.layout.state]
-    mixed = problem.mixed
-    values = {"u": u, "x": x, "y": problem.outputs.C @ x, "mixed": mixed.F @ x + mixed.G @ u}
-    if problem.layout.n_previous:
-        values["du"] = u - theta[problem.layout.previous]
-    softness = {"x": problem.soft.x, "y": problem.soft.y, "mixed": mixed.soft}
-    rows = [np.zeros((0, n + m))]
+    theta = np.eye(problem.n_theta, problem.n_theta + problem.model.n_inputs)
+    rows = [theta[:0]]
     ends = [np.zeros(0)]
     for kind in kinds:
-        if kind in values:
-            value = values[kind]
-            hard = softness.get(kind, np.zeros(len(value))) == 0
+        if kind in problem.bounded:
+            value, softness, _ = problem.bounded[kind]
+            hard = softness == 0
             low, high, L, H = problem.limit_rows(kind)
             rows += [(value - H @ theta)[hard], (L @ theta - value)[hard]]
             ends += [high[hard], -low[hard]]
@@ -214,9 +198,10 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     n = len(half)
     unit = np.concatenate([half, u_half])
     box = _around(problem, half)
-    inputs = _scaled(hard_rows(problem, ("u", "du", "mixed")), unit)
-    bounds = _scaled(hard_rows(problem, ("x", "y")), unit)
-    bounds = bounds[0][:, :n], bounds[1]
+    of_inputs, ends_of_inputs = hard_rows(problem, ("u", "du", "mixed"))
+    inputs = of_inputs * unit, ends_of_inputs
+    of_states, ends_of_states = hard_rows(problem, ("x", "y"))
+    bounds = of_states[:, :n] * half, ends_of_states
 
     def before(rows: Facets, room: float = 0.0) -> Facets | None:
         F, g = rows
@@ -266,10 +251,6 @@ def _around(problem: MPCProblem, half: Array, unbounded: float = 1.0) -> Facets:
     reach = far * (high - low) / 2
     eye = np.eye(len(half))
     return np.vstack([eye, -eye]), np.concatenate([middle + reach, reach - middle])
-
-
-def _scaled(rows: Facets, unit: Array) -> Facets:
-    return rows[0] * unit, rows[1]
 
 
 def _joined(*parts: Facets) -> Facets:

@@ -19,10 +19,11 @@ from sb3_yann._validation import (
     check_array,
     check_bounds,
     check_symmetric,
+    finite_sizes,
     to_float,
     warn,
 )
-from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, require_few
+from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
@@ -187,7 +188,8 @@ class LinearMPC(MPCProblem):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         n = model.n_states
         m = model.n_inputs
-        horizon = _as_horizon(horizon)
+        check.check_type("horizon", horizon, (int, np.integer), "a whole number of steps")
+        horizon = check.check_int("horizon", horizon)
         gamma = check.check_discount(gamma)
         infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE_OPTIONS)
         Q = check_symmetric("Q", Q, n)
@@ -444,8 +446,11 @@ class LinearMPC(MPCProblem):
                 program = self.condensed().without(self.extra)
                 law = solve_explicit(program, *limits, self.infeasible, solver, timer)
             self._laws[solver] = self._widened(law)
-        require_few(self._laws[solver].n_regions, region_limit)
-        return self._laws[solver]
+        law = self._laws[solver]
+        if region_limit is not None and law.n_regions > region_limit:  # it was there
+            with BudgetTimer(region_limit=region_limit) as timer:
+                timer.count(law.n_regions)
+        return law
 
     def _widened(self, law: PiecewiseAffine) -> PiecewiseAffine:
         """Return a law of theta without extra signals as one of theta, on its plant."""
@@ -477,30 +482,26 @@ class LinearMPC(MPCProblem):
         if kind == "explicit":
             return self.explicit()
         if kind == "auto" and ONLINE_CHOSEN not in vars(self):
-            found = self._found_soon()
-            if isinstance(found, PiecewiseAffine):
-                return found
+            rows, n = self.condensed().S.shape
+            why = f"It has {rows} constraints on {n} parameters, too many to look for regions."
+            if rows * n <= LARGE:
+                try:
+                    return self._solved(region_limit=REGIONS, effort_limit=EFFORT)
+                except ExplicitLimitError as error:
+                    why = (
+                        f"{error} Or call problem.explicit() before, which has no limit by default."
+                    )
+                except ExplicitSolutionError as error:
+                    why = str(error)
             warn(
                 "The program will be solved online, at each point. It is the same law, and "
-                f"policies train on it as well. {found} To skip the search, and this warning, "
+                f"policies train on it as well. {why} To skip the search, and this warning, "
                 "choose problem.law('online'), or law='online' of a policy. An online law is "
                 "exported as C, FMU or npz, not as Structured Text or ONNX.",
                 OnlineLawWarning,
             )
         vars(self)[ONLINE_CHOSEN] = True
         return self.online()
-
-    def _found_soon(self) -> PiecewiseAffine | str:
-        """Return the explicit law if it is found within a small budget, else why it is not."""
-        rows, n = self.condensed().S.shape
-        if rows * n > LARGE:
-            return f"It has {rows} constraints on {n} parameters, too many to look for regions."
-        try:
-            return self._solved(region_limit=REGIONS, effort_limit=EFFORT)
-        except ExplicitLimitError as error:
-            return f"{error} Or call problem.explicit() before, which has no limit by default."
-        except ExplicitSolutionError as error:
-            return str(error)
 
     @cached_property
     def _online(self) -> OnlineLaw:
@@ -534,13 +535,6 @@ class LinearMPC(MPCProblem):
         check.check_int("samples", samples)
         check.check_int("seed", seed, 0)
         return report(self, self.law(), self.online(), samples, seed)
-
-
-def _as_horizon(value: int) -> int:
-    """Return the number of predicted steps, a whole number of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"horizon = {value!r} must be a whole number of steps.")
-    return check.check_int("horizon", value)
 
 
 def _as_control_horizon(
@@ -674,21 +668,18 @@ def _warn_of_misread_bounds(problem: MPCProblem) -> None:
         cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
     if has_constants:
         cure = "Have they the same units?"
-    for i in np.flatnonzero(left_out["u"]):
-        low, high, point = (each[i] for each in ranges["u"])
-        warn(
-            f"u_min = {low:g} and u_max = {high:g} leave out {labels_of(model)[1][i]} = {point:g}, "
-            f"the operating point: the law cannot rest there. {cure}"
-        )
-    if has_constants:
-        return
-    for i in np.flatnonzero(has_point & (left_out["x"] | left_out["theta"])):
-        low, high, point = (each[i] for each in ranges["x" if left_out["x"][i] else "theta"])
-        warn(
-            f"{labels_of(model)[0][i]} = {point:g}, the operating point, lies outside its "
-            f"bounds, {low:g} to {high:g}: the law cannot rest there. Look at the "
-            "order of the states."
-        )
+    names, inputs = labels_of(model)
+    asked = [("u", inputs, cure)]
+    if has_point and not has_constants:
+        left_out["theta"] &= ~left_out["x"]  # said once
+        asked += [(each, names, "Look at the order of the states.") for each in ("x", "theta")]
+    for name, called, cure in asked:
+        for i in np.flatnonzero(left_out[name]):
+            low, high, point = (each[i] for each in ranges[name])
+            warn(
+                f"{name}_min = {low:g} and {name}_max = {high:g} leave out {called[i]} = "
+                f"{point:g}, the operating point: the law cannot rest there. {cure}"
+            )
 
 
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
@@ -704,16 +695,11 @@ def _choose_penalty(problem: MPCProblem) -> None:
     of a unit in that cost, which multipliers are like.
     """
     n = problem.model.n_states
-    given = [problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]]
-    sizes = np.abs([np.where(np.isfinite(each), each, 0.0) for each in given])
-    x = np.where(np.any(sizes[:2] > 0, axis=0), sizes[:2].max(axis=0), sizes.max(axis=0))
-    limits = np.abs([problem.u_min, problem.u_max])
-    u = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
+    x, u, y, mixed = (finite_sizes(*problem.limits[kind]) for kind in ("x", "u", "y", "mixed"))
+    x = np.where(x > 0, x, finite_sizes(problem.theta_min[:n], problem.theta_max[:n]))
     terminal = problem.terminal.cost[:n, :n]
     total = x @ (np.abs(problem.Q) + np.abs(terminal)) @ x + u @ np.abs(problem.R) @ u
     total += problem.horizon * (np.abs(problem.price.x) @ x + np.abs(problem.price.u) @ u)
-    sides = [np.abs(problem.limits[kind]) for kind in ("y", "mixed")]
-    y, mixed = (np.where(np.isfinite(each), each, 0.0).max(axis=0) for each in sides)
     units = [(problem.soft.x, x), (problem.soft.y, y), (problem.mixed.soft, mixed)]
     parts = [unit[size > 0] / size[size > 0] for unit, size in units]
     wide = max(float(part.max(initial=0.0)) for part in parts)

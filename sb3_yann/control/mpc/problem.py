@@ -12,7 +12,7 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, Given, ReadOnlyArrays, check_array, half_widths, to_float
 from sb3_yann.control import lqr
-from sb3_yann.control.linear_system import with_units
+from sb3_yann.control.linear_system import labels_of, labels_of_outputs, with_units
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.coordinates import (
     ErrorSystem,
@@ -38,6 +38,17 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from sb3_yann.control.online import Law
+
+
+class Bounded(NamedTuple):
+    """What bounds of one kind are of: rows (k, n_theta + m) of ``[theta; u]``, and their names.
+
+    ``softness`` (k,) is the violation that counts as one unit, 0 where a bound is hard.
+    """
+
+    rows: Array
+    softness: Array
+    names: list[str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -148,6 +159,27 @@ class MPCProblem(ReadOnlyArrays):
             "mixed": (self.mixed.low, self.mixed.high),
         }
 
+    @cached_property
+    def bounded(self) -> dict[str, Bounded]:
+        """What is bounded, by kind as in :attr:`limits`; rates where theta holds the last input."""
+        theta, u = np.split(np.eye(self.n_theta + self.model.n_inputs), [self.n_theta])
+        x = theta[self.layout.state]
+        C = self.outputs.C
+        mixed = self.mixed
+        states, inputs = labels_of(self.model)
+        hard = np.zeros(len(u))
+        combined = [f"mixed[{i}]" for i in range(len(mixed.F))]
+        found = {
+            "u": Bounded(u, hard, inputs),
+            "x": Bounded(x, self.soft.x, states),
+            "y": Bounded(C @ x, self.soft.y, labels_of_outputs(C, self.model.state_names)),
+            "mixed": Bounded(mixed.F @ x + mixed.G @ u, mixed.soft, combined),
+        }
+        if self.layout.n_previous:
+            rates = [f"the rate of {each}" for each in inputs]
+            found["du"] = Bounded(u - theta[self.layout.previous], hard, rates)
+        return found
+
     def limit_rows(self, kind: str) -> tuple[Array, Array, Array, Array]:
         """Return low, high (k,) and L, H (k, n_theta) of ``low + L theta`` and ``high + H theta``.
 
@@ -252,21 +284,19 @@ class MPCProblem(ReadOnlyArrays):
         A set-point is called after the state that it is for. Units stand in parentheses.
         """
         model = self.model
-        found = list(self.layout.names)
-        later = ["", *(f", {k} sample{'s' * (k > 1)} ahead" for k in range(1, self.horizon + 1))]
         states, inputs, loads = with_units(model, units)
-        if model.state_names or (units and model.units):
-            found[self.layout.state] = states
-            p = self.layout.n_references
-            for state, at in self.set_points.items():
-                for k in range(self.layout.previews[0] + 1):
-                    found[at + k * p] = f"set-point of {states[state]}{later[k]}"
-        for i, name in enumerate(loads[: len(model.disturbance_names)]):
-            own = {f"d_{k}[{i}]" if k else f"d[{i}]": name + each for k, each in enumerate(later)}
-            found = [own.get(each, each) for each in found]
-        if model.input_names or (units and model.units):
-            previous = inputs[: self.layout.n_previous]
-            found[self.layout.previous] = [f"previous {each}" for each in previous]
+        has_units = bool(units and model.units)
+        called = {("x", i): each for i, each in enumerate(states)}
+        called |= {("d", i): loads[i] for i in range(len(model.disturbance_names))}
+        if model.state_names or has_units:
+            rows = ((i, at - model.n_states) for i, at in self.set_points.items())
+            called |= {("r", row): f"set-point of {states[i]}" for i, row in rows}
+        if model.input_names or has_units:
+            called |= {("u_prev", i): f"previous {each}" for i, each in enumerate(inputs)}
+        found = []
+        for name, (kind, i, ahead) in zip(self.layout.names, self.layout.entries, strict=True):
+            later = f", {ahead} sample{'s' * (ahead > 1)} ahead" if ahead else ""
+            found.append(called[kind, i] + later if (kind, i) in called else name)
         return tuple(found)
 
     def shown_as_deviation(self, shown: ArrayLike) -> str:
@@ -362,13 +392,10 @@ class MPCProblem(ReadOnlyArrays):
         x = self.units.to_plant(self.steady_states.x @ constant)
         u = self.units.input_to_plant(self.steady_states.u @ constant)
         if np.any(room < 0):
-            sizes = {kind: len(self.limits[kind][0]) for kind in BOUNDED_KINDS}
-            names = [(name, f"[{i}]") for name, size in sizes.items() for i in range(size)]
-            sides = [
-                f"{a}{i} {side} {a}_{end}{i}"
-                for side, end in ((">", "max"), ("<", "min"))
-                for a, i in names
-            ]
+            kinds = [(kind, len(self.limits[kind][0])) for kind in BOUNDED_KINDS]
+            entries = [(kind, i) for kind, size in kinds for i in range(size)]
+            sides = [f"{kind}[{i}] > {kind}_max[{i}]" for kind, i in entries]
+            sides += [f"{kind}[{i}] < {kind}_min[{i}]" for kind, i in entries]
             broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
             p = len(self.tracking.C)
             shown = constant + self.theta_ss[self.layout.now]
@@ -436,10 +463,11 @@ def margins(problem: MPCProblem, r: Given, d: Given, thetas: Array | None = None
     x = constant @ problem.steady_states.x.T
     u = constant @ problem.steady_states.u.T
     own = problem.deviations
-    values = x, u, x @ own.outputs.C.T, x @ own.mixed.F.T + u @ own.mixed.G.T
     below: list[Array] = []
     above: list[Array] = []
-    for kind, value in zip(BOUNDED_KINDS, values, strict=True):
+    for kind in BOUNDED_KINDS:
+        rows = own.bounded[kind].rows
+        value = x @ rows[:, own.layout.state].T + u @ rows[:, own.n_theta :].T
         low, high = own.limits[kind] if thetas is None else own.limits_at(kind, thetas)
         below.append(high - value + TOLERANCE * np.where(np.isfinite(high), np.abs(high), 0.0))
         above.append(value - low + TOLERANCE * np.where(np.isfinite(low), np.abs(low), 0.0))

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_yann._progress import bar
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
-from sb3_yann.control.linear_system import labels_of, labels_of_outputs
+from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.problem import MPCProblem, margins
 from sb3_yann.control.online import Law, OnlineLaw
@@ -48,21 +48,18 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
     how = "in plant units; the operating point is in brackets" if rests else "in theta"
     yield f"Parameters of the law, {problem.n_theta}, {how}:"
     labels = problem.labels(units=True)
-    names = problem.layout.names
     width = max(10, *map(len, labels))
     low = problem.theta_min
     high = problem.theta_max
     shown = [f"[{each:.4g}]" if rests else "" for each in points]
     room = max(10, *(len(each) + 1 for each in shown)) if rests else 0
-    for i, (label, name) in enumerate(zip(labels, names, strict=True)):
-        kind, index = name[:-1].split("[")
-        kind, _, ahead = (kind, "", "") if kind in meanings else kind.partition("_")
-        what = meanings.get(kind if ahead.isdigit() or not ahead else "", BOUND)
-        meaning = f"{shown[i]:<{room}}{what.format(index)}"
-        if ahead.isdigit():
-            meaning += f", {ahead} sample{'s' * (ahead != '1')} ahead"
-        is_estimated = kind == "d" and int(index) in problem.model.estimated
-        if kind in previews and (is_estimated or int(ahead or 0) == previews[kind]):
+    entries = zip(labels, problem.layout.entries, strict=True)
+    for i, (label, (kind, index, ahead)) in enumerate(entries):
+        meaning = f"{shown[i]:<{room}}{meanings.get(kind, BOUND).format(index)}"
+        if ahead:
+            meaning += f", {ahead} sample{'s' * (ahead > 1)} ahead"
+        is_estimated = kind == "d" and index in problem.model.estimated
+        if kind in previews and (is_estimated or ahead == previews[kind]):
             meaning += " and after" if ahead else ", constant over the horizon"
         if is_estimated:
             meaning += ", which an observer estimates"
@@ -85,12 +82,8 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
     rows = len(problem.terminal.set[1])
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
     if problem.soft.penalty:
-        states = labels_of(problem.model)[0]
-        outputs = labels_of_outputs(problem.outputs.C, problem.model.state_names)
-        mixed = problem.mixed.soft
-        names = [*states, *outputs, *(f"mixed[{i}]" for i in range(len(mixed)))]
-        units = np.concatenate([problem.soft.x, problem.soft.y, mixed])
-        soft = [names[i] for i in np.flatnonzero(units)]
+        kinds = [problem.bounded[kind] for kind in ("x", "y", "mixed")]
+        soft = [each.names[i] for each in kinds for i in np.flatnonzero(each.softness)]
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
     if problem.layout.n_references and not problem.layout.n_disturbances:
         yield "There is no integral action: a plant that is not its model may rest beside its"

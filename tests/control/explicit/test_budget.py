@@ -44,7 +44,7 @@ def test_bad_limit_is_named(limits: dict[str, Any], message: Message) -> None:
 def test_a_law_that_is_there_keeps_to_the_limit_of_regions() -> None:
     mpc = benchmark()
     assert mpc.explicit().n_regions == 9
-    with pytest.raises(ExplicitLimitError, match="9 regions, more than region_limit = 8") as error:
+    with pytest.raises(ExplicitLimitError, match="region_limit = 8 regions: 9 regions") as error:
         mpc.explicit(region_limit=8)
     assert error.value.n_regions == 9
 
