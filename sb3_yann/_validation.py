@@ -71,7 +71,7 @@ def check_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Arra
         raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).{hint}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")
-    return _frozen(array)
+    return frozen(array)
 
 
 def check_vector(name: str, value: ArrayLike | None, size: int) -> Array:
@@ -92,7 +92,7 @@ def check_symmetric(name: str, value: ArrayLike, size: int) -> Array:
         raise ValueError(
             f"{name} must be positive semi-definite, its smallest eigenvalue is {smallest:g}."
         )
-    return _frozen((matrix + matrix.T) / 2)
+    return frozen((matrix + matrix.T) / 2)
 
 
 def check_bounds(
@@ -343,7 +343,7 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
     if np.any(np.isnan(array)):
         raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
     _require_moderate(name, array, "Use inf for 'no bound'.")
-    return _frozen(array)
+    return frozen(array)
 
 
 def is_kept(value: Any) -> bool:
@@ -362,7 +362,8 @@ def _require_moderate(name: str, array: Array, hint: str) -> None:
         )
 
 
-def _frozen(array: Array) -> Array:
+def frozen(array: Array) -> Array:
+    """Return the array itself, read-only and without -0.0."""
     array[array == 0] = 0.0  # -0.0 equals 0.0 but has other bytes; equal objects share a hash
     array.setflags(write=False)
     return array

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, ReadOnlyArrays, finite_sizes, half_widths
+from sb3_yann._validation import Array, ReadOnlyArrays, finite_sizes, frozen, half_widths
 
 FLOAT32_ROUNDING = 1e-6
 """Half-widths, or a relative difference, that float32 observations and actions make."""
@@ -94,16 +94,13 @@ def fields_in_deviations(problem: Any) -> dict[str, Any]:
         "theta_min": problem.theta_min - problem.theta_ss,
         "theta_max": problem.theta_max - problem.theta_ss,
     }
-    own = {name: np.where(value == 0, 0.0, value) for name, value in shifted.items()}
-    for value in own.values():
-        value.setflags(write=False)
     if isinstance(terminal.set, tuple):  # else it is still to be found
         rows, ends = terminal.set
         at = problem.theta_ss[: rows.shape[1]]
         terminal = replace(terminal, set=(rows, ends - rows @ at))
     return {
         **{name: getattr(problem, name) for name in problem.__dataclass_fields__},
-        **own,
+        **{name: frozen(value) for name, value in shifted.items()},
         "model": model.about_zero(),
         "terminal": terminal,
         "tracking": replace(tracking, r_min=tracking.r_min - r_ss, r_max=tracking.r_max - r_ss),

@@ -264,10 +264,7 @@ def _steady_state(
             if not STEADY_RESIDUAL < np.max(np.abs(left)) < np.inf:
                 break
             settled[:n] += left * scale[:n]
-        other, most_of_other = search(settled)
-        if most_of_other <= STEADY_RESIDUAL:
-            point = other
-            most = most_of_other
+        point, most = min((point, most), search(settled), key=lambda each: each[1])
     if most > STEADY_RESIDUAL:
         left = motion(point)  # which may be no more than the simulator's own error
         noise = noise_of(simulator.step, point, np.where(np.arange(scale.size) < n, scale, 0.0))
@@ -582,17 +579,14 @@ def _rest_of(
             return np.full(n, np.nan)
 
     found: list[Array] = []
-    least = np.inf
-    for start in STARTS:
-        begun = np.where(free, start * scale, given)
-        point, left = _least_moved(motion, begun, free, scale, RATE_STEP)
-        if left < least:
-            least = left
-            best = point
+    begun = [np.where(free, start * scale, given) for start in STARTS]
+    tried = [_least_moved(motion, each, free, scale, RATE_STEP) for each in begun]
+    for point, left in tried:
         apart = (np.max(np.abs(point - other) / scale) > ANOTHER for other in found)
         if left <= AT_REST and all(apart):
             found.append(point)
     if not found:
+        best, least = min(tried, key=lambda each: each[1])
         raise ValueError(
             f"No steady state was found. The best is x_ss = {best[:n].tolist()}, the rest "
             f"{best[n:].tolist()}, which moves in one sample by {least:.2g} scales. Leave more "

@@ -112,16 +112,16 @@ def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
 
     It is looked for where inputs are held: those of a feedback follow the noise of each sample.
     """
-    rows = [(e.states, e.inputs) for e in episodes if len(e) > lags + MOST_EARLY + 1]
-    moves = [np.any(np.diff(u, axis=0), axis=1) for _, u in rows]
-    if not rows or np.mean(np.concatenate(moves)) > 1 - HELD:
+    longer = [each for each in episodes if len(each) > lags + MOST_EARLY + 1]
+    moves = [np.any(np.diff(each.inputs, axis=0), axis=1) for each in longer]
+    if not longer or np.mean(np.concatenate(moves)) > 1 - HELD:
         return []
     left = []
     for early in range(MOST_EARLY + 1):
-        moved = [
-            Episode(x[: len(u) - MOST_EARLY + 1], u[early : len(u) - MOST_EARLY + early])
-            for x, u in rows
-        ]
+        moved = []
+        for each in longer:
+            rows = len(each) - MOST_EARLY
+            moved.append(Episode(each.states[: rows + 1], each.inputs[early : rows + early]))
         known, after = stacked(with_lags(moved, lags + 1, lags))
         known = np.column_stack([np.ones(len(known)), known])
         if len(after) < 4 * known.shape[1]:

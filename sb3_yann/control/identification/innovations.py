@@ -106,15 +106,12 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
         return sum(max(len(each) - lags + 1, 0) for each in episodes)
 
     tried = [p for p in LAGS if rows(p) > max(3 * p * width + 10, steps / 2)] or [1]
-    start = tried[-1] - 1
-    best = np.inf
-    for p in tried:
-        found = arx(episodes, p, start)
-        log_det = np.linalg.slogdet(above_rounding(found))[1]
-        criterion = found.steps * log_det + 2 * q * p * width
-        if criterion < best:
-            best = criterion
-            lags = p
+
+    def criterion(p: int) -> float:
+        found = arx(episodes, p, tried[-1] - 1)
+        return float(found.steps * np.linalg.slogdet(above_rounding(found))[1] + 2 * q * p * width)
+
+    lags = min(tried, key=criterion)
     # The state needs a longer past than the criterion's.
     lags = max(lags, min(tried[-1], max(4, round(1.5 * lags))))
     return lags, arx(episodes, lags, lags - 1)

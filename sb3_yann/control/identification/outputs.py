@@ -114,9 +114,8 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
 
     ValueError for an input that is a function of earlier outputs and inputs alone, all as rounded.
     """
-    q = episodes[0].states.shape[1]
-    m = episodes[0].inputs.shape[1]
-    width = episodes[0].regressors.shape[1]
+    q, m, d = episodes[0].sizes
+    width = q + m + d
     rows = [each.regressors for each in with_lags(episodes, lags + 1, lags)]
     if sum(map(len, rows)) <= 10 * lags * width:
         return []
