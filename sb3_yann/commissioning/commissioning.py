@@ -159,7 +159,18 @@ class Commissioning:
         # A model that was saved meanwhile has the bound of then.
         self.largest: float = record.events[0].get("largest", bound) if record.events else bound
         self._first_bound = min(self.smallest, self.largest)
-        begin = {**self._settings, "largest": self.largest}
+        problem = self.policy.problem
+        own = problem.deviations
+        parts = *problem.prediction, problem.stage_matrix, own.u_min, own.u_max
+        numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
+        names = "batch", "excite", "shadow", "rounds", "updates", "seed"
+        begin = {
+            **{name: getattr(self, name) for name in names},
+            "max_correction": self.smallest,
+            "learner": f"{type(model).__name__} {self.policy.actor.net_arch}",
+            "problem": hashlib.sha256(numbers).hexdigest()[:16],
+            "largest": self.largest,
+        }
         self.journal = Journal(record, begin, CommissioningState(self._first_bound))
         if self.journal.batches:
             with shown(self.progress_bar):
@@ -378,20 +389,6 @@ class Commissioning:
         units = self.policy.problem.units
         log = [(units.to_plant(e.thetas), units.input_to_plant(e.actions)) for e in episodes]
         return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
-
-    @property
-    def _settings(self) -> dict[str, Any]:
-        problem = self.policy.problem
-        own = problem.deviations
-        parts = *problem.prediction, problem.stage_matrix, own.u_min, own.u_max
-        numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
-        names = "batch", "excite", "shadow", "rounds", "updates", "seed"
-        return {
-            **{name: getattr(self, name) for name in names},
-            "max_correction": self.smallest,
-            "learner": f"{type(self.model).__name__} {self.policy.actor.net_arch}",
-            "problem": hashlib.sha256(numbers).hexdigest()[:16],
-        }
 
     def _restore(self, state: CommissioningState) -> None:
         """Restore the accepted policies, the twin and its watchdog as a record left them."""

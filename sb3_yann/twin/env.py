@@ -54,11 +54,6 @@ class Starts:
         return cls(row, np.minimum(low, high), np.maximum(low, high), first, rows)
 
     @property
-    def problem(self) -> LinearMPC:
-        """The MPC of the plant."""
-        return self.row.problem
-
-    @property
     def shown(self) -> tuple[Array, Array]:
         """The box of theta (n_theta,), twice, that the log shows: all rows, and where it may begin.
 
@@ -91,14 +86,14 @@ class Starts:
         passes at the few of the log may fail between them.
         """
         drawn = self.draw(count, rng)
-        if not self.problem.layout.has_constants:
+        if not self.row.problem.layout.has_constants:
             return drawn
         held = self.row.given
         some = drawn[::2].copy()
-        own = self.problem.deviations
+        own = self.row.problem.deviations
         low, high = np.clip(self.shown, own.theta_min, own.theta_max)
         some[:, held] = rng.uniform(low[held], high[held], some[:, held].shape)
-        inside = self.problem.law().in_domain(self.row.shown(some))
+        inside = self.row.problem.law().in_domain(self.row.shown(some))
         drawn[::2][inside] = some[inside]
         return drawn
 
@@ -113,7 +108,7 @@ class Starts:
         has no solution for are replaced by logged ones.
         """
         drawn = self.draw_between(count, rng)
-        own = self.problem.deviations
+        own = self.row.problem.deviations
         n = len(self.low)
         k = len(self.first)
         nearest = (1 + _widened(k)) / 2
@@ -122,7 +117,7 @@ class Starts:
         reach = np.minimum(wide, WIDEST_DRAW) * (self.high - self.low) / 2
         drawn[:, :n] = (self.high + self.low) / 2 + reach * rng.uniform(-1, 1, (count, n))
         shown = np.clip(self.row.shown(drawn), own.theta_min, own.theta_max)
-        outside = ~self.problem.law().in_domain(shown)
+        outside = ~self.row.problem.law().in_domain(shown)
         drawn[:, : shown.shape[1]] = shown
         drawn = self.row.begin(drawn)
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
@@ -229,14 +224,12 @@ class TwinEnv(gym.Env[Single, Single]):
     :meth:`PlantTwin.env` makes one.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}
     observation_space: ProblemBox
 
     def __init__(self, model: LearntModel) -> None:
         self.model = model
         self.dynamics = model.dynamics
         problem = model.problem
-        self.render_mode = None
         bounds = problem.theta_min, problem.theta_max, problem.u_min, problem.u_max
         low, high, u_min, u_max = (each.astype(np.float32) for each in bounds)
         self.observation_space = ProblemBox(low, high, problem=problem)
