@@ -380,7 +380,9 @@ def no_worse(
     elif above or is_above(costs, before):  # or by what rounding in many acceptances adds up to
         beaten = before is not of_mpc and is_above(costs, before)
         whose, other = ("accepted", before) if beaten else ("MPC", of_mpc)
-        mean, its = format_distinct(costs.mean(), other.mean())
+        # In six digits, or as many more as tell them apart.
+        shown = [(f"{costs.mean():.{k}g}", f"{other.mean():.{k}g}") for k in range(6, 18)]
+        mean, its = next((pair for pair in shown if pair[0] != pair[1]), shown[0])
         reason = f"mean cost {mean} from {len(costs)} starts, {whose} {its}"
     reason += f": {words}" * bool(words)
     above |= bool(less[:, LARGEST_EXCESS:].any())
@@ -555,12 +557,6 @@ def tail_average(values: Array, alpha: float) -> tuple[float, float]:
 def is_above(costs: Array, others: Array) -> bool:
     """Return whether the mean of costs is above that of others beyond rounding, or not a number."""
     return not costs.mean() - others.mean() <= COST_ROUNDING * np.abs(others).mean()
-
-
-def format_distinct(one: float, other: float) -> tuple[str, str]:
-    """Return two numbers in six digits, or in as many more as tell them apart."""
-    shown = [(f"{one:.{digits}g}", f"{other:.{digits}g}") for digits in range(6, 18)]
-    return next((pair for pair in shown if pair[0] != pair[1]), shown[0])
 
 
 def unsafe_columns(

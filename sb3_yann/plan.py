@@ -67,12 +67,11 @@ class TwinPlant:
         if self.members is None:
             return self.dynamics
         key = rows.tobytes()
-        every = self.dynamics
         if key not in self._known:
             if len(self._known) == KEPT_SETS:  # networks take memory
                 self._known.clear()
-            chosen = tuple(every.members[self.members[row]] for row in rows)
-            self._known[key] = Dynamics(every.problem, every.coordinates, chosen)
+            chosen = tuple(self.dynamics.members[self.members[row]] for row in rows)
+            self._known[key] = dataclasses.replace(self.dynamics, members=chosen)
         return self._known[key]
 
     def advance(self, theta: Array, u: Array, rows: Rows) -> Array:

@@ -26,7 +26,6 @@ from sb3_yann.guard.start import (
     InterruptHandler,
     all_callbacks,
     check_place,
-    check_twin,
     first_evidence,
     still_holds,
     warn_of_place,
@@ -41,7 +40,7 @@ from sb3_yann.guard.state import (
 )
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import require_same_statistics
-from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.rollout import LONG_EPISODE, preserve_rng
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -256,7 +255,13 @@ class ImprovementGuard(BaseCallback):
         check_place(self)
         policy = require_yann_policy(self.model.policy, "ImprovementGuard")
         if self.twin is not None:
-            check_twin(policy, self.twin.problem)
+            require_problem_of_twin(policy, self.twin.problem)
+            if policy.observation is not None:
+                raise ValueError(
+                    "The twin shows theta, but the model's policy makes theta of its observations. "
+                    "Guard it in a simulator that shows those, or improve it with "
+                    "improve(model, twin)."
+                )
         watch_buffer(self.model)
         known = getattr(self.model, "guard_state", None)
         with preserve_rng():  # building an actor draws weights; a run that goes on has the same

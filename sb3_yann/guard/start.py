@@ -18,12 +18,10 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from sb3_yann._validation import warn
 from sb3_yann.audit.meaning import warn_of_box, warn_of_order, warn_of_signs
 from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, Scores, Starts
-from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.guard.decide import GuardSettings, Player, Unplayable, try_before_training
 from sb3_yann.guard.state import Decision, Evidence, GuardState
 from sb3_yann.policy.checkpoint import ActorCheckpoint
-from sb3_yann.policy.policies import StartsAsMPC, require_problem_of_twin
 from sb3_yann.rollout import Trajectories, preserve_rng, require_finite, require_repeated
 
 REPEATED = 2  # starts from which the MPC plays twice: a simulator repeats itself
@@ -204,16 +202,6 @@ def warn_of_rare_trials(model: BaseAlgorithm, eval_freq: int) -> None:
             f"eval_freq = {eval_freq} counts training episodes, not steps, and {steps} steps are "
             f"{count} of them, of {length} steps: unless they end sooner the guard tries no "
             "candidate between the first episode and the end. eval_freq=1 tries each."
-        )
-
-
-def check_twin(policy: StartsAsMPC, problem: LinearMPC) -> None:
-    """Raise ValueError unless a twin shows what the policy observes, theta of the same problem."""
-    require_problem_of_twin(policy, problem)
-    if policy.observation is not None:
-        raise ValueError(
-            "The twin shows theta, but the model's policy makes theta of its observations. Guard "
-            "it in a simulator that shows those, or improve it with improve(model, twin)."
         )
 
 

@@ -196,7 +196,12 @@ class Trial:
         if not reason and less.any():
             worst = int(np.argmax(np.where(less, played.unsafe[:, LARGEST_EXCESS], -1)))
             broken = allowed_more.exceeded(played, worst) or "the cost is not finite"
-            reason = f"outside the log, from {self._in_words(worst)}, {broken}"
+            problem = self.twin.problem
+            rows = self.starts.reshape(-1, self.starts.shape[-1])
+            theta = problem.units.to_plant(self.twin.dynamics.row.shown(rows[worst]))
+            values = zip(problem.labels(units=True), theta, strict=True)
+            where = ", ".join(f"{name} = {value:.3g}" for name, value in values)
+            reason = f"outside the log, from {where}, {broken}"
         beyond = (excess - self.room())[~known]
         if not reason and not np.all(beyond <= 0):
             more = 100 * excess[~known][np.argmax(beyond)] / mean
@@ -204,13 +209,6 @@ class Trial:
         shown = float(excess[known].mean()) / mean, float(excess[known].max()) / mean
         of_log = logged / mean, error / mean
         return Check(iteration, not reason, reason, *shown, not less.any(), *of_log)
-
-    def _in_words(self, start: int) -> str:
-        """Return theta of one of all starts, in plant units."""
-        problem = self.twin.problem
-        theta = self.twin.dynamics.row.shown(self.starts.reshape(-1, self.starts.shape[-1])[start])
-        values = zip(problem.labels(units=True), problem.units.to_plant(theta), strict=True)
-        return ", ".join(f"{name} = {value:.3g}" for name, value in values)
 
     def _as_logged(self, excess: Array) -> tuple[float, float]:
         """Return the mean of the starts that go on as the log does, and its standard error.
@@ -322,12 +320,6 @@ class SimulatorTrial(PairedTrial):
         worse = (self.relative > 0) | self.less_safe
         return [e for e, lost in zip(self.episodes, worse, strict=True) if lost and e is not None]
 
-    @property
-    def rides_a_bound(self) -> bool:
-        """Whether a hard bound is in force: it is exceeded in some episode, also by the MPC."""
-        both = np.concatenate([self.starts.mpc.unsafe, self.scores.unsafe])
-        return bool(both[:, LARGEST_EXCESS].any())
-
     def check(self, number: int, level: float, final: bool) -> tuple[Check, Verdict]:
         """Return what the pairs say of the policy, at a one-sided level of significance."""
         found = self.verdict(level, least_gain=RULE.least_gain, must_gain=True)
@@ -376,7 +368,8 @@ def confirm(
         found, verdict = trial.check(number, level, final=True)
         count = len(trial.starts.seeds)
         say(f"confirmation, {count} new starts: {100 * found.change:+.2f} %")
-        enough = LOOKS[-1] if trial.rides_a_bound else ENOUGH
+        both = np.concatenate([trial.starts.mpc.unsafe, trial.scores.unsafe])
+        enough = LOOKS[-1] if both[:, LARGEST_EXCESS].any() else ENOUGH
         most = max(-found.change, 2 * found.error - found.logged)  # what it may gain
         hopeless = count > FIRST_LOOK and (verdict.is_hopeless or most < RULE.least_gain)
         refused = not found.accepted and (hopeless or not found.safe)

@@ -377,7 +377,10 @@ def improve(
                 seen = None if model.get_vec_normalize_env() else policy.observation
                 found = work.with_simulator(twin, max_steps, seen)
         except KeyboardInterrupt:
-            print(work.interrupted(), file=sys.stderr)
+            found = Improvement(tuple(work.checks), 0.0, False, note="Ctrl-C ended the search")
+            if simulator := work.say.simulator:
+                found = replace(found, where="the simulator", steps=simulator.steps)
+            print(found, file=sys.stderr)
             raise
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}
@@ -455,13 +458,6 @@ class _Work:
         self.hard: Scenarios | None = None  # what the last check in a twin has lost
         self.is_family = False  # the first model of a simulator
         self.estimator: StateEstimator | None = None  # what the policy's estimates come from
-        self.has_learnt = not self.layer.network.is_zero()
-
-    def interrupted(self) -> Improvement:
-        """Return what was found before Ctrl-C."""
-        found = Improvement(tuple(self.checks), 0.0, False, note="Ctrl-C ended the search")
-        played = self.say.simulator
-        return replace(found, where="the simulator", steps=played.steps) if played else found
 
     def act(self) -> Any:
         """Return the layer as it is now as a policy."""
@@ -500,7 +496,7 @@ class _Work:
         self.estimator = twin.dynamics.row.estimator
         self.keep_margin(twin.dynamics.row, twin.episodes)
         trial = Trial.draw(twin, self.n_starts, self.rng)
-        before = self._check_in(trial) if self.has_learnt else None
+        before = None if self.layer.network.is_zero() else self._check_in(trial)
         best = before.change if before is not None and before.accepted else 0.0
 
         def passes(share: float) -> bool:
@@ -632,14 +628,14 @@ class _Work:
             self.keep_margin(simulator.row, simulator.episodes)
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
             trial = SimulatorTrial(simulator)
-            if self.has_learnt:
-                next(trial.stages(self.act(), [FIRST_LOOK]))
-                before, _ = trial.check(0, RULE.significance, final=False)
-                self.note(before, f"learnt before, {before.starts_in_words}", before.verdict)
-            else:
+            if self.layer.network.is_zero():
                 trial.extend(FIRST_LOOK)
                 assert trial.played is not None
                 simulator.learn(*trial.played)
+            else:
+                next(trial.stages(self.act(), [FIRST_LOOK]))
+                before, _ = trial.check(0, RULE.significance, final=False)
+                self.note(before, f"learnt before, {before.starts_in_words}", before.verdict)
             best = before.change if before is not None and before.accepted else 0.0
             model, note = self._rounds(simulator, trial, best)
             if not note:

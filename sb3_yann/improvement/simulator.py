@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._progress import shown
-from sb3_yann._validation import Array, Mask, NonFiniteWarning, warn
+from sb3_yann._validation import Array, NonFiniteWarning, warn
 from sb3_yann.audit.meaning import (
     in_deviations,
     require_spaces,
@@ -269,28 +269,26 @@ class Simulator:
         return played
 
     def learn(self, played: Trajectories, seeds: Sequence[int]) -> list[Episode | None]:
-        """Take the first parts of episodes that are of use, and return them; None for none."""
+        """Take the first parts of episodes that are of use, and return them; None for none.
+
+        Thetas are finite there, and states at most a width beyond the box: an env that has failed
+        shows others, and so do equations beyond where they hold.
+        """
         found: list[Episode | None] = []
+        part = self.problem.layout.state
+        low = self.problem.deviations.theta_min[part]
+        high = self.problem.deviations.theta_max[part]
         for (thetas, inputs), seed in zip(played.pairs, seeds, strict=True):
-            kept = int(np.argmin(np.append(self._near(thetas), False)))
+            x = thetas[:, part]
+            near = (x >= low - (high - low)) & (x <= high + (high - low))
+            usual = near.all(axis=1) & np.isfinite(thetas).all(axis=1)
+            kept = int(np.argmin(np.append(usual, False)))
             thetas = thetas[:kept]
             inputs = inputs[: max(kept - 1, 0)]
             usable = len(inputs) >= SHORTEST and bool(np.isfinite(inputs).all())
             found.append(Episode(*self.row.recovered(thetas, inputs), seed) if usable else None)
         self.episodes += [each for each in found if each is not None]
         return found
-
-    def _near(self, thetas: Array) -> Mask:
-        """Return which thetas (T, n_theta) are finite, with states at most a width beyond the box.
-
-        An env that has failed shows others, and so do equations beyond where they hold.
-        """
-        bounds = self.problem.deviations
-        part = self.problem.layout.state
-        x = thetas[:, part]
-        width = (bounds.theta_max - bounds.theta_min)[part]
-        near = (x >= bounds.theta_min[part] - width) & (x <= bounds.theta_max[part] + width)
-        return np.asarray(near.all(axis=1) & np.isfinite(thetas).all(axis=1))
 
     def close(self) -> None:
         """Close all envs."""
