@@ -212,7 +212,7 @@ def describe(
         change = layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs))
     else:
         law, program = _with_regions(policy.law() if isinstance(policy, LinearMPC) else policy)
-        networks = _no_networks(law)
+        networks = _network_arrays(None, law)
         change = np.empty((0, law.n_inputs))
         if law.rate is not None:
             change = law.rate / _input_range(law)[2]
@@ -456,9 +456,10 @@ def _input_range(law: PiecewiseAffine) -> tuple[Any, Array, Array]:
     return finite, (high + low) / 2, (high - low) / 2
 
 
-def _no_networks(law: PiecewiseAffine) -> dict[str, Any]:
+def _network_arrays(layer: LawLayer | None, law: PiecewiseAffine) -> dict[str, Any]:
+    """Return the networks of a layer that are not zero, and which of them each region has."""
     n = law.n_theta
-    return {
+    found: dict[str, Any] = {
         "per_theta": np.ones(n),
         "network_of": np.full(law.n_regions, -1),
         "n_layers": np.int64(0),
@@ -469,10 +470,8 @@ def _no_networks(law: PiecewiseAffine) -> dict[str, Any]:
         "kept": np.empty((0, n + law.n_inputs + 2)),
         "fades": np.array([FADE_START, FADE_END]),
     }
-
-
-def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
-    """Return the networks of a layer that are not zero, and which of them each region has."""
+    if layer is None:
+        return found
     network = layer.network
     nodes, *rest = (each.detach().double().cpu().numpy() for each in network.weights())
     layers = [nodes.sum(1), *rest]
@@ -487,7 +486,7 @@ def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
     number = np.full(len(zero), -1)
     number[kept] = np.arange(len(kept))
     per_region = isinstance(layer, YannLayer)
-    found = _no_networks(law) | {
+    found |= {
         "per_theta": 1 / layer.theta_half.double().cpu().numpy(),
         "network_of": number if per_region else np.full(law.n_regions, number[0]),
         "pinned": pinned[kept],

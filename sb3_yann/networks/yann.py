@@ -143,14 +143,15 @@ class LawLayer(nn.Module):
         if self.reach is not None:
             # The bound holds for weights that overflow, or are no numbers, as well.
             correction = correction.nan_to_num(0.0, self.reach, -self.reach)
-            correction = clamp_with_inward_gradient(correction, -self.reach, self.reach)
+            ends = -self.reach, self.reach
+            correction = _InwardGradientClamp.apply(correction, *ends)  # type: ignore[no-untyped-call]
         part = self.confined(theta)
-        output = law + th.where(part > 0, correction * part, 0.0)
+        output: th.Tensor = law + th.where(part > 0, correction * part, 0.0)
         # As compiled: where theta is not finite nothing is passed off as an input.
         output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
         bounds = self.reachable(theta) if self.rated else (-1.0, 1.0)
         adds = (output != law).any(1, keepdim=True)
-        output = clamp_with_inward_gradient(output, *bounds)
+        output = _InwardGradientClamp.apply(output, *bounds)  # type: ignore[no-untyped-call]
         if len(self.constants[2]) == 0:
             return output
         rows = th.as_tensor(self.constants[2], device=theta.device)
@@ -599,9 +600,3 @@ class _Kept(th.autograd.Function):
         along = (gradient * ctx.along).sum(1, keepdim=True).clamp(max=0)
         moves = (gradient - along * ctx.along).to(gradient)
         return moves, None, None, None, None, None, None
-
-
-def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
-    """Return x clamped to numbers or tensors, with a gradient that can still lead inside."""
-    clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
-    return clamped

@@ -245,12 +245,13 @@ class RowAdam(th.optim.Optimizer):
         """Do one step for the rows that have a gradient."""
         for group in self.param_groups:
             for parameter in group["params"]:
-                if parameter.grad is not None:
-                    self._step(parameter, *_rows(parameter.grad), group)
+                if (gradient := parameter.grad) is not None:
+                    by_row = gradient if gradient.is_sparse else gradient.to_sparse(1)
+                    self._step(parameter, by_row.coalesce(), group)
 
-    def _step(
-        self, parameter: th.Tensor, rows: th.Tensor, gradient: th.Tensor, group: dict[str, Any]
-    ) -> None:
+    def _step(self, parameter: th.Tensor, by_row: th.Tensor, group: dict[str, Any]) -> None:
+        rows = by_row.indices()[0]
+        gradient = by_row.values()
         state = self.state[parameter]
         if "steps" not in state:  # nothing yet, or what an Adam left
             taken = float(state.pop("step", 0.0))
@@ -267,12 +268,3 @@ class RowAdam(th.optim.Optimizer):
         size = (square / (1 - beta2**step)).sqrt_().add_(group["eps"])
         change = mean.div_(size).mul_(group["lr"] / (1 - beta1**step))
         parameter.index_add_(0, rows, change, alpha=-1)
-
-
-def _rows(gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """Return which rows have a gradient, and it."""
-    if gradient.is_sparse:
-        gradient = gradient.coalesce()
-        return gradient.indices()[0], gradient.values()
-    rows = gradient.flatten(1).any(1).nonzero()[:, 0]
-    return rows, gradient[rows]
