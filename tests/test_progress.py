@@ -161,7 +161,7 @@ def test_no_compiled_function_that_python_calls_returns_an_array(name) -> None:
 def test_all_that_is_known_to_be_called_is_looked_at() -> None:
     names = {name.rpartition(".")[2] for name in CALLED}
     known = "law_at law_of_batch locate_batch bounded_region support solve_batch inputs_of_batch"
-    known += " recall remember forward backward _forms _output _output_backward _forms_backward"
+    known += " recall remember forward backward _forward _backward _adam"
     assert names >= {*known.split(), "_rates", "advance", "advance_all", "is_rich"}
 
 
