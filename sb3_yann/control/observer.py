@@ -82,9 +82,6 @@ class StateEstimator:
         E = np.delete(model.E, known, axis=1)
         _require_observable(model, E, self.C)
         q = len(self.C)
-        self.n_measured = q
-        self.n_estimated = d
-        self.n_known = len(known)  # measured disturbances, which `update` takes
         self.A = np.block([[model.A, E], [np.zeros((d, n)), np.eye(d)]])
         self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
         self.E = np.vstack([model.E[:, known], np.zeros((d, len(known)))])
@@ -136,6 +133,21 @@ class StateEstimator:
     def _measured(self, model: LinearModel) -> list[int]:
         """Return which disturbances are measured."""
         return [*model.measured]
+
+    @property
+    def n_measured(self) -> int:
+        """Number of measured outputs q."""
+        return len(self.C)
+
+    @property
+    def n_estimated(self) -> int:
+        """Number of estimated disturbances."""
+        return len(self.A) - self.model.n_states
+
+    @property
+    def n_known(self) -> int:
+        """Number of measured disturbances, which :meth:`update` takes."""
+        return int(self.E.shape[1])
 
     @property
     def x_hat(self) -> Array:

@@ -252,6 +252,7 @@ class ImprovementGuard(BaseCallback):
         return plot_decisions(self.decisions, axes)
 
     def _init_callback(self) -> None:
+        self.locals = {}  # those of an earlier `learn` say nothing of this one
         check_place(self)
         policy = require_yann_policy(self.model.policy, "ImprovementGuard")
         if self.twin is not None:

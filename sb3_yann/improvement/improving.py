@@ -6,7 +6,7 @@ import copy
 import hashlib
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import Progress, shown
-from sb3_yann._validation import check_bool, check_int
+from sb3_yann._validation import check_bool, check_int, check_range
 from sb3_yann.compare import RULE, TOO_LITTLE
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.linear_system import missing_observer
@@ -262,6 +262,7 @@ def improve(
     rounds: int = 4,
     updates: int = 4000,
     confine: bool = True,
+    least_sure: float = SURE_SHARE,
     seed: int = 0,
     progress_bar: bool = True,
 ) -> Improvement:
@@ -307,6 +308,9 @@ def improve(
     confine : bool, default True
         Whether the MPC acts alone beyond what the log, or the simulator's episodes, show: see
         :meth:`YannPolicy.confine_correction`.
+    least_sure : float, default 0.1
+        Share of the gain that a twin promises that must be sure on the plant, with 95 %. 0 takes
+        any sure gain, as :class:`Commissioning` does: there the plant confirms it.
     seed : int, default 0
         Of the starts, the models and the batches. No other random numbers are drawn.
     progress_bar : bool, default True
@@ -351,6 +355,7 @@ def improve(
                 "Leave it out; n_starts, rounds and updates bound what a twin takes."
             )
     check_bool("confine", confine)
+    check_range("least_sure", least_sure, 0, 1, "[]")
     with shown(progress_bar, parts=True), threadpool_limits(1):
         if isinstance(model, LinearMPC):
             with preserve_rng():  # a seed of Stable-Baselines3 is a global one
@@ -366,7 +371,9 @@ def improve(
         if isinstance(twin, PlantTwin):
             require_problem_of_twin(policy, twin.problem)
             twin.require_trust()
-        work = _Work(policy, n_starts, rounds, updates, seed, _Progress(rounds), confine)
+        work = _Work(
+            policy, n_starts, rounds, updates, seed, _Progress(rounds), confine, least_sure
+        )
         try:
             if isinstance(twin, PlantTwin):
                 work.confine_to(twin)
@@ -449,6 +456,7 @@ class _Work:
     seed: int
     say: _Progress
     confine: bool = True
+    least_sure: float = SURE_SHARE
 
     def __post_init__(self) -> None:
         self.problem = self.policy.problem
@@ -538,18 +546,12 @@ class _Work:
             if passes(1.0):
                 return improvement(True)
             scenarios = self.hard
-        return improvement(self._retreat(passes))
-
-    def _retreat(self, passes: Callable[[float], bool]) -> bool:
-        """Return whether a part of a correction passes; not where a forecast doubts all of it."""
-        if self.checks[-1].interval is not None:
-            return False
         whole = copy.deepcopy(self.layer.state_dict())
         for share in RETREATS:
             self.scale(share, whole)
             if passes(share):
-                return True
-        return False
+                return improvement(True)
+        return improvement(False)
 
     def _of_estimates(self, scenarios: Scenarios, episodes: list[Episode], seed: int) -> Scenarios:
         """Return scenarios of a twin of hidden states in a model of what the policy sees.
@@ -598,12 +600,12 @@ class _Work:
         change, low, high, cure, worst, objection = twin.forecast(self.act())
         found = replace(check, logged=change, error=(high - low) / 2, interval=(low, high))
         found = replace(found, worst=max(check.worst, worst))
-        if high < SURE_SHARE * min(change, 0.0):
+        if high < self.least_sure * min(change, 0.0):
             reason = f"from new starts, {objection}" if objection else ""
             return replace(found, accepted=not objection, reason=reason)
         text = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
         if high < 0:
-            text += f", and {100 * SURE_SHARE:.0f} % of the expected gain must be sure"
+            text += f", and {100 * self.least_sure:.3g} % of the expected gain must be sure"
         little = max(-low, high) < RULE.least_gain
         leads_on = "too little to teach" if little else f"to settle it, {cure}"
         return replace(found, accepted=False, reason=f"{text}: {leads_on}")

@@ -25,7 +25,7 @@ from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
 ONE_SIDED = 0.95  # probability that a change is not above an interval's end, or not below
-SURE_SHARE = 0.1  # of what a policy gains in the twin must be sure on the plant
+SURE_SHARE = 0.1  # of the gain that a twin promises must be sure where no plant confirms it
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
 TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
 EACH = 5  # episodes, at least, that show by themselves how much they vary

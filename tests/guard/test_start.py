@@ -216,8 +216,10 @@ def test_another_simulator_of_the_same_name_begins_afresh_and_says_so() -> None:
 @pytest.mark.parametrize("together", [lambda a, b: [a, b], lambda a, b: [CallbackList([a]), b]])
 def test_two_guards_at_once_are_refused(together) -> None:
     guards = together(make_guard(), make_guard())
+    model = build()
     with pytest.raises(ValueError, match="2 guards were passed to learn, expected is one"):
-        train(build(), STEPS, *guards)
+        train(model, STEPS, *guards)
+    train(model, STEPS, guards[1])
 
 
 def test_candidates_that_are_rarer_than_episodes_are_named_before_the_first_step() -> None:

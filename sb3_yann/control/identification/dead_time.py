@@ -38,14 +38,37 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
 
     Long ARX models tell it from sensor noise and from curvature.
     """
+    none = [0] * n_inputs
     longer = [episode for episode in episodes if len(episode) > MAX_DELAY + 1]
-    steps = sum(len(episode) - MAX_DELAY for episode in longer)
-    if steps <= 4 * (sum(episodes[0].sizes) + 1 + MAX_DELAY * n_inputs):
-        return [0] * n_inputs
-    found = dead_times(longer, MAX_DELAY, n_inputs)[0]
+    rows = with_lags(longer, MAX_DELAY + 1, MAX_DELAY)
+    n = episodes[0].states.shape[1]
+    width = episodes[0].regressors.shape[1]
+    if sum(map(len, rows)) <= 4 * (width + 1 + MAX_DELAY * n_inputs):
+        return none
+    best = dead_times(longer, MAX_DELAY, n_inputs)[0]
+    if not any(best):
+        return none
+    known, target = stacked(rows)
+    taps = [lag * width + n + j for j, delay in enumerate(best) for lag in range(1, delay + 1)]
+    known = known[:, [*range(width), *taps]]
+    # Behind sensor noise earlier inputs tell of the state, too, but it is the latest that acts.
+    prompt = [
+        _explained(known, n + j, target) > _explained(known, width + sum(best[: j + 1]) - 1, target)
+        for j in range(n_inputs)
+    ]
+    found = [0 if each else lag for lag, each in zip(best, prompt, strict=True)]
     # A hidden state makes earlier inputs count too, but earlier states with them.
-    hidden = any(found) and leftover(longer, found).is_hidden
-    return [0] * n_inputs if hidden else [*found]
+    return none if any(found) and leftover(longer, found).is_hidden else found
+
+
+def _explained(regressors: Array, column: int, target: Array) -> float:
+    """Return the sum over targets (k, n) of squared partial correlations with one column."""
+    others = np.delete(regressors, column, axis=1)
+    others = np.column_stack([np.ones(len(others)), others - others.mean(axis=0)])
+    left = project_out(others, np.column_stack([target, regressors[:, column]]))
+    sizes = np.sum(left**2, axis=0)
+    explained = (left[:, :-1].T @ left[:, -1]) ** 2
+    return float(np.sum(explained / np.maximum(sizes[:-1] * sizes[-1], np.finfo(float).tiny)))
 
 
 def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]:

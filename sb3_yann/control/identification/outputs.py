@@ -222,7 +222,8 @@ class Search:
             errors, long = ahead(RUN_AHEAD)
             fits = ahead(1)[1], long
             criterion = self.criterion(model, start)
-        error, size = (float(np.nan_to_num(x, nan=np.inf)) for x in (np.mean(errors**2), criterion))
+        both = np.mean(errors**2), criterion
+        error, size = (float(x) if np.isfinite(x) else np.inf for x in both)
         return Structure(model, self.delays, error, size, start, fits)
 
     def criterion(self, model: Innovations, start: tuple[Array, Array]) -> float:
