@@ -264,7 +264,9 @@ def _steady_state(
             if not STEADY_RESIDUAL < np.max(np.abs(left)) < np.inf:
                 break
             settled[:n] += left * scale[:n]
-        point, most = min((point, most), search(settled), key=lambda each: each[1])
+        other = search(settled)
+        if other[1] <= STEADY_RESIDUAL:
+            point, most = other
     if most > STEADY_RESIDUAL:
         left = motion(point)  # which may be no more than the simulator's own error
         noise = noise_of(simulator.step, point, np.where(np.arange(scale.size) < n, scale, 0.0))

@@ -251,7 +251,8 @@ def forecast(
                 worst = max(worst, float(np.nan_to_num(most, nan=np.inf)))
     change = (found[0][0] + found[1][0]) / 2
     widest = max(found, key=lambda each: each[2])
-    cure = _cure(*widest, independent, loosest, partial(more_of, problem, episodes))
+    goal = SURE_SHARE * min(change, 0.0)
+    cure = _cure(goal, *widest, independent, loosest, partial(more_of, problem, episodes))
     low = min(each[1] for each in found)
     return Forecast(change, low, widest[2], cure, worst, objection)
 
@@ -313,6 +314,7 @@ def _changed(
 
 
 def _cure(
+    goal: float,
     middle: float,
     low: float,
     high: float,
@@ -321,12 +323,12 @@ def _cure(
     loosest: str,
     more: Callable[[int], str],
 ) -> str:
-    """Return what would settle a change whose interval contains zero."""
+    """Return what would settle a change that is not surely below a goal."""
     if not np.isfinite(high - low):
         return "log more episodes"
-    if middle >= 0 or says == REMEMBERED:
+    if middle >= goal or says == REMEMBERED:
         kind = " for longer than the actuator takes" if says == REMEMBERED else ""
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
-    needed = independent * min(((high - middle) / (middle - SURE_SHARE * middle)) ** 2, 100.0)
+    needed = independent * min(((high - middle) / (middle - goal)) ** 2, 100.0)
     return f"log about {more(max(int(np.ceil(needed)), EACH) - independent + 1)} more"
