@@ -366,7 +366,7 @@ def no_worse(
         reason = f"{len(which)} of {len(less)} starts with {UNSAFE[column]}, the first is "
         reason += f"start {names[which[0]]}"
         if column == ENDED:
-            words = 'where an end is a success, the env says so by info["is_success"]'
+            reason += '; where an end is a success, the env says so by info["is_success"]'
         elif column != INPUT_STEP:
             words = tolerance.exceeded(policy, int(which[0]))
         hopeless = True

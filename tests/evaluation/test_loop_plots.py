@@ -13,7 +13,6 @@ from sb3_yann.evaluation.plots import (
     plot_gains,
     plot_regions,
     plot_surface,
-    surfaces_figure,
     use_figure,
 )
 from sb3_yann_envs import problems
@@ -124,18 +123,6 @@ def test_below_many_pairs_lie_their_differences() -> None:
     assert len(loops_figure(tank(), {"before": before, "after": episodes(20)}).axes) == 2
 
 
-def test_rounding_is_not_drawn_large() -> None:
-    before = episodes(9)
-    after = episodes(9)
-    for x in after.observations:
-        x += 1e-9
-    after.costs[:] += 1e-9
-    below = loops_figure(tank(), {"before": before, "after": after}).axes[2]
-    width = 1e-4 * 8 / 9  # of the levels
-    assert below.get_ylim() == pytest.approx((-width, width))
-    assert plot_gains({"MPC": before, "policy": after}).get_ylim() == (-0.01, 0.01)
-
-
 def test_gains_are_sorted_and_in_percent_of_the_first_one_s_mean() -> None:
     before = episodes(3)
     after = episodes(3)
@@ -165,22 +152,6 @@ def test_the_surface_is_the_law_in_plant_units() -> None:
     values = np.asarray(mesh.get_array()).reshape(121, 121)
     assert values[40, 60] == pytest.approx(mpc.explicit().plant_input(shown)[0])
     assert values.min() == pytest.approx(0, abs=1e-9) and values.max() == pytest.approx(110)
-
-
-def test_a_surface_is_drawn_in_the_frame_that_is_given() -> None:
-    mpc = reactor_in_plant_units()
-    axes = plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"), frame=([0.5, 470], [1, 480]))
-    assert axes.get_xlim() == pytest.approx((0.5, 1), abs=0.01)
-    assert axes.get_ylim() == pytest.approx((470, 480), abs=0.1)
-    with pytest.raises(ValueError, match=r"no frame to draw \['C_B', 'T'\] in"):
-        plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"), frame=([1, 470], [1, 480]))
-
-
-def test_before_and_after_share_their_colors() -> None:
-    mpc = problems.clipped_pendulum()
-    figure = surfaces_figure(mpc, mpc.explicit(), lambda theta: np.full((len(theta), 1), 3.0))
-    scales = [panel.collections[0].get_clim() for panel in figure.axes[:3]]
-    assert scales == [(-2.0, 3.0), (-2.0, 3.0), (-5.0, 5.0)]
 
 
 @pytest.mark.parametrize("entries", [(0, 0), (0, "x"), (0, 9)])

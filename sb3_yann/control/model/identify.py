@@ -107,10 +107,16 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     Parameters
     ----------
     states : Log, or array_like, shape (T+1, n), or a sequence of such
-        A log; or the states of one episode or several.
-    actions, dt, disturbances, time
-        With states that are no log: inputs, ``dt``, disturbances and time as of
-        :meth:`sb3_yann.Log.from_arrays`. Disturbances make E.
+        A log, which brings all up to ``time``; or one episode or several, each with the state
+        before every action and after the last.
+    actions : array_like, shape (T, m), or a sequence of such
+        The inputs as they were executed (clipped, if the plant clips).
+    dt : float
+        Sampling time.
+    disturbances : array_like, shape (T, d), or a sequence of such, optional
+        Measured disturbances, which make E.
+    time : array_like, shape (T+1,), or a sequence of such, optional
+        When each row was measured, in the unit of ``dt``; steps of another time are left out.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
         The operating point. By default, inputs and disturbances take their mean, and the state is
         the fitted model's steady state. An integrating state keeps its mean, which the inputs hold.

@@ -187,8 +187,12 @@ def identify_outputs(
     outputs : Log, or array_like, shape (T + 1, q), or a sequence of such
         A log whose states are the outputs; or one record or several. Rows with NaN are gaps, but
         for outputs that are read in fewer than two of three samples: these need not be there.
-    inputs, dt, disturbances
-        With outputs that are no log: as of :meth:`sb3_yann.Log.from_arrays`. Disturbances make E.
+    inputs : array_like, shape (T, m), or a sequence of such
+        As they were executed: row k acts between rows k and k + 1 of the outputs.
+    dt : float
+        Sampling time.
+    disturbances : array_like, shape (T, d), or a sequence of such, optional
+        Measured disturbances, which make E.
     order : int or "auto", default "auto"
         Number of states without dead time. "auto" takes that of the least criterion of Hannan and
         Quinn (J. R. Stat. Soc. B 41, 1979), up to 16.

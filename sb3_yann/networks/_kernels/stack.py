@@ -18,6 +18,7 @@ WEIGHT_TYPES = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], f
 """Types of nodes, second, last and pinned, see :func:`network`."""
 
 BLOCK = 128  # rows of a product of narrow matrices: as a whole it takes BLAS twice as long
+ONE_THREAD = 262_144  # multiplications of a product that OpenBLAS does not share out among threads
 
 
 def to_numpy(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
@@ -103,9 +104,28 @@ def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, ou
 
 
 @compiled()
+def block_of(size: int) -> int:
+    """Return how many rows a product with a matrix of so many entries takes at once.
+
+    Threads of BLAS wait for one another: where other processes have the cores, ten times as long.
+    Large matrices are worth it.
+    """
+    few = ONE_THREAD // size
+    return few if BLOCK // 4 <= few < BLOCK else BLOCK
+
+
+@compiled()
+def _product(rows: Single, matrix: Single, out: Single) -> None:
+    """Write the products of rows, (batch, k), and a matrix, (k, outputs)."""
+    block = block_of(matrix.size)
+    for at in range(0, len(rows), block):
+        np.dot(rows[at : at + block], matrix, out[at : at + block])
+
+
+@compiled()
 def _layer_of_all(x: Single, matrix: Single, zero: Single, out: Single) -> None:
     """Write what :func:`hidden_layer` does for all rows of x, which go through one matrix."""
-    np.dot(x, np.ascontiguousarray(matrix[:-1].T).T, out)  # BLAS is faster so
+    _product(x, np.ascontiguousarray(matrix[:-1].T).T, out)  # BLAS is faster so
     for row in range(len(out)):
         for a in range(out.shape[1]):
             out[row, a] = tanh(out[row, a] + matrix[-1, a]) - zero[a]
@@ -222,8 +242,9 @@ def _all_backward(
             through[row, a] = back[row, a] * (one - (out[row, a] + b) * (out[row, a] + b))
             by_bias[a] += through[row, a] - pinned * back[row, a] * (one - b * b)
     by[:, inputs] = by_bias
-    for at in range(0, len(x) if asked else 0, BLOCK):
-        by[:, :inputs] += np.dot(through[at : at + BLOCK].T, x[at : at + BLOCK])
+    block = block_of(inputs * out.shape[1])
+    for at in range(0, len(x) if asked else 0, block):
+        by[:, :inputs] += np.dot(through[at : at + block].T, x[at : at + block])
     return through
 
 
@@ -283,9 +304,9 @@ def network_backward(
     if len(pinned) == 1:
         own = pinned[0]
         through = _all_backward(by_2, hidden1, hidden2, zero2[0], own, asked, by_second[0])
-        np.dot(through, matrices2[0, :-1].T, by_1)
+        _product(through, matrices2[0, :-1].T, by_1)
         through = _all_backward(by_1, x, hidden1, zero1[0], own, asked, by_first[0])
-        np.dot(through, matrices1[0, :-1].T, by_x)
+        _product(through, matrices1[0, :-1].T, by_x)
     for s in range(by_first.shape[0]):
         for node in range(2):  # they enter the same sum
             for a in range(by_first.shape[1]):

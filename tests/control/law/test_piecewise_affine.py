@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 
 from errors import Message, raises
 from random_problems import edges
@@ -19,7 +18,7 @@ from sb3_yann import LinearModel, LinearMPC, RateLimits, Tracking
 from sb3_yann._archive import read_arrays, write_arrays
 from sb3_yann.control import DisturbanceBounds, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.gains import Gains
-from sb3_yann.control.law_plot import COLORS, REST, area, slices
+from sb3_yann.control.law_plot import area, slices
 from sb3_yann_envs import problems
 
 PLANAR = ["pendulum", "benchmark", "asymmetric input bounds", "two inputs", "terminal set"]
@@ -299,16 +298,6 @@ def test_a_color_stands_for_one_value_of_the_input() -> None:
         own = [int(p.get_gid()) for p in axes.patches if p.get_facecolor() == color]
         assert own and all(law.offsets[i] == pytest.approx(value) for i in own)
         assert all(np.abs(law.gains[i]).max() < 1e-9 for i in own)
-
-
-def test_more_names_than_colors_share_a_gray() -> None:
-    law = problems.cstr().explicit()
-    numbered = law.plot(entries=(0, 3), name=lambda region, theta: f"own {region}")
-    assert len({p.get_facecolor() for p in numbered.patches}) == len(numbered.patches) <= 8
-    many = strips(np.linspace(-2, 2, 12)).plot(name=lambda region, theta: f"own {region}")
-    colors = [to_hex(p.get_facecolor()).upper() for p in many.patches]
-    assert sorted(set(colors)) == sorted({*COLORS, REST}) and colors.count(REST) == 4
-    assert "4 others" in many.get_legend_handles_labels()[1]
 
 
 def test_regions_are_numbered_but_for_slivers_and_where_they_are_too_many() -> None:
