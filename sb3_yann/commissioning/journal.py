@@ -283,7 +283,8 @@ class Journal:
         for batch in self.trial:
             for both in zip(batch[::2], batch[1::2], strict=False):
                 ours, its = sorted(both, key=lambda i: not self.by_policy[i])
-                if self.by_policy[ours] > self.by_policy[its] and not self.episodes[its].alarm:
+                paired = self.by_policy[ours] and not self.by_policy[its]
+                if paired and not self.episodes[its].alarm:
                     found.append((self.episodes[ours], self.episodes[its]))
         return found
 

@@ -15,8 +15,8 @@ from sb3_yann.twin.log import pieces
 from sb3_yann.twin.plant_twin import PlantTwin
 
 CHART_GAINS = np.array([1.0, 0.2, 0.05, 0.02])  # without a memory; with 5, 20 and 50 samples
-FACTOR = 2.0  # times the largest held-out ratio a band is: this,
-FACTOR_OF_FEW = 7.5  # and so much more, divided by the number of episodes
+FACTOR = 2.0  # times the largest held-out ratio is a band, with many episodes
+FACTOR_OF_FEW = 7.5  # divided by the number of episodes, so much is added to the factor
 LEAST_RATIO = 0.5  # the largest ratio is taken to be at least this
 LEAST_ERROR = 0.1  # that the residual is taken to be, in standard deviations of one-step errors
 NORMAL_MEDIAN = 0.6745  # of the normal distribution, without its sign, in standard deviations

@@ -217,12 +217,13 @@ def _against_law(
             continue
         _, s, i = min(found)
         slope = readings[s].slope[i, j]
-        cures = ["move the inputs by a row"] * bool(s) + ["exchange the columns"] * bool(i != j)
-        cures += ["change the sign"] * bool(slope < 0)
+        cures = ["move the inputs by a row"] if s else []
+        cures += ["exchange the columns"] if i != j else []
+        cures += ["change the sign"] if slope < 0 else []
         if cures and abs(abs(slope) - 1) < SLOPE_TOLERANCE + readings[s].error[i, j]:
             late = " A controller that acts a sample late is dead time: PastInputs."
             yield (
-                f"The logged {names[j]} is {'minus ' * bool(slope < 0)}what the MPC gives "
+                f"The logged {names[j]} is {'minus ' if slope < 0 else ''}what the MPC gives "
                 f"{names[i]} in {ROW_NAMES[s]} (it leaves "
                 f"{100 * np.sqrt(readings[s].left[i, j]):.3g} % of its deviation; its own leaves "
                 f"{100 * np.sqrt(own):.3g} %). In the log, "

@@ -183,7 +183,8 @@ class _Replays:
         left = np.zeros(2)
         for k in range(self.members):
             unseen = np.arange(count) % self.members == k
-            fit, test = (known & of if np.any(known & of) else known for of in (~unseen, unseen))
+            fit = known & ~unseen if np.any(known & ~unseen) else known
+            test = known & unseen if np.any(known & unseen) else known
             z = basis[:, k]
             e = self.errors[:, k]
             weights.append(_ridge(z[fit], e[fit]))

@@ -22,7 +22,7 @@ SHOOTING_STEPS = (5, 15, 60)  # steps of the windows: long ones begin where shor
 CORRECTIONS = 15  # of a search, at most
 LEAST_SAVED = 1e-3  # a search is done when a correction saves less than this part of its errors
 GUESS = 1e-5  # weight of the given states where windows begin, beside the outputs'
-KNOWN = 1e-2  # of those that another fit found: what is hidden has the same coordinates then
+KNOWN = 1e-2  # weight of states that another fit found: the hidden ones keep their coordinates
 FARTHEST = 3.0  # times the largest magnitude in the log, of a residual while it is fitted
 
 

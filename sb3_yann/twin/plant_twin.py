@@ -61,7 +61,7 @@ WINDOW_STEPS = 20  # steps of the windows that networks are fitted to
 HIDDEN_SETTINGS = Setting(1, 1e-4, 1.0), Setting(2, 1e-4, 1.0), Setting(2, 1e-6, 1.0)
 """How the residuals of states that nothing shows are fitted, the least free first."""
 LONG_LOG = 100  # steps of a log that networks are tried on
-LACKS = 0.01  # error of all else's predicted costs, relative to their mean, where they are
+LACKS = 0.01  # error of predicted costs, relative to their mean, from which networks are tried
 
 
 @dataclass(frozen=True, eq=False, repr=False)

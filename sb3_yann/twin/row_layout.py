@@ -62,7 +62,7 @@ class RowLayout:
         if found is None or found.n_estimated != self.problem.layout.n_disturbances:
             return None
         told = self.hidden or (isinstance(found, DisturbanceObserver) and found.C.shape == (n, n))
-        matrices = [found.gain[:n], *[found.C] * (not self.hidden)]
+        matrices = [found.gain[:n]] if self.hidden else [found.gain[:n], found.C]
         determined = told and max(map(np.linalg.cond, matrices)) < SINGULAR
         return found if determined else None
 

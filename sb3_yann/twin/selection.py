@@ -89,7 +89,8 @@ def fit_family(coordinates: Coordinates, log: Sequence[Episode], seed: int) -> l
 
 def _pair(coordinates: Coordinates, log: Sequence[Episode]) -> list[Array]:
     """Return z (rows, k) and y (rows, n) of all episodes: see `Coordinates.regression`."""
-    return [*map(np.concatenate, zip(*map(coordinates.regression, log), strict=True))]
+    pairs = [coordinates.regression(each) for each in log]
+    return [np.concatenate(each) for each in zip(*pairs, strict=True)]
 
 
 class _Networks:

@@ -226,6 +226,7 @@ def _constraints(
         G, S = (np.concatenate(each) for each in zip(*made, strict=True))
         low, high, L, H = (np.concatenate([each[used]] * len(steps)) for each in limits[kind])
         soft = np.tile(softness[used], len(steps))[:, None] * [kind == each for each in slacks]
+        # 0 - soft, for -soft would hold negative zeros.
         parts.append((np.hstack([G, 0 - soft]), high, H - S))
         parts.append((np.hstack([-G, 0 - soft]), -low, S - L))
         chosen = np.tile(np.array(called, object)[used], len(steps))
@@ -244,8 +245,10 @@ def _constraints(
     for k in range(1, N + 1) if len(problem.outputs.C) else ():
         add("y", k)
     acting = np.any(problem.mixed.G, axis=1)
+    # At first the state is given, and in the end no input acts.
+    used = {0: acting, N: ~acting}
     for k in range(N + 1) if len(acting) else ():
-        add("mixed", k, used={0: acting, N: ~acting}.get(k, slice(None)))
+        add("mixed", k, used=used.get(k, slice(None)))
     none = np.zeros((len(slacks), G.shape[1])), np.zeros((len(slacks), problem.n_theta))
     parts.append((np.hstack([none[0], 0 - np.eye(len(slacks))]), np.zeros(len(slacks)), none[1]))
     names += [f"no violation of the soft bounds of {kind}" for kind in slacks]

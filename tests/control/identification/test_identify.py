@@ -278,6 +278,11 @@ def test_sensor_noise_is_taken_for_no_delay() -> None:
         noisy = record(seed, 4000, sensor=0.1)[:2]
         identify(*noisy, dt=1)  # a warning would be an error
         assert identify(*noisy, dt=1, delay="auto").delays == (0,)
+    rng = np.random.default_rng(358)  # a short log, whose latest input's share alone tells
+    a = rng.uniform(0.5, 0.95)
+    u = np.repeat(rng.uniform(-1, 1, 150), 4)[:150, None]
+    x = played(lambda x, u: a * x + u, u, [0.0]) + 0.5 * rng.normal(size=(151, 1))
+    assert identify(x, u, dt=1, delay="auto").delays == (0,)
 
 
 def closed_loop(test_signal: float, noise=0.0, integral=0.0) -> tuple[np.ndarray, np.ndarray]:
