@@ -360,8 +360,8 @@ class Commissioning:
         if state.is_kept:  # the plant has confirmed it: the next one may leave the MPC farther
             wider = replace(state, max_correction=min(2 * state.max_correction, self.largest))
         self._become(self.candidate or self._acting, wider.max_correction)
-        options: dict[str, Any] = {"rounds": self.rounds, "updates": self.updates}
-        found = improve(self.model, twin, **options, least_sure=0, seed=self.seed + number)
+        seed = self.seed + number
+        found = improve(self.model, twin, rounds=self.rounds, updates=self.updates, seed=seed)
         before = found.before
         if found.accepted or (before is not None and before.accepted and not state.is_kept):
             return wider, "accepted", f"{text}{found.change_in_words}."

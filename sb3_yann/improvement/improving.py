@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from threadpoolctl import threadpool_limits
 
 from sb3_yann._progress import Progress, shown
-from sb3_yann._validation import check_bool, check_int, check_range
+from sb3_yann._validation import check_bool, check_int
 from sb3_yann.compare import RULE, TOO_LITTLE
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.linear_system import missing_observer
@@ -61,7 +61,6 @@ from sb3_yann.policy.policies import (
 )
 from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.env import LearntModel
-from sb3_yann.twin.forecast import SURE_SHARE
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.row_layout import RowLayout
@@ -262,7 +261,6 @@ def improve(
     rounds: int = 4,
     updates: int = 4000,
     confine: bool = True,
-    least_sure: float = SURE_SHARE,
     seed: int = 0,
     progress_bar: bool = True,
 ) -> Improvement:
@@ -308,9 +306,6 @@ def improve(
     confine : bool, default True
         Whether the MPC acts alone beyond what the log, or the simulator's episodes, show: see
         :meth:`YannPolicy.confine_correction`.
-    least_sure : float, default 0.1
-        Share of the gain that a twin promises that must be sure on the plant, with 95 %. 0 takes
-        any sure gain, as :class:`Commissioning` does: there the plant confirms it.
     seed : int, default 0
         Of the starts, the models and the batches. No other random numbers are drawn.
     progress_bar : bool, default True
@@ -355,7 +350,6 @@ def improve(
                 "Leave it out; n_starts, rounds and updates bound what a twin takes."
             )
     check_bool("confine", confine)
-    check_range("least_sure", least_sure, 0, 1, "[]")
     with shown(progress_bar, parts=True), threadpool_limits(1):
         if isinstance(model, LinearMPC):
             with preserve_rng():  # a seed of Stable-Baselines3 is a global one
@@ -371,9 +365,7 @@ def improve(
         if isinstance(twin, PlantTwin):
             require_problem_of_twin(policy, twin.problem)
             twin.require_trust()
-        work = _Work(
-            policy, n_starts, rounds, updates, seed, _Progress(rounds), confine, least_sure
-        )
+        work = _Work(policy, n_starts, rounds, updates, seed, _Progress(rounds), confine)
         try:
             if isinstance(twin, PlantTwin):
                 work.confine_to(twin)
@@ -456,7 +448,6 @@ class _Work:
     seed: int
     say: _Progress
     confine: bool = True
-    least_sure: float = SURE_SHARE
 
     def __post_init__(self) -> None:
         self.problem = self.policy.problem
@@ -600,12 +591,10 @@ class _Work:
         change, low, high, cure, worst, objection = twin.forecast(self.act())
         found = replace(check, logged=change, error=(high - low) / 2, interval=(low, high))
         found = replace(found, worst=max(check.worst, worst))
-        if high < self.least_sure * min(change, 0.0):
+        if high < 0:
             reason = f"from new starts, {objection}" if objection else ""
             return replace(found, accepted=not objection, reason=reason)
         text = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
-        if high < 0:
-            text += f", and {100 * self.least_sure:.3g} % of the expected gain must be sure"
         little = max(-low, high) < RULE.least_gain
         leads_on = "too little to teach" if little else f"to settle it, {cure}"
         return replace(found, accepted=False, reason=f"{text}: {leads_on}")

@@ -25,7 +25,6 @@ from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
 ONE_SIDED = 0.95  # probability that a change is not above an interval's end, or not below
-SURE_SHARE = 0.1  # of the gain that a twin promises must be sure where no plant confirms it
 REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
 TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
 EACH = 5  # episodes, at least, that show by themselves how much they vary
@@ -252,8 +251,7 @@ def forecast(
                 worst = max(worst, float(np.nan_to_num(most, nan=np.inf)))
     change = (found[0][0] + found[1][0]) / 2
     widest = max(found, key=lambda each: each[2])
-    goal = SURE_SHARE * min(change, 0.0)
-    cure = _cure(goal, *widest, independent, loosest, partial(more_of, problem, episodes))
+    cure = _cure(*widest, independent, loosest, partial(more_of, problem, episodes))
     low = min(each[1] for each in found)
     return Forecast(change, low, widest[2], cure, worst, objection)
 
@@ -315,7 +313,6 @@ def _changed(
 
 
 def _cure(
-    goal: float,
     middle: float,
     low: float,
     high: float,
@@ -324,12 +321,12 @@ def _cure(
     loosest: str,
     more: Callable[[int], str],
 ) -> str:
-    """Return what would settle a change that is not surely below a goal."""
+    """Return what would settle a change whose interval contains zero."""
     if not np.isfinite(high - low):
         return "log more episodes"
-    if middle >= goal or says == REMEMBERED:
+    if middle >= 0 or says == REMEMBERED:
         kind = " for longer than the actuator takes" if says == REMEMBERED else ""
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
-    needed = independent * min(((high - middle) / (middle - goal)) ** 2, 100.0)
+    needed = independent * min(((high - middle) / middle) ** 2, 100.0)
     return f"log about {more(max(int(np.ceil(needed)), EACH) - independent + 1)} more"

@@ -141,7 +141,7 @@ def test_where_it_may_cost_more_it_is_said_what_would_settle_it() -> None:
     law = law_of(MPC)
     _, low, high, cure, *_ = found.forecast(lambda x: np.clip(1.05 * law(x), -1, 1))
     assert low < 0 < high and ("held steps of u[0]" in cure or "episodes more" in cure)
-    said = _cure(0.0, 0.01, -0.01, 0.02, REMEMBERED, 9, "u[0]", str)
+    said = _cure(0.01, -0.01, 0.02, REMEMBERED, 9, "u[0]", str)
     assert said.startswith("log held steps of u[0] for longer than the actuator takes; with errors")
     assert said.endswith("perhaps because of a lag or a load that lasts, the change is -1 to +2 %")
 
