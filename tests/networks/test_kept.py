@@ -13,8 +13,8 @@ import general_problems
 import sample_problems
 from general_problems import PUMPS, solved
 from sample_laws import by_loops_and_by_torch, scrambled
-from sb3_yann import LinearModel, LinearMPC, OutputBounds, Tracking
-from sb3_yann.control.mpc.bound_excess import Bounds
+from sb3_yann import LinearModel, LinearMPC, MixedBounds, OutputBounds, Tracking
+from sb3_yann.control.mpc.bound_excess import Bounds, mixed_beyond
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from twin_samples import problem
 from weights import shake
@@ -29,18 +29,23 @@ def cart() -> LinearMPC:
     return LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, tracking=track, **limits)
 
 
-def spring() -> LinearMPC:
+def spring(**limits: Any) -> LinearMPC:
     """A mass on a spring with a bounded output, whose MPC alone breaks it from some states."""
+    limits = limits or {"outputs": OutputBounds([[1, 0.5]], -0.6, 0.8)}
     model = LinearModel([[0.995, 0.0998], [-0.0998, 0.985]], [[0.005], [0.0998]], 0.1)
     return LinearMPC(
         model, Q=np.diag([10, 1]), R=[[0.1]], horizon=5, theta_min=[-2, -2], theta_max=[2, 2],
-        u_min=-1, u_max=1, outputs=OutputBounds([[1, 0.5]], -0.6, 0.8),
+        u_min=-1, u_max=1, **limits,
     )  # fmt: skip
 
 
 CASES = {
     "cart": cart,
     "spring": spring,
+    "spring, mixed": lambda: spring(mixed=MixedBounds([[1e-8, 5e-9]], low=-6e-9, high=8e-9)),
+    "spring, mixed with inputs": lambda: spring(
+        mixed=MixedBounds([[1e-8, 5e-9]], [[5e-9]], -6e-9, 8e-9)
+    ),
     "references, loads and rates": lambda: general_problems.solved("servo with all of it"),
     "two tanks": lambda: general_problems.solved("two tanks, all parts"),
     "terminal set": lambda: general_problems.solved("invariant with all of it"),
@@ -78,6 +83,7 @@ def largest_excess(mpc: LinearMPC, act, steps: int = 80) -> float:
     kept = mpc.kept_set
     bounds = Bounds.of(mpc)
     A, B = mpc.prediction
+    alone = not np.any(mpc.mixed.G)  # a row of states alone holds from the next step on
     theta = drawn(mpc, count=4000)
     theta = theta[(theta @ kept.F.T <= kept.g).all(axis=1)][:100]
     assert len(theta) == 100
@@ -87,9 +93,12 @@ def largest_excess(mpc: LinearMPC, act, steps: int = 80) -> float:
             low = mpc.theta_min[parts.reference]
             high = mpc.theta_max[parts.reference]
             theta[:, parts.reference] = rng.uniform(low, high, (len(theta), len(low)))
-        theta = theta @ A.T + act(theta) @ B.T
-        beyond = np.abs(bounds.beyond(theta))[:, bounds.softness <= 0]
-        found = max(found, float(beyond.max()))
+        inputs = act(theta)
+        after = theta @ A.T + inputs @ B.T
+        beyond = np.abs(bounds.beyond(after))[:, bounds.softness <= 0]
+        mixed = mixed_beyond(mpc, after if alone else theta, 0 * inputs if alone else inputs)
+        found = max(found, float(beyond.max(initial=0)), float(np.abs(mixed).max(initial=0)))
+        theta = after
     return found
 
 

@@ -166,7 +166,7 @@ UNPLANNED_MOVE = 1e-5
 class KeptSet(ReadOnlyArrays):
     """Half-spaces ``F theta <= g`` in deviations: in all of them hard bounds can be kept.
 
-    There are none for a problem without hard bounds of states or outputs. Slacks are in
+    There are none for a problem whose hard bounds are those of inputs alone. Slacks are in
     half-widths: a state that is off by as much moves them by no more than 1. Of rows ``[a, b, c]``
     of ``ahead``, where ``a theta + b u <= c`` the predicted next theta lies in the set, and mixed
     bounds and those that change at run time hold. From each theta in it some inputs within bounds
@@ -198,10 +198,17 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     n = len(half)
     unit = np.concatenate([half, u_half])
     box = _around(problem, half)
-    of_inputs, ends_of_inputs = hard_rows(problem, ("u", "du", "mixed"))
-    inputs = of_inputs * unit, ends_of_inputs
-    of_states, ends_of_states = hard_rows(problem, ("x", "y"))
-    bounds = of_states[:, :n] * half, ends_of_states
+
+    def hard(*kinds: str) -> Facets:  # whatever units a row is in
+        rows, limits = hard_rows(problem, kinds)
+        size = np.abs(rows * unit).sum(1)
+        size = np.where(size > 0, size, 1.0)
+        return rows * unit / size[:, None], limits / size
+
+    inputs = hard("u", "du", "mixed")
+    values, limits = hard("x", "y", "mixed")
+    of_states = np.all(np.abs(values[:, n:]) <= ZERO_LENGTH, axis=1)
+    bounds = values[of_states, :n], limits[of_states]
 
     def before(rows: Facets, room: float = 0.0) -> Facets | None:
         F, g = rows
@@ -212,7 +219,7 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     steps = 0
     found = bounds if end is None else end
     settled = False
-    nothing = end is None or not len(bounds[1])
+    nothing = end is None or not np.any(np.abs(values[:, problem.layout.state]) > ZERO_LENGTH)
     ends = not nothing and not _implies(bounds, (last * half, upper), box)
     if ends:  # a terminal set that inputs cannot stay in promises nothing
         stays = before(found)
@@ -234,8 +241,9 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     g = g / size
     # Inputs and rates within fixed bounds, and inputs within those of theta, are clipped anyway.
     rate_moves = any(name.startswith("du") for name in problem.layout.bounds)
-    now = hard_rows(problem, ("du", "mixed") if rate_moves else ("mixed",))
-    rows = np.vstack([np.hstack([F @ A, F @ B, g[:, None]]), np.column_stack(now)])
+    now = np.column_stack(hard("du", "mixed") if rate_moves else hard("mixed"))
+    now[:, :-1] /= unit
+    rows = np.vstack([np.hstack([F @ A, F @ B, g[:, None]]), now])
     return KeptSet(F, g, rows, steps, settled or (ends and steps == problem.horizon))
 
 
