@@ -65,6 +65,10 @@ class Gains(ReadOnlyArrays):
         degrees = np.where(speeds_up, 2, moves_on.astype(int))
         pick = np.expand_dims(degrees, 0)
         values, own = (np.take_along_axis(each, pick, 0)[0] for each in (found, widths))
+        # Of an input that moves one state on and on, the others' gains are beside that pole.
+        rests = (degrees == 0) & np.any(degrees, axis=0)
+        values = np.where(rests, found[3], values)
+        own = np.where(rests, widths[3], own)
         beside = (np.where(degrees, each[0], each[3]) for each in (found, widths))
         return cls(values, own, degrees, integrators, *beside)
 
