@@ -568,11 +568,12 @@ REGULAR = 0.9  # share of a column's changes that are as many rows apart, where 
 
 
 SPIKE = 50.0  # times nearly all other steps of a state are the two to and from a spike
-LONGEST_SPIKE = 3  # readings
+LONGEST_SPIKE = 3  # readings, unless all are one value
+DOWN = 10.0  # times nearly all other steps are those to and from what a dead transmitter sends
 
 
 def _leave_out_spikes(name: str, columns: Sequence[Array]) -> None:
-    """Leave out up to three readings in a row that are far beyond the rest.
+    """Leave out readings that are far beyond the rest: a few, or one value that comes again.
 
     They stay where there are many: a plant may answer a pulse so.
     """
@@ -580,13 +581,21 @@ def _leave_out_spikes(name: str, columns: Sequence[Array]) -> None:
     moves = moves[moves > 0]
     if len(moves) < LEAST_READ:
         return
-    least = SPIKE * float(np.quantile(moves, 0.9))
+    typical = float(np.quantile(moves, 0.9))
     whole = np.concatenate(columns)
-    far = np.concatenate([_there_and_back(each, least) for each in columns])
+    far = np.concatenate([_there_and_back(each, SPIKE * typical) for each in columns])
     rest = whole[~far & np.isfinite(whole)]
     far &= np.abs(whole - np.median(rest)) > 1.5 * np.ptp(rest)
+    if np.count_nonzero(far) > LONGEST_SPIKE + len(whole) // 1000:
+        far[:] = False
+    away = np.concatenate([_there_and_back(each, DOWN * typical) for each in columns])
+    for value in np.unique(whole[away & ~far]):
+        down = whole == value
+        rest = whole[~down & ~far & np.isfinite(whole)]
+        if LONGEST_SPIKE < np.count_nonzero(down) <= len(whole) // 20:
+            far |= down & ((value < rest.min()) | (value > rest.max()))
     rows = np.flatnonzero(far)
-    if 0 < len(rows) <= LONGEST_SPIKE + len(whole) // 1000:
+    if len(rows):
         warn(
             f"{name} of the log is {whole[rows[0]]:g} in row {rows[0]}, and far from it before "
             f"and after ({len(rows)} such rows): taken for no reading."
@@ -595,16 +604,19 @@ def _leave_out_spikes(name: str, columns: Sequence[Array]) -> None:
 
 
 def _there_and_back(column: Array, least: float) -> NDArray[np.bool_]:
-    """Return where up to three readings of a record are a jump of ``least`` there and back away."""
+    """Return where a record jumps by ``least`` there and back, for a few rows or to one value."""
     rows = np.flatnonzero(np.isfinite(column))
     z = column[rows]
-    steps = np.diff(z)
+    steps = np.abs(np.diff(z))
+    jumps = np.flatnonzero(steps > least)
     found = np.zeros(len(column), bool)
-    for length in range(1, LONGEST_SPIKE + 1):
-        both = np.minimum(np.abs(steps[:-length]), np.abs(steps[length:]))
-        back = np.abs(z[length + 1 :] - z[: -length - 1]) < both / 10
-        for k in np.flatnonzero(back & (both > least)):
-            found[rows[k + 1 : k + 1 + length]] = True
+    for i, first in enumerate(jumps):
+        for last in jumps[i + 1 : i + 1 + LONGEST_SPIKE]:
+            away = slice(first + 1, last + 1)
+            stands = np.ptp(z[away]) == 0  # longer, in which the plant goes on
+            back = min(steps[first], steps[last]) / (3 if stands else 10)
+            if abs(z[last + 1] - z[first]) < back and (stands or last - first <= LONGEST_SPIKE):
+                found[rows[away]] = True
     return found
 
 
@@ -656,14 +668,16 @@ def _period(parts: Sequence[Array]) -> int:
 def _number(path: object, line: int, content: dict[str, str], name: str, decimal: str) -> float:
     text = (content[name] or "").strip()
     try:
+        if decimal != "." and "." in text:
+            raise ValueError
         return float(text.replace(decimal, ".")) if text else np.nan
     except ValueError:
         if _is_word(text):  # see `_warn_of_words`
             return np.nan
         raise ValueError(
-            f"{path}, line {line}: {name} is {text!r}, expected a number. Leave the cell empty "
-            "where there is no reading; for decimal commas pass decimal=','; leave out thousands' "
-            "separators."
+            f"{path}, line {line}: {name} is {text!r}, expected a number whose decimal sign is "
+            f"{decimal!r}: decimal= says which it is. Leave out thousands' separators, and the "
+            "cell empty where there is no reading."
         ) from None
 
 

@@ -217,16 +217,17 @@ class Frozen:
 def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen]:
     """Return where states (T+1, n) read exactly the same for long though the plant moves.
 
-    A sensor that counts in steps repeats itself often: runs count from ten times its usual length
-    on. None is returned where they are less than 5 % of all rows. ``driven`` (T, k) are the inputs
-    and disturbances between the rows.
+    A sensor that counts in steps repeats itself often: runs count from ten times their median
+    length on, and six times that of the longest twentieth. None is returned where they are less
+    than 5 % of all rows. ``driven`` (T, k) are the inputs and disturbances between the rows.
     """
     rows = sum(map(len, states))
     found = list[Frozen]()
     for i in range(states[0].shape[1]):
         runs = [*_runs([x[:, i] for x in states], i)]
-        usual = float(np.median([*map(len, runs)]))
-        long = [each for each in runs if len(each) >= max(LEAST_REPEATS, TIMES * usual)]
+        usual, rare = np.quantile([*map(len, runs)], [0.5, 0.95])
+        least = max(LEAST_REPEATS, TIMES * usual, 6 * rare)
+        long = [each for each in runs if len(each) >= least]
         those = _unexplained(states, driven, i, runs, long) if long else []
         if sum(map(len, those)) > REPEATED_SHARE * rows:
             found += those
