@@ -151,7 +151,8 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     between r_min and r_max at each reset, and held for the episode, or drawn anew every ``hold``
     steps; so are bounds that change. No :class:`SetPoint` is needed around it. The reward is minus
     the MPC's stage cost, and ``info["state"]`` the state. The inputs are held for a sample,
-    ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps`` equal steps.
+    ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps`` equal steps, and
+    shorter ones where these err by more than a thousandth of the half-width of theta's box.
     ``reset(options={"state": x})`` begins in a state. Where it is no longer finite an episode
     terminates, in the last one that was, with ``info["violation"]``; a warning says where f was
     not, and how often.
@@ -237,15 +238,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"{plant.fault}, the operating point.")
         require_order(f, mpc.model.dt, x_ss, mpc.model.u_ss)
         env: Any = plant
-        if ratio := ratio_of_time_units(plant.slope, mpc):
-            times = max(ratio, 1 / ratio)
-            pace, cure = ("fast", "/") if ratio < 1 else ("slow", "*")
-            warn(
-                f"f(x, u) is {times:g} times as {pace} as the model of the "
-                f"MPC, whose dt = {mpc.model.dt:g}{f' {mpc.model.time_unit}'.rstrip()}. If f is in "
-                f"another unit of time than dt, pass lambda x, u: np.asarray(f(x, u)) {cure} "
-                f"{times:g}.",
-            )
+        warn_of_another_time(plant.slope, mpc)
         if layout.n_references:
             r = mpc.tracking
             env = SetPoint(env, r.r_min, r.r_max, hold=hold, preview=r.preview)
@@ -261,11 +254,10 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(TimeLimit(StageCost(env, mpc), limit))
 
 
-def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) -> float | None:
-    """Return by what a unit of time explains that f and the model differ; None where none does.
+def warn_of_another_time(slope: Callable[[Array, Array], Array], mpc: LinearMPC) -> None:
+    """Warn where f is far off the model, and nearly right in another unit of time or as a map.
 
-    Compared are the effects of state and input on the next state, in half-widths of their boxes:
-    the model must be far off, and nearly right with another unit.
+    Compared are the effects of state and input on the next state, in half-widths of their boxes.
     """
     model = mpc.model
     n = mpc.model.n_states
@@ -279,18 +271,41 @@ def ratio_of_time_units(slope: Callable[[Array, Array], Array], mpc: LinearMPC) 
         )
         rates = np.zeros((point.size, point.size))
         rates[:n] = ((ahead - behind) / 2e-4 / size[:n]).T
-    effects = np.hstack([model.A - np.eye(n), model.B]) * size / size[:n, None]
+    at_rest = np.eye(n, point.size)
+    effects = np.hstack([model.A, model.B]) * size / size[:n, None] - at_rest
     if not (np.all(np.isfinite(rates)) and np.any(effects)):
-        return None
+        return
 
-    def error(ratio: float) -> float:
-        with np.errstate(all="ignore"):
-            held = linalg.expm(ratio * model.dt * rates)[:n] - np.eye(n, point.size)
-            found = np.linalg.norm(held - effects) / np.linalg.norm(effects)
+    def error(next_state: Array) -> float:
+        found = np.linalg.norm(next_state[:n] - at_rest - effects) / np.linalg.norm(effects)
         return float(np.nan_to_num(found, nan=np.inf))
 
-    best = min([*UNITS_OF_TIME, *(1 / each for each in UNITS_OF_TIME)], key=error)
-    return best if error(1.0) > 0.8 and error(best) < 0.2 else None
+    def error_of(ratio: float) -> float:
+        with np.errstate(all="ignore"):
+            return error(linalg.expm(ratio * model.dt * rates))
+
+    if error_of(1.0) <= 0.8:
+        return
+    ratio = min([*UNITS_OF_TIME, *(1 / each for each in UNITS_OF_TIME)], key=error_of)
+    if error(rates) < 0.2:
+        warn(
+            "f(x, u) looks like the next state, and f is the slope dx/dt: what it gives is that of "
+            f"the MPC's model after dt = {model.dt:g}. Of a map write a gymnasium.Env, and wrap it "
+            "in StageCost."
+        )
+    elif error_of(ratio) < 0.2:
+        times = max(ratio, 1 / ratio)
+        pace, cure = ("fast", "/") if ratio < 1 else ("slow", "*")
+        warn(
+            f"f(x, u) is {times:g} times as {pace} as the model of the "
+            f"MPC, whose dt = {model.dt:g}{f' {model.time_unit}'.rstrip()}. If f is in "
+            f"another unit of time than dt, pass lambda x, u: np.asarray(f(x, u)) {cure} "
+            f"{times:g}.",
+        )
+
+
+LARGEST_ERROR = 1e-3  # of a substep, in half-widths of theta's box
+FINEST = 1024  # parts that a substep may be cut into
 
 
 class Equations(gym.Env[Array, Array]):
@@ -314,6 +329,8 @@ class Equations(gym.Env[Array, Array]):
         self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
         self.state: Array = mpc.model.x_ss
         self.model = mpc.model
+        half = mpc.theta_half[mpc.layout.state]
+        self.weight = 1 / np.where(np.isfinite(half) & (half > 0), half, 1.0)
         self.time = 0.0
         self.fault = ""  # of a step: where f was not finite first
 
@@ -336,15 +353,8 @@ class Equations(gym.Env[Array, Array]):
         """Hold the inputs, clipped to their bounds, for a sample."""
         box: Any = self.action_space
         u = np.clip(np.asarray(action, np.float64), box.low, box.high)
-        self.fault = ""
-        x = self.state
-        h = self.dt / self.substeps
         with np.errstate(all="ignore"):
-            for _ in range(self.substeps):
-                k1 = self.slope(x, u)
-                k2 = self.slope(x + h / 2 * k1, u)
-                k3 = self.slope(x + h / 2 * k2, u)
-                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.slope(x + h * k3, u))
+            x = self._held(u)
         lost = not np.all(np.isfinite(x))
         if self.fault:
             key = getattr(self.f, "__code__", self.plant_name)
@@ -358,6 +368,39 @@ class Equations(gym.Env[Array, Array]):
         self.time += self.dt
         info = {"state": self.state.copy(), **({"violation": True} if lost else {})}
         return self.C @ self.state, 0.0, lost, False, info
+
+    def _held(self, u: Array) -> Array:
+        """Return the state after a sample, not finite where no step is short enough.
+
+        The error of a step is that of the third-order formula that its slopes and the first one of
+        the next make; where it is too large the step is cut in half.
+        """
+        self.fault = ""
+        x = self.state
+        k1 = self.slope(x, u)
+        step = FINEST
+        left = FINEST * self.substeps
+        while left:
+            h = self.dt / self.substeps * (step / FINEST)
+            k2 = self.slope(x + h / 2 * k1, u)
+            k3 = self.slope(x + h / 2 * k2, u)
+            k4 = self.slope(x + h * k3, u)
+            after = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            following = self.slope(after, u)
+            error = h / 6 * float((np.abs(following - k4) * self.weight).max())
+            if error <= LARGEST_ERROR:
+                x = after
+                k1 = following
+                left -= step
+                if error < LARGEST_ERROR / 16 and left % (2 * step) == 0:
+                    step = min(2 * step, FINEST)
+            elif step > 1:
+                self.fault = ""
+                step //= 2
+            else:
+                self.fault = self.fault or f"f(x, u) changes too fast for steps of {h:.3g}"
+                return after * np.nan
+        return x
 
     def slope(self, x: Array, u: Array) -> Array:
         """Return dx/dt; `fault` says where it was not finite first."""

@@ -77,13 +77,24 @@ def test_equations_in_another_unit_of_time_are_named(faster, words) -> None:
     assert len(found) == bool(words) and all(words in each for each in found)
 
 
-def test_it_is_integrated_exactly() -> None:
-    env = PlantEnv(lambda x, u: (u - x) / 7, LinearMPC(
-        LinearModel.from_dynamics(lambda x, u: (u - x) / 7, [3], [3], dt=2.0), **WEIGHTS,
+@pytest.mark.parametrize(("lag", "error"), [(7, 1e-8), (1e-3, 1e-2), (1e-6, None)])
+def test_it_is_integrated_exactly_or_ends(lag: float, error: float | None) -> None:
+    env = PlantEnv(lambda x, u: (u - x) / lag, LinearMPC(
+        LinearModel.from_dynamics(lambda x, u: (u - x) / lag, [3], [3], dt=2.0), **WEIGHTS,
         u_min=0, u_max=9, theta_min=0, theta_max=9,
     ))  # fmt: skip
     env.reset(options={"state": [5.0]})
-    assert env.step(np.array([1.0]))[0] == pytest.approx([1 + 4 * np.exp(-2 / 7)], abs=1e-8)
+    found = []
+    words = told(lambda: found.extend(env.step(np.array([1.0]))))
+    assert found[2] == (error is None) == any("f(x, u) changes too fast for" in x for x in words)
+    at = 5.0 if error is None else 1 + 4 * np.exp(-2 / lag)
+    assert found[0] == pytest.approx([at], abs=error)
+
+
+def test_a_map_that_is_taken_for_a_slope_is_named() -> None:
+    mpc = LinearMPC(TANK, **WEIGHTS, **BOX)
+    (words,) = told(lambda: PlantEnv(lambda x, u: mpc.model.step(x, u), mpc))
+    assert words.startswith("f(x, u) looks like the next state")
 
 
 def test_a_policy_on_it_is_the_mpc_and_its_reward_minus_the_cost() -> None:
