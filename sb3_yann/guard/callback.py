@@ -287,6 +287,7 @@ class ImprovementGuard(BaseCallback):
         goes_on = False
         if known is not None and known.settings == settings.of_evidence:
             player.max_input_step = known.max_input_step
+            player.offset = known.offset
             goes_on = still_holds(known.evidence, player)
             if not goes_on:
                 warn(
@@ -297,7 +298,9 @@ class ImprovementGuard(BaseCallback):
         if not goes_on:
             player.max_input_step = None
             evidence, leading, refusals = first_evidence(player, settings, known)
-            state = GuardState(settings.of_evidence, evidence, player.max_input_step)
+            state = GuardState(
+                settings.of_evidence, evidence, player.max_input_step, offset=player.offset
+            )
             if known is not None:  # other starts or another plant: what was decided stays
                 state.decisions = [*known.decisions]
                 state.episodes = known.episodes

@@ -437,7 +437,8 @@ def _what_acts(evidence: Evidence, tried: ActorCheckpoint) -> str:
 class Player:
     """Plays checkpoints in the guard's simulator; the policy stays as it is.
 
-    Inputs may move by ``max_input_step`` (m,) from one sample to the next. Whether its env
+    Inputs may move by ``max_input_step`` (m,) from one sample to the next. Costs count from
+    ``offset``: what an episode of the MPC gets by the reward's own. Whether its env
     ``pays_cost`` of the problem, as the policy scales it, is known once the MPC has played. Once
     Ctrl-C has restored the accepted policy, it is ``interrupted``, and restores nothing else.
     ``steps`` are those of the simulator that all episodes took.
@@ -448,6 +449,7 @@ class Player:
     envs: EnvPool
     mpc: ActorCheckpoint
     max_input_step: Array | None = None
+    offset: float = 0.0
     pays_cost: bool = True
     interrupted: bool = False
     steps: int = 0
@@ -494,7 +496,8 @@ class Player:
         for visited, theta in zip(visits, own.observations, strict=True):
             visited[layer.regions(th.as_tensor(theta[:-1]))] = True
         unsafe = replace(played, excess=excess).unsafe(far)
-        return Scores(played.costs + excess.penalty, unsafe, visits)
+        penalty = self.policy.critic_options.reward_scale * excess.penalty
+        return Scores(played.costs + self.offset + penalty, unsafe, visits)
 
     def theta(self, observations: NDArray[Any]) -> Array:
         """Return theta in deviations (steps, n_theta) of what the simulator shows."""

@@ -99,6 +99,8 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
         space: Any = player.policy.action_space
         rounding = COST_ROUNDING * (space.high - space.low)
         player.max_input_step = np.asarray(settings.rule.max_input_step * most + rounding)
+    offset = player.policy.critic_options.reward_offset
+    player.offset = offset * float(np.median(mpc.lengths))
     return player.scores(mpc)
 
 

@@ -202,9 +202,9 @@ class Decision:
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
 
-    ``settings`` are what the evidence depends on, ``max_input_step`` (m,) and ``steps`` the
-    `Player`'s. ``step`` is the factor of the actor's learning rate; ``episodes`` of training are
-    over, and so many were when the last candidate was tried.
+    ``settings`` are what the evidence depends on, ``max_input_step`` (m,), ``steps`` and ``offset``
+    the `Player`'s. ``step`` is the factor of the actor's learning rate; ``episodes`` of training
+    are over, and so many were when the last candidate was tried.
     """
 
     settings: dict[str, Any]
@@ -215,6 +215,7 @@ class GuardState:
     last_trial: int | None = None
     steps: int = field(default=0, compare=False)  # with those that check a run that goes on
     decisions: list[Decision] = field(default_factory=list)
+    offset: float = 0.0
 
     @property
     def accepted(self) -> ActorCheckpoint:

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import TimeLimit, TransformReward
 from stable_baselines3 import DDPG, TD3
 
 from errors import told
@@ -308,6 +308,19 @@ def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) 
     reason = guard.decisions[0].reason
     assert named in reason and "m/s" in reason
     assert max(np.abs(each[:, 1]).max() for each in log.observations) < LIMIT * 1.01
+
+
+def test_a_guard_s_costs_are_the_mpc_s_where_the_policy_knows_a_scale_and_an_offset() -> None:
+    mpc, plant = carriage("soft states")
+    mpc = replace(mpc, soft=SoftBounds(x=[0, LIMIT], penalty=0.1))
+    costs = []
+    for scale, offset in ((1.0, 0.0), (0.01, 50.0)):
+        make = lambda s=scale, o=offset: TransformReward(plant(), lambda r: s * r + o)  # noqa: E731
+        model = built(mpc, make, critic={"reward_scale": scale, "reward_offset": offset})
+        guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=4, n_final_starts=4)
+        model.learn(1, callback=[NoActionNoise(), guard])
+        costs.append(guard.state.evidence.starts.mpc.costs / scale)
+    np.testing.assert_allclose(*costs, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
