@@ -326,7 +326,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         """Do what SB3 asks for as a rollout begins; name random actions and misread states."""
         if not mode and sys._getframe(1).f_code.co_name == "collect_rollouts":
             sb3_hooks.warn_of_random_actions(self._algorithm)
-            sb3_hooks.warn_of_misread_states(self, self._algorithm)
+            sb3_hooks.warn_of_first_steps(self, self._algorithm)
         super().set_training_mode(mode)
 
     def unscale_action(self, scaled_action: Array) -> Array:

@@ -20,6 +20,7 @@ from sb3_yann._validation import NonFiniteWarning, warn
 from sb3_yann.control.mpc.misreading import STEPS_PER_STATE, misread_states
 
 FIRST_STEPS = 200  # steps of a learn after which what the env shows is compared with the model
+OTHER_REWARD = 0.1  # of the stage cost: a reward that differs by more is another one
 
 
 def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
@@ -163,8 +164,8 @@ def warn_of_random_actions(algorithm: Any) -> None:
         )
 
 
-def warn_of_misread_states(policy: Any, algorithm: Any) -> None:
-    """Warn, once, where the first steps in a buffer are the model's in other units or order.
+def warn_of_first_steps(policy: Any, algorithm: Any) -> None:
+    """Warn, once, of states in other units or order, and of rewards that are not the MPC's cost.
 
     A guard and a `CostAudit` look themselves.
     """
@@ -187,6 +188,26 @@ def warn_of_misread_states(policy: Any, algorithm: Any) -> None:
     u = policy.inputs(policy.unscale_action(buffer.actions[:rows].reshape(len(thetas[0]), -1)))
     if words := misread_states(policy.problem, thetas[0], u, thetas[1]):
         warn(words)
+        return
+    rewards = buffer.rewards[:rows].reshape(-1).astype(float)
+    rewards = rewards if normalize is None else normalize.normalize_reward(rewards)
+    options = policy.critic_options
+    cost = policy.problem.deviations.stage_cost(thetas[0], u)
+    expected = options.reward_offset - options.reward_scale * cost
+    # Where it costs most, and of these the median: violations and ends of episodes may cost more.
+    most = np.isfinite(rewards) & (cost > np.mean(cost))
+    if not most.any():
+        return
+    wrong = np.median(np.abs(rewards - expected)[most])
+    typical = options.reward_scale * np.median(cost[most])
+    if wrong > OTHER_REWARD * typical:
+        warn(
+            f"Rewards are not the MPC's cost: of the first {len(rewards)} steps half of the most "
+            f"costly {np.count_nonzero(most)} differ by {wrong:.3g} or more from what the critic, "
+            f"which starts as the MPC's value, counts with, where a step costs {typical:.3g}. "
+            "learn(..., callback=CostAudit()) names in what; StageCost(env, mpc) makes rewards of "
+            "the cost."
+        )
 
 
 def watch_buffer(model: BaseAlgorithm) -> None:

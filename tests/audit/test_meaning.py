@@ -161,6 +161,16 @@ def test_learning_alone_and_a_cost_audit_tell_it_once(audit: list[Any], factor: 
     assert ["show h times 100:" in each for each in found] == [True] * (factor == 100)
 
 
+@pytest.mark.parametrize(("factor", "assumed"), [(1, 1), (0.1, 1), (-1, 1), (0.1, 0.1)])
+def test_learning_alone_names_rewards_that_are_not_the_cost(factor: float, assumed: float) -> None:
+    plant = StageCost(Tanks(lambda x: x), IN_PLANT_UNITS)
+    env = gym.wrappers.TransformReward(plant, lambda reward: factor * reward)
+    options = {"problem": IN_PLANT_UNITS, "critic": {"reward_scale": assumed}}
+    model = DDPG("YannPolicy", env, policy_kwargs=options, seed=0, learning_starts=10**6)
+    found = said(lambda: model.learn(220, callback=NoActionNoise()), "are not the MPC's cost")
+    assert len(found) == (factor != assumed)
+
+
 def test_a_factor_that_explains_more_than_the_order_is_named() -> None:
     model = LinearModel([[0.5, 0.5], [0.1, 0.9]], [[1], [1]], dt=1.0)
     mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
