@@ -7,6 +7,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from io import StringIO
@@ -389,6 +390,11 @@ class Log:
                 time_unit = unit or "s"
             elif own in SECONDS and unit in SECONDS:
                 instants = instants * SECONDS[own] / SECONDS[unit]
+            elif own not in ("", unit):
+                raise ValueError(
+                    f"{path} has times in {own!r} by its header, and time_unit = {unit!r}: expected "
+                    f"are {[*SECONDS]}, in both."
+                )
             times = [instants[part] for part in parts]
         names, units = zip(*map(_name_and_unit, wanted[: n + m + d]), strict=True)
         return cls._of(
@@ -692,8 +698,9 @@ def _rows(
     for row in rows:
         if rows.restkey in row:
             raise ValueError(
-                f"{path}, line {rows.line_num} has more entries than the header has names. Numbers "
-                f"with a decimal comma need another delimiter than {delimiter!r}, and decimal=','."
+                f"{path}, line {rows.line_num} has more entries than the header, {header}, has "
+                "names. Leave out lines above the header. Numbers with a decimal comma need "
+                f"another delimiter than {delimiter!r}, and decimal=','."
             )
         content.append(row)
         lines.append(rows.line_num)
@@ -725,16 +732,17 @@ def _time(
     path: object, line: int, content: dict[str, str], name: str, unit: str, decimal: str
 ) -> tuple[float, bool]:
     """Return a time as it is given, an ISO 8601 time stamp in the unit, and which of them it is."""
+    with suppress(ValueError):
+        number = _number(path, line, content, name, decimal)
+        if not any(1.9 < number / size < 2.1 for size in (1e11, 1e13)):  # 20260131080000 is none
+            return number, False
     try:
-        return _number(path, line, content, name, decimal), False
+        stamp = datetime.fromisoformat(content[name].strip())
     except ValueError:
-        try:
-            stamp = datetime.fromisoformat(content[name].strip())
-        except ValueError:
-            raise ValueError(
-                f"{path}, line {line}: {name} is {content[name]!r}, expected a number or a time "
-                "stamp such as 2026-01-31 08:00. pandas.to_datetime(column, format=...) makes it."
-            ) from None
+        raise ValueError(
+            f"{path}, line {line}: {name} is {content[name]!r}, expected a number or a time "
+            "stamp such as 2026-01-31 08:00. pandas.to_datetime(column, format=...) makes it."
+        ) from None
     if unit not in ("", *SECONDS):
         raise ValueError(
             f"{path} has time stamps, and time_unit = {unit!r}: expected one of {[*SECONDS]}, "

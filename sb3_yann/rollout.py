@@ -280,7 +280,7 @@ class _Envs:
     def reset(self) -> NDArray[Any]:
         """Return the first observations (k, n)."""
         starts = enumerate(self.resets)  # the last lot may be smaller
-        shown = (self._asked(i, self.envs[i].reset, seed=s, options=o)[0] for i, (s, o) in starts)
+        shown = (self._asked(i, "reset", seed=s, options=o)[0] for i, (s, o) in starts)
         # A copy of each: an env may write its next observation into the same array.
         return np.stack([*map(np.array, shown)])
 
@@ -294,20 +294,38 @@ class _Envs:
         """Step one env, and return what is in a `_Step` of it."""
         if self.problem is not None:
             action = action.astype(self.envs[i].action_space.dtype)
-        observation, reward, terminated, truncated, info = self._asked(i, self.envs[i].step, action)
+        observation, reward, terminated, truncated, info = self._asked(i, "step", action)
         told = bool(info.get("violation", False)), bool(info.get("is_success", False))
         paid = float(info["penalty"]) if "excess" in info else 0.0  # as StageCost tells it
         flags = bool(terminated), bool(truncated), *told, may_change_reward(info)
         return np.array(observation), as_reward(reward), *flags, paid
 
-    def _asked(self, i: int, call: Callable[..., Any], *given: Any, **named: Any) -> Any:
-        """Call an env; an error says in which episode, and where in it."""
+    def _asked(self, i: int, name: str, *given: Any, **named: Any) -> Any:
+        """Call a method of an env; an error says in which episode, and where in it."""
         try:
-            return call(*given, **named)
+            answer = getattr(self.envs[i], name)(*given, **named)
+            expected = ANSWERS[name]
+            if not (
+                isinstance(answer, tuple | list)
+                and len(answer) == len(expected.split(", "))
+                and isinstance(answer[-1], dict)
+            ):
+                kinds = type(answer).__name__
+                if isinstance(answer, tuple | list):
+                    kinds = ", ".join(type(each).__name__ for each in answer)
+                raise TypeError(f"{name} returned ({kinds}), expected ({expected}), info a dict.")
+            return answer
         except Exception as error:
             where = f"step {self.steps}" if self.steps else "the reset"
             add_note(error, f"in {where} of the episode from the seed {self.resets[i][0]}")
             raise
+
+
+ANSWERS = {
+    "reset": "observation, info",
+    "step": "observation, reward, terminated, truncated, info",
+}
+"""What gymnasium asks of an env."""
 
 
 @dataclass
@@ -345,8 +363,8 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
     passed = bar(f"{n} episode{'s' * (n > 1)}: steps", total=limit_of(plant.envs[0]))
     while running.any():
         actions = np.asarray(controller(len(inputs), shown, rows))
+        inputs.append(_scattered(actions, rows, n).astype(np.float64))  # an env may write into them
         step = _Step(*(_scattered(each, rows, n) for each in plant.step(actions, rows)))
-        inputs.append(_scattered(actions, rows, n).astype(np.float64))
         states.append(step.observations.astype(np.float64))
         steps.append(step)
         passed.update()

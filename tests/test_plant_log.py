@@ -267,7 +267,7 @@ TWO = "level,valve\n"
         (f"{TWO}1,\n,2\n", ["level"], "no two samples"),
         ("level,level,valve\n1,2,3\n4,5,6\n", ["level"], "several columns 'level'"),
         (f"{TWO}1,2\n3,4\n", ["level", "valve"], "'valve' is named twice"),
-        (f"{TWO}1,2\n1,5,2,3\n", ["level"], "line 3 has more entries than the header"),
+        (f"{TWO}1,2\n1,5,2,3\n", ["level"], "line 3 has more entries than the header, .* Leave"),
     ],
 )
 def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> None:
@@ -279,6 +279,16 @@ def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> Non
         Log.from_csv(write(text), ["level"], ["valve"], 10, delimiter=";", decimal=",")
     with pytest.raises(ValueError, match=r"no column 'level'; .* pass delimiter=','.$"):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, delimiter=";")
+
+
+@pytest.mark.parametrize(("header", "first", "said"), [
+    ("time", "20260131080000", "time is '20260131080000', expected a number or a time stamp"),
+    ("time [sec]", "0", r"times in 'sec' by its header, and time_unit = 'min'"),
+])  # fmt: skip
+def test_times_in_what_is_no_unit_are_named(write, header: str, first: str, said: str) -> None:
+    text = f"{header},level,valve\n{first},1,2\n{int(first) + 10},3,4\n"
+    with pytest.raises(ValueError, match=said):
+        Log.from_csv(write(text), ["level"], ["valve"], 10, time="time", time_unit="min")
 
 
 def test_identify_takes_a_log_with_its_names(write) -> None:

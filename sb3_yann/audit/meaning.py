@@ -100,7 +100,7 @@ def warn_of_signs(
         found: list[Any] = []
         for _ in range(steps):
             taken += 1
-            after = theta(env.step(action)[0][None])[0, states]
+            after = theta(env.step(action.copy())[0][None])[0, states]
             found.append(after if estimating is None else estimating.readings)
         return np.array(found)
 

@@ -208,8 +208,11 @@ class CostAudit(BaseCallback):
         normalize = self.model.get_vec_normalize_env()
         # The buffer holds what VecNormalize has not touched, and normalizes samples of it.
         rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
-        # On-policy algorithms call what the env took "clipped".
-        actions = self.locals.get("clipped_actions", self.locals["actions"])
+        # Off-policy ones keep them in [-1, 1]: an env may write into what it is given.
+        if "buffer_actions" in self.locals:
+            actions = self.model.policy.unscale_action(self.locals["buffer_actions"])
+        else:
+            actions = self.locals["clipped_actions"]
         for i, info in enumerate(self.locals["infos"]):
             done = bool(self.locals["dones"][i])
             terminated = done and not info.get("TimeLimit.truncated", False)

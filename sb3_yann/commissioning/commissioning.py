@@ -161,8 +161,12 @@ class Commissioning:
         self._first_bound = min(self.smallest, self.largest)
         problem = self.policy.problem
         own = problem.deviations
-        parts = *problem.prediction, problem.stage_matrix, own.u_min, own.u_max
+        parts = [*problem.prediction, problem.stage_matrix, own.theta_min, own.theta_max]
+        for kind, (value, softness, _) in own.bounded.items():
+            parts += [value, softness, *own.limit_rows(kind)]
+        parts.append(np.array([own.horizon, own.gamma, own.soft.penalty or 0.0]))
         numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
+        numbers += f"{own.control_horizon} {own.infeasible}".encode()
         names = "batch", "excite", "shadow", "rounds", "updates", "seed"
         begin = {
             **{name: getattr(self, name) for name in names},

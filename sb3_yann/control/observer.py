@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, check_array, check_int, check_outputs, check_positive_vector
+from sb3_yann._validation import (
+    Array,
+    check_array,
+    check_int,
+    check_outputs,
+    check_positive_vector,
+    check_symmetric,
+)
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
 
@@ -292,8 +299,8 @@ def _covariance(name: str, value: ArrayLike, size: int) -> tuple[Array, list[flo
         deviations = check_positive_vector(name, value, size, "Give standard deviations, above 0.")
         with np.errstate(all="ignore"):
             return np.diag(deviations**2), deviations.tolist()
-    given = check_array(name, value, (size, size))
-    return (given + given.T) / 2, np.sqrt(np.abs(np.diag(given))).tolist()
+    given = check_symmetric(name, value, size)
+    return given, np.sqrt(np.diag(given)).tolist()
 
 
 def _require_observable(model: LinearModel, E: Array, C: Array) -> None:

@@ -337,9 +337,11 @@ class ImprovementGuard(BaseCallback):
             found: Any = self._audit.finding
             if found is not None and found.matches and not self.player.pays_cost:
                 warn(
-                    f"The training env pays minus the cost of the MPC, and the guard's env "
-                    f"{self.settings.env} pays something else, by which policies are compared. "
-                    "Give the guard the env of the training, with the same StageCost.",
+                    "The first steps of training pay minus the cost of the MPC, and the guard's "
+                    f"env {self.settings.env} pays something else, by which policies are compared. "
+                    "Give it the env of the training, with the same StageCost; if it has it, its "
+                    "reward holds more where its starts lead. The guard itself counts what soft "
+                    "bounds cost.",
                 )
         dones = self.locals["dones"]
         state = self.state

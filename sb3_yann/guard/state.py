@@ -338,6 +338,7 @@ def summary_of(state: GuardState, policy: StartsAsMPC, eval_freq: int = 1) -> st
             f"{', '.join(map(str, lost[:10]))}{', ...' * (len(lost) > 10)}"
         )
     counts = Counter(each.verdict for each in decisions)
+    last = decisions[-1].reason if decisions else ""
     refused = [each.reason for each in decisions if each.verdict == "rejected"]
     kinds = [next((words for words in REFUSAL_ADVICE if words in why), why) for why in refused]
     candidates = "none was tried yet"
@@ -365,5 +366,6 @@ def summary_of(state: GuardState, policy: StartsAsMPC, eval_freq: int = 1) -> st
         steps=f"{state.steps:,} of the guard's simulator" if state.steps else "",
         candidates=candidates,
         refused=refusals,
+        end=last * last.startswith("at the end"),
         next=more,
     )

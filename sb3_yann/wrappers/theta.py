@@ -87,8 +87,8 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Step; the observation is the completed one."""
+        u = np.clip(np.array(action, np.float64), self.inputs.low, self.inputs.high)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
         return self._shown(observation, u, info), float(reward), terminated, truncated, info
 
     def _shown(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:

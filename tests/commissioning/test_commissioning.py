@@ -203,6 +203,16 @@ def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once(begun) -
     assert turn not in run.journal.log
 
 
+@pytest.mark.parametrize("change", [{"horizon": 4}, {"gamma": 0.9}, {"x_max": [4.0, 3.0]}])
+def test_a_record_of_another_mpc_is_refused(begun, tmp_path: Path, change: dict) -> None:
+    begun()
+    mpc = replace(problem(), **change)
+    model = DDPG(YannPolicy, Cart(), policy_kwargs={"problem": mpc}, seed=0, device="cpu")
+    with pytest.raises(ValueError, match="problem"):
+        settings = {"batch": 5, "updates": 200, "max_correction": 0.2}
+        Commissioning(model, Cart, log_path=tmp_path / "plant", **settings)
+
+
 def test_a_violation_takes_the_policy_back(begun) -> None:
     turn = policys_turn(commission())
     run = begun(env=Faulty(Cart(), turn - 5, "violation"))

@@ -29,6 +29,7 @@ LAW_TOL = 1e-6
 """How far a law may be off, in half-widths of the input range."""
 INSIDE_TOL = 1e-8
 """How far a point may lie from a region that holds it, in half-widths of the box."""
+SLIVER = 1e-6  # half-widths of theta, so thin that rounding decides where a region ends
 IMPLIED_TOL = 1e-9
 """How far a region may reach beyond its conditions, and equal half-spaces may differ."""
 
@@ -83,10 +84,10 @@ class Certificate:
         self.balls = [region.ball() for region in regions]
         # Two looks at each region.
         self.timer.stage("regions checked", "and not all were checked", 2 * len(self.balls))
-        for i, (middle, _) in enumerate(self.balls):
+        for i, (middle, radius) in enumerate(self.balls):
             self.timer.tick(self.qp_effort)
-            U = self.program.solve(middle)
-            if U is None or self._error(np.array([i]), middle[None], U[None])[0] > LAW_TOL:
+            U = self.program.solve(middle)  # None in slivers along the edge of the feasible set
+            if radius > SLIVER if U is None else self._is_wrong(i, middle, U):
                 self._fail(f"the law of region {i} is not optimal inside it", middle)
             self.timer.advance()
         refined = list(regions)
@@ -115,6 +116,10 @@ class Certificate:
         off = np.einsum("kvn,kn->kv", gains, points) + laws[..., -1] - inputs @ self.to_inputs.T
         return np.asarray(np.abs(off).max(axis=1) - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1))
 
+    def _is_wrong(self, i: int, point: Array, U: Array) -> bool:
+        """Return whether the law of region i is not the answer of a QP at a point."""
+        return bool(self._error(np.array([i]), point[None], U[None])[0] > LAW_TOL)
+
     def _checked(self, i: int, kkt: Optimality) -> Region:
         """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
         region = self.regions[i]
@@ -142,7 +147,7 @@ class Certificate:
         """Return which conditions the half-spaces of region i just do not imply.
 
         They are left out where they seem to touch the region alone. Raise if it lies farther
-        beyond one; ``known`` marks the conditions that are among the half-spaces.
+        beyond one, and its law is another there; ``known`` marks those among the half-spaces.
         """
         region = self.regions[i]
         inside, radius = self.balls[i]
@@ -158,7 +163,10 @@ class Certificate:
         beyond = np.sum(rows[:, :n] * points, axis=1) - rows[:, n]
         worst = int(np.argmax(beyond))
         if beyond[worst] > INSIDE_TOL:
-            self._fail(f"the law of region {i} violates the KKT conditions", points[worst])
+            at = points[worst]
+            U = self.program.solve(at)  # None beyond the feasible set, of which this is the edge
+            if beyond[worst] > SLIVER or (U is not None and self._is_wrong(i, at, U)):
+                self._fail(f"the law of region {i} violates the KKT conditions", at)
         return np.asarray(others[beyond > IMPLIED_TOL])
 
     def _beyond(self, candidates: Iterable[int]) -> tuple[int, ...] | None:

@@ -299,9 +299,16 @@ class LinearMPC(MPCProblem):
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""
         A, B = self.prediction
-        at = self.units.to_deviations(to_float("theta", theta))
-        v = self.units.input_to_deviations(to_float("u", u))
+        at, v = self._deviations_of(theta, u)
         return self.units.to_plant(at @ A.T + v @ B.T)
+
+    def _deviations_of(self, theta: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        at = to_float("theta", theta)
+        v = to_float("u", u)
+        for name, given, size in ("theta", at, self.n_theta), ("u", v, self.model.n_inputs):
+            if not given.ndim or given.shape[-1] != size:
+                raise ValueError(f"{name} has shape {given.shape}, expected (..., {size}).")
+        return self.units.to_deviations(at), self.units.input_to_deviations(v)
 
     def simulate(self, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
         """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model.
@@ -329,8 +336,8 @@ class LinearMPC(MPCProblem):
         :meth:`is_reachable` says no, a part of the cost stays with any controller.
         """
         errors = self.error_system
-        at = self.units.to_deviations(to_float("theta", theta))
-        v = self.units.input_to_deviations(to_float("u", u)) - at @ errors.to_input.T
+        at, v = self._deviations_of(theta, u)
+        v = v - at @ errors.to_input.T
         z = at @ errors.to_error.T
         cost = np.sum((z @ errors.Q) * z, axis=-1) + np.sum((v @ errors.R) * v, axis=-1)
         if errors.cross is not None:

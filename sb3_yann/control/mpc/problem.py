@@ -404,6 +404,8 @@ class MPCProblem(ReadOnlyArrays):
                 f"reachable: its steady state is x_s = {x.tolist()}, u_s = {u.tolist()}, and "
                 f"{broken}. Ask is_reachable(r, d) first, or choose a reference nearer to the "
                 "operating point."
+                + " Another balance of the inputs may reach it: R sets it."
+                * (self.model.n_inputs > p)
             )
         return x, u
 
