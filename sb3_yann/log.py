@@ -392,8 +392,8 @@ class Log:
                 instants = instants * SECONDS[own] / SECONDS[unit]
             elif own not in ("", unit):
                 raise ValueError(
-                    f"{path} has times in {own!r} by its header, and time_unit = {unit!r}: expected "
-                    f"are {[*SECONDS]}, in both."
+                    f"{path} has times in {own!r} by its header, and time_unit = {unit!r}: "
+                    f"expected are {[*SECONDS]}, in both."
                 )
             times = [instants[part] for part in parts]
         names, units = zip(*map(_name_and_unit, wanted[: n + m + d]), strict=True)

@@ -61,6 +61,7 @@ class Countdown(gym.Env):
         reward = -float(self.left + action[0])
         if self.left == 13:
             raise ArithmeticError("thirteen")
+        action[...] = 9  # an env may write into what it is given
         violation = self.left == 2
         self.left -= 1
         observation = np.full(1, self.left, np.float32)
@@ -92,6 +93,13 @@ def test_episodes_of_different_length_wait_for_nobody() -> None:
     assert [each[:, 0].tolist() for each in episodes.observations][:2] == [[3, 2, 1, 0], [1, 0]]
     np.testing.assert_allclose(episodes.actions[0][:, 0], [0.3, 0.2, 0.1], rtol=1e-6)
     assert_equal(episodes, evaluate(Tenth(), Countdown(), [3, 1, 4]))
+
+
+def test_an_answer_that_lacks_something_is_named(monkeypatch) -> None:
+    whole = Countdown.step
+    monkeypatch.setattr(Countdown, "step", lambda self, action: whole(self, action)[:4])
+    with pytest.raises(TypeError, match=r"step returned \(ndarray, float, bool, bool\), expected"):
+        evaluate(Tenth(), Countdown, [3])
 
 
 @pytest.mark.parametrize("version", [(3, 10), (3, 11)])

@@ -74,10 +74,10 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Facets:
     From a theta in it the law ``v = -K z``, with K the gain of the terminal cost, keeps all hard
     bounds of x, u, y and the rate for ever on the model, with r and d constant. The boxes of r, d
     and ``u_prev``, and ten times that of the states, are taken for granted. Steady states lie
-    inside by one percent: the number of steps is finite (Gilbert & Tan, Linear systems with state and
-    control constraints, IEEE Trans. Autom. Control 36 (1991), Section V). ValueError if the gain
-    does not stabilize the model, the origin is not inside all bounds, or 500 steps or 200 rows are
-    not enough.
+    inside by one percent: the number of steps is finite (Gilbert & Tan, Linear systems with state
+    and control constraints, IEEE Trans. Autom. Control 36 (1991), Section V). ValueError if the
+    gain does not stabilize the model, the origin is not inside all bounds, or 500 steps or 200 rows
+    are not enough.
     """
     errors = problem.error_system
     K = lqr.gain(errors.model, errors.R, cost, problem.gamma, errors.cross)
