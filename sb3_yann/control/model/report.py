@@ -220,7 +220,7 @@ def _gains(model: LinearSystem) -> list[str]:
             f"{inputs[j]} on {states[i]}{', its rate' * bool(gains.degrees[i, j])}"
             for i, j in unsure
         )
-        noise = "process noise" if model.C is None else "process and sensor noise"
+        noise = "process noise" if model.C is None else "process and sensor noise, if the order is right"
         text = f" Not distinguishable from zero: {none}." if none else ""
         if any(each.endswith(UNTOLD) for each in model.notes):
             noise += " alone: the notes say what there is besides, by which gains err more"

@@ -278,7 +278,7 @@ def test_intervals_of_poles_and_gains_hold_the_truth_nearly_as_often_as_they_say
         assert told is not None and not told.errors[1:].any()  # only the first state is an output
         inside.append(np.abs(told.values[:1] - gains) <= 1.96 * told.errors[:1])
     assert np.mean(inside) > 0.85
-    assert "± is a 95 % interval, under process and sensor noise.\n" in found.report()
+    assert "± is a 95 % interval, under process and sensor noise, if the order is right.\n" in found.report()
 
 
 def test_an_output_that_integrates_has_a_rate_and_no_gain() -> None:
