@@ -220,10 +220,12 @@ def _gains(model: LinearSystem) -> list[str]:
             f"{inputs[j]} on {states[i]}{', its rate' * bool(gains.degrees[i, j])}"
             for i, j in unsure
         )
-        noise = "process noise" if model.C is None else "process and sensor noise, if the order is right"
+        noise = "process noise" if model.C is None else "process and sensor noise"
         text = f" Not distinguishable from zero: {none}." if none else ""
         if any(each.endswith(UNTOLD) for each in model.notes):
             noise += " alone: the notes say what there is besides, by which gains err more"
+        elif model.C is not None:
+            noise += ", if the order is right"
         if any(each.startswith(CURVED) for each in model.notes):
             text = f" It is of a linear fit, and does not cover the curvature.{text}"
         lines.append(f"  ± is a 95 % interval, under {noise}.{text}")
