@@ -3,7 +3,6 @@
 import io
 import math
 import sys
-from typing import Any
 
 import numba
 import pytest
@@ -78,12 +77,6 @@ def test_where_another_bar_has_taken_stderr_there_are_lines(monkeypatch) -> None
     assert not is_watched()
 
 
-def test_a_notebook_is_watched(monkeypatch) -> None:
-    stream: Any = type("OutStream", (io.StringIO,), {"__module__": "ipykernel.iostream"})
-    monkeypatch.setattr(sys, "stderr", stream())
-    assert is_watched()
-
-
 def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     progress = Progress(lambda: 1234)
     clock.now += 5.0
@@ -91,41 +84,6 @@ def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     assert capsys.readouterr().err == (
         "[    5 s     1,234 steps, about 20 s more if all is needed] a round is over\n"
     )
-
-
-def test_bars_of_parts_count_foretell_nothing_and_leave_little_in_a_file_but_the_first(
-    clock, capsys, monkeypatch
-) -> None:
-    counted(clock, each=1.0)  # of another call
-    capsys.readouterr()
-    with shown(True, parts=True):
-        for seconds, lines in ((1.0, ["plans: 3 of 100"]), (1.9, []), (1.9, ["plans: 7 of 100"])):
-            counted(clock, seconds)
-            assert capsys.readouterr().err.splitlines() == lines
-        Progress()("what is counted next")
-        counted(clock, each=1.0, n=20, timed=True)  # what nothing else foretells
-        assert capsys.readouterr().err == "plans: 3 of 20, 00:03 so far, 00:17 left\n"
-        counted(clock, each=1.0, n=2, timed=True)  # too short to say a word, it lets no part by
-        counted(clock, each=1.0, n=20)
-        assert capsys.readouterr().err == ""
-        screen = Terminal()
-        monkeypatch.setattr(sys, "stderr", screen)
-        monkeypatch.setattr(sys, "__stderr__", screen)
-        counted(clock, each=1.0)
-    assert "plans: 3 of 100" in screen.getvalue()
-
-
-def test_a_detail_is_a_line_of_a_file_where_there_was_no_other_of_late(clock, capsys) -> None:
-    progress = Progress()
-    clock.now += 5.0
-    progress("a round is over")
-    for _ in range(4):
-        clock.now += 10.0
-        progress("a fit", detail=True)
-    assert [each.partition("] ")[2] for each in capsys.readouterr().err.splitlines()] == [
-        "a round is over",
-        "a fit",
-    ]
 
 
 def test_false_silences_all_that_is_called(clock, capsys) -> None:

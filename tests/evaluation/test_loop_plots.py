@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sample_laws import reactor_in_plant_units
-from sb3_yann import LinearModel, LinearMPC, SoftBounds, Tracking
+from sb3_yann import LinearModel, LinearMPC, Tracking
 from sb3_yann.evaluation import Trajectories, comparison_table, evaluate
 from sb3_yann.evaluation.plots import (
     loops_figure,
@@ -71,20 +71,6 @@ def test_of_many_episodes_the_median_and_a_band_are_drawn() -> None:
     np.testing.assert_allclose(spans, [high - low])
 
 
-def test_limits_are_drawn_near_the_data_alone() -> None:
-    axes = plot_loop(tank(x_max=13.2), {"MPC": episodes(4)}, "level")
-    drawn = [line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1]
-    assert 13.2 in drawn and 9.0 not in drawn
-    low, high = axes.get_ylim()
-    assert 9.0 < low < 12 and high > 13.2
-
-
-def test_a_soft_limit_is_called_one() -> None:
-    soft = tank(x_max=12.5, soft=SoftBounds(x=1.0, penalty=10.0))
-    labels = plot_loop(soft, {"MPC": episodes(4)}, "level").get_legend_handles_labels()[1]
-    assert "soft limit" in labels
-
-
 def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
     mpc = tank(tracking=Tracking([0], 10, 14))
     played = episodes(2, size=2)
@@ -94,33 +80,6 @@ def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
     axes = plot_loop(mpc, {"MPC": played}, "level")
     (line,) = (each for each in axes.lines if each.get_label() == "set-point")
     assert set(line.get_ydata()) == {13.0}
-
-
-def test_where_set_points_differ_the_distance_from_them_is_drawn() -> None:
-    axes = plot_loop(tank(tracking=Tracking([0], 10, 14)), {"MPC": episodes(3, size=2)}, "level")
-    assert axes.get_ylabel() == "level (m)\nless its set-point"
-    played = episodes(9, size=2)
-    for k, x in enumerate(played.observations):
-        x[:, 1] = x[0, 0] + 0.5 + k / 100
-        x[-1, 1] = 21.0
-    axes = plot_loop(tank(tracking=Tracking([0], 10, 14)), {"MPC": played}, "level")
-    (median,) = (line for line in axes.lines if len(line.get_ydata()) == 5)
-    np.testing.assert_allclose(median.get_ydata(), -0.54)
-    assert axes.get_ylabel() == "level (m)\nless its set-point"
-
-
-def test_below_many_pairs_lie_their_differences() -> None:
-    before = episodes(9)
-    after = episodes(9)
-    for x in after.observations:
-        x += 0.25
-    figure = loops_figure(tank(), {"before": before, "after": after})
-    rows = [panel.get_subplotspec().rowspan.start for panel in figure.axes]
-    assert rows == [0, 0, 1, 1]
-    difference = figure.axes[2]
-    assert difference.get_ylabel() == "difference (m)"
-    np.testing.assert_allclose(difference.lines[0].get_ydata(), 0.25)
-    assert len(loops_figure(tank(), {"before": before, "after": episodes(20)}).axes) == 2
 
 
 def test_gains_are_sorted_and_in_percent_of_the_first_one_s_mean() -> None:
