@@ -52,7 +52,7 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     search = _Walk(program, timer)
     search.explore(search.seeds(20))
     for _ in range(10):
-        missed = set(search.seeds(20 * program.F.shape[1])) - search.visited
+        missed = set(search.seeds(100 * program.F.shape[1])) - search.visited
         if not missed:
             break
         search.explore(missed)

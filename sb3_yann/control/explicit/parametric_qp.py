@@ -17,6 +17,7 @@ ROW_NORM_TOL = 1e-7
 
 Where such a bound is active, the law is so steep that its own rounding shows.
 """
+SAME_ROW = 1e-9  # by how much entries of unit rows differ that rounding tells apart
 DEPENDENT = 1e-9
 """Constraints whose part across those of an active set is smaller, relative to all, depend on it.
 """
@@ -121,6 +122,21 @@ class ParametricQP:
         short = (moved < ROW_NORM_TOL) & np.any(self.G, axis=1) & np.any(self.S, axis=1)
         w = self.w - np.where(short, moved, 0.0)
         return replace(self, G=np.where(short[:, None], 0.0, self.G), w=w)
+
+    def without_twins(self) -> ParametricQP:
+        """Return the program in which of rows that are the same but for rounding one counts.
+
+        Late states of a plant that has come to rest make such rows. Rows are of unit length.
+        """
+        rows = np.hstack([self.G, self.S])
+        kept = list[int]()
+        twins = list[int]()
+        for i in np.argsort(self.w, kind="stable").tolist():
+            near = kept and np.abs(rows[kept] - rows[i]).max(axis=1).min() < SAME_ROW
+            (twins if near else kept).append(i)
+        none = np.isin(np.arange(len(rows)), twins)
+        G, S = (np.where(none[:, None], 0.0, each) for each in (self.G, self.S))
+        return replace(self, G=G, S=S, w=np.where(none, 1.0, self.w)) if twins else self
 
     def scaled(self, u_min: Array, u_max: Array, center: Array) -> tuple[ParametricQP, Array]:
         """Return the program in half-widths, of unit rows, and those of U (v,), 1 for slacks.
