@@ -176,7 +176,9 @@ def _swapped(modelled: Array, answers: Array) -> str:
 def _push(env: gym.Env[Any, Any], action: Array, j: int) -> Array:
     """Return an action whose entry j is half the way to the bound that is farther away."""
     space: Any = env.action_space
-    ends = np.clip([space.low[j], space.high[j]], action[j] - 1e3, action[j] + 1e3)
+    width = float(space.high[j]) - float(space.low[j])
+    far = width if width < 1e30 else 1e3
+    ends = np.clip([space.low[j], space.high[j]], action[j] - far, action[j] + far)
     pushed = np.array(action, dtype=space.dtype)
     pushed[j] = (action[j] + max(ends, key=lambda end: abs(end - action[j]))) / 2
     return pushed

@@ -142,8 +142,9 @@ class Plant:
             excess = beyond.largest
             limit = allowed if act == self.policy else np.inf
             sized = EXCESS_ROOM < excess <= limit
-            violated = bool(info.get("violation", False)) or terminated
-            forbidden = terminated or bool(excess > limit) or (violated and not sized)
+            lost = terminated and not info.get("is_success", False)
+            violated = bool(info.get("violation", False)) or lost
+            forbidden = lost or bool(excess > limit) or (violated and not sized)
             reward += float(gained)
             violations += violated or bool(excess > EXCESS_ROOM)
             unsafe += forbidden

@@ -252,9 +252,10 @@ def sample_observations(controller: Controller, count: int, seed: int = 0) -> Ar
 def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     """Return the rows of obs whose answer a rounding of the observation does not change.
 
-    A policy with a network for each region jumps from one to the next.
+    A policy with a network for each region jumps from one to the next: readings are moved by many
+    roundings, and the answer may change by as many times its room.
     """
-    size = 1e-6 if precision == "float" else 1e-13
+    size, times = (1e-6, 10) if precision == "float" else (1e-13, 100)
     largest = np.maximum(np.abs(obs).max(0), np.finfo(float).tiny)
     # A small row's roundings are small: what is near to rest is kept beside a wide box.
     scale = largest * (np.abs(obs) / largest).max(axis=1, keepdims=True)
@@ -270,7 +271,7 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
             moved = obs.copy()
             moved[:, j] += sign * 2 * size * scale[:, j]
             change = np.abs(controller.evaluate(moved) - actions) / half
-            kept &= (change < room).all(1)
+            kept &= (change < times * room).all(1)
             kept &= controller.in_domain(moved) == inside
     return np.asarray(obs[kept])
 

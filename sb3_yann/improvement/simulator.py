@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_yann._progress import shown
 from sb3_yann._validation import Array, NonFiniteWarning, warn
 from sb3_yann.audit.meaning import (
+    SIGN_STARTS,
+    SIGN_STEPS,
     in_deviations,
     require_spaces,
     require_theta_shown,
@@ -180,7 +182,9 @@ class Simulator:
 
     def needed(self, later: int) -> int:
         """Return how many steps the first episodes and so many later ones take; 0: not known."""
-        return self.longest * (self.usual + 1 + later)
+        m = self.problem.model.n_inputs
+        pushes = m if self.row.estimator is None else SIGN_STEPS * (m + 1)
+        return self.longest * (self.usual + 1 + later) + SIGN_STARTS * pushes * (self.longest > 0)
 
     @property
     def steps(self) -> int:

@@ -278,7 +278,8 @@ class LinearMPC(MPCProblem):
         if shown.shape == (model.n_states,):
             low = np.asarray(shown.low, np.float64)
             high = np.asarray(shown.high, np.float64)
-            bounded = np.abs([low, high]) < 1e6  # "no bound" may be the largest float32
+            # "No bound" may be the largest float32.
+            bounded = np.abs([low, high]) < 1e6 * np.maximum(np.abs(model.x_ss), 1.0)
             limits["theta_min"] = np.where(bounded[0], low, -np.inf)
             limits["theta_max"] = np.where(bounded[1], high, np.inf)
         if isinstance(own, LinearMPC):  # a PlantEnv's
