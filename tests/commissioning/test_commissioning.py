@@ -84,6 +84,9 @@ class Faulty(gym.Wrapper[Any, Any, Any, Any]):
                 observation = np.append(observation[:1], np.float32(np.nan))
             elif self.fault == "violation":
                 info = {**info, "violation": self.numbers[1] == self.at[1]}
+            else:
+                info = {**info, "is_success": True}
+                terminated = True
         return observation, reward, terminated, over, info
 
 
@@ -233,6 +236,13 @@ def test_steps_of_the_mpc_beyond_a_bound_are_counted_and_alarm_nobody() -> None:
     assert played.alarm is None
     ours = plant.play(plant.begin(seed), plant.policy, None, allowed=0.0)
     assert ours.unsafe > 0 and ours.alarm.kind == "violation"
+
+
+def test_an_end_that_is_a_success_alarms_nobody() -> None:
+    plant = Plant(Faulty(Cart(), 0, "success"), DDPG(YannPolicy, Cart(), device="cpu"))
+    played = plant.play(plant.begin(0), plant.policy, None, allowed=0.0)
+    assert len(played.actions) == 5 and played.alarm is None
+    assert played.unsafe == played.violations == 0
 
 
 def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:

@@ -130,6 +130,17 @@ def test_inputs_without_bounds_and_a_box_that_mostly_has_no_solution(wide, tmp_p
     assert self_test(tmp_path).returncode == 0
 
 
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_readings_that_are_large_beside_their_box_are_exported(precision, tmp_path):
+    A = [[0.92, 0.05, 0], [0, 0.85, 0.1], [0.02, 0, 0.7]]
+    B = [[0.3, 0], [0.1, 0.2], [0, 0.25]]
+    model = LinearModel(A, B, 2.0, x_ss=[50, 300, 12], u_ss=[3, 40])
+    limits = {"u_min": [0, 20], "u_max": [6, 60], "x_min": [45, 290, 0], "x_max": [55, 310, 30]}
+    weights = {"Q": np.diag([1, 0.2, 0.1]), "R": np.diag([0.5, 0.02]), "horizon": 3}
+    export(LinearMPC(model, **weights, **limits), tmp_path / "plant.c", precision=precision)
+    assert self_test(tmp_path).returncode == 0
+
+
 def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
     model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, x_ss=[1e8, 0], u_ss=[0])
     bounds = {"x_min": [1e8 - 5, -2], "x_max": [1e8 + 5, 2], "u_min": -1, "u_max": 1}
