@@ -61,16 +61,6 @@ def test_few_episodes_are_lines_in_plant_units() -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "level (m)")
 
 
-def test_of_many_episodes_the_median_and_a_band_are_drawn() -> None:
-    axes = plot_loop(tank(), {"MPC": episodes(50)}, "flow")
-    values = 40 - np.arange(50) / 50
-    (median,) = (line for line in axes.lines if len(line.get_ydata()) == 5)
-    assert set(median.get_ydata()) == {np.median(values)}
-    spans = [np.ptp(each.get_paths()[0].vertices[:, 1]) for each in axes.collections]
-    low, high = np.percentile(values, [10, 90])
-    np.testing.assert_allclose(spans, [high - low])
-
-
 def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
     mpc = tank(tracking=Tracking([0], 10, 14))
     played = episodes(2, size=2)
@@ -111,13 +101,6 @@ def test_the_surface_is_the_law_in_plant_units() -> None:
     values = np.asarray(mesh.get_array()).reshape(121, 121)
     assert values[40, 60] == pytest.approx(mpc.explicit().plant_input(shown)[0])
     assert values.min() == pytest.approx(0, abs=1e-9) and values.max() == pytest.approx(110)
-
-
-@pytest.mark.parametrize("entries", [(0, 0), (0, "x"), (0, 9)])
-def test_a_surface_needs_two_coordinates(entries) -> None:
-    mpc = problems.clipped_pendulum()
-    with pytest.raises(ValueError, match=r"entr(y|ies)"):
-        plot_surface(mpc, mpc.explicit(), entries=entries)
 
 
 def test_use_counts_steps_and_distances_by_region() -> None:
