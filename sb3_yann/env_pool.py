@@ -78,6 +78,10 @@ def maker(env: Any, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]
     return partial(copy.deepcopy, source)
 
 
+class ProcessEndedError(RuntimeError):
+    """An env of a VecEnv has raised an error, and plays no more."""
+
+
 class OneOf(gym.Env[Any, Any]):
     """One env of a Stable-Baselines3 VecEnv: it waits for no other, and resets alone.
 
@@ -92,11 +96,20 @@ class OneOf(gym.Env[Any, Any]):
 
     def reset(self, **kwargs: Any) -> Any:
         """Start an episode."""
-        return self.all.env_method("reset", indices=[self.number], **kwargs)[0]
+        return self._asked("reset", **kwargs)
 
     def step(self, action: Any) -> Any:
         """Step this env alone."""
-        return self.all.env_method("step", action, indices=[self.number])[0]
+        return self._asked("step", action)
+
+    def _asked(self, name: str, *given: Any, **named: Any) -> Any:
+        try:
+            return self.all.env_method(name, *given, indices=[self.number], **named)[0]
+        except (EOFError, ConnectionError) as error:
+            raise ProcessEndedError(
+                f"The process of env {self.number} has ended: its own error is above, on stderr. "
+                "Let its step return terminated=True in a state that it cannot be in."
+            ) from error
 
 
 def is_vec_env(env: Any) -> bool:

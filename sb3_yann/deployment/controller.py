@@ -76,7 +76,7 @@ class Controller:
     A faulty reading is replaced by the last good one, and the MPC's law acts alone. An estimator
     goes on without a faulty output. After ``hold``
     steps with a fault the output is held: manual. Once the readings are good again the law acts,
-    and after ``recover`` good steps the policy. At every change the output goes on from where it
+    and at the ``recover``-th good step the policy. At every change the output goes on from where it
     was, and the difference fades within ``transfer`` steps.
 
     Take it from :meth:`load`; the limits of the checks are in the file, see `export`.

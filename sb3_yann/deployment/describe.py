@@ -54,7 +54,7 @@ class Checks:
     hold : int, default 5
         Steps with a faulty reading that the last good one stands in for; then the output is held.
     recover : int, default 10
-        Steps without a fault before the policy acts again. The MPC's law acts until then.
+        The policy acts again at so many steps without a fault. The MPC's law acts until then.
     transfer : int, default 5
         Steps within which a change of who acts fades.
 

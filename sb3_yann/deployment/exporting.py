@@ -128,8 +128,10 @@ def export(
         )
     if not target.parent.is_dir():
         raise FileNotFoundError(f"There is no folder {target.parent}: make it first.")
-    if kind in ("st", "xml") and prefix.upper() in RESERVED:
-        raise ValueError(f"name = {prefix!r} is a word of Structured Text. Pass another name.")
+    if kind in ("st", "xml") and RESERVED.fullmatch(prefix):
+        raise ValueError(
+            f"name = {prefix!r} is a word of Structured Text, or no name in it. Pass another name."
+        )
     if kind == "c" and target.stem.lower() in ("math", "stddef", "stdint", "stdio"):
         raise ValueError(
             f"{target.stem}.h would stand in for C's own header: call the file something else."

@@ -30,7 +30,7 @@ from sb3_yann.audit.meaning import (
 from sb3_yann.compare import NewSeeds, unsafe_columns
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import costs_of
-from sb3_yann.env_pool import Source, maker, name_of, pool_of
+from sb3_yann.env_pool import ProcessEndedError, Source, maker, name_of, pool_of
 from sb3_yann.plan import WEIGHT, Disagreement, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import (
     Controller,
@@ -87,7 +87,7 @@ class _Counted(gym.Wrapper[Any, Any, Any, Any]):
         try:
             return self.env.step(action)
         except Exception as error:  # whatever it raises in a state that it cannot be in
-            if self.count.strict:
+            if self.count.strict or isinstance(error, ProcessEndedError):
                 raise
             warn(
                 f"The simulator raised {error!r}: what leads there ends there, and counts as lost. "
@@ -248,7 +248,7 @@ class Simulator:
         begun = time.monotonic()
         joblib: Any = sys.modules.get("joblib")
         alone = joblib is None or self.envs.most or getattr(controller, "remembers", False)
-        jobs = 1 if alone else min(joblib.effective_n_jobs(), len(seeds))
+        jobs = 1 if alone else min(joblib.effective_n_jobs(None), len(seeds))
         if jobs > 1:
             parts = np.array_split(np.arange(len(seeds)), jobs)
             found = joblib.Parallel()(

@@ -309,6 +309,7 @@ def test_arrays_that_do_not_fit_together_are_named(tmp_path):
         ({"path": "plant.xyz"}, ValueError, "format"),
         ({"path": "2 tanks.c"}, ValueError, "name = '2 tanks'"),
         ({"path": "real.st"}, ValueError, "name = 'real' is a word of Structured Text"),
+        ({"path": "end_var.st"}, ValueError, "name = 'end_var' is a word of Structured Text"),
         ({"path": "no/plant.c"}, FileNotFoundError, "There is no folder"),
         ({"path": "math.c", "name": "plant"}, ValueError, "math.h"),
         ({"precision": "half"}, ValueError, "precision"),
