@@ -24,7 +24,10 @@ def room_of(data: ControllerArrays, precision: str, inside: bool = True) -> floa
     """Return how far code of a controller may be off, in parts of an input's range."""
     if "qp_gram" not in data:
         return ROOM[precision]
-    return 1e-9 if inside else 1e-6  # constraints that give way cost digits
+    if not inside:
+        return 1e-6  # constraints that give way cost digits
+    # Multipliers of steep soft bounds lose the digits that their effect on the inputs is large by.
+    return 1e-9 * max(1.0, float(np.abs(data["qp_E"]).max(initial=0.0)) / 10)
 
 
 def scale_within(
