@@ -39,10 +39,10 @@ def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
     # Beyond the box inputs may rest at their bounds, whatever is lost of a reading.
     steady = [np.any(controller.in_domain(each)) for each in (drawn, obs)]
     if not len(obs) or steady == [True, False]:
+        cure = "Pass precision='double'." if precision == "float" else "Export npz, st or onnx."
         raise ValueError(
             f"In {precision} a rounding of a reading moves the output by more than {room:g} of its "
-            "range, at all points tried: readings are large beside what they move by. Pass "
-            "precision='double'."
+            f"range, at all points tried: readings are large beside what they move by. {cure}"
         )
     ranges = code.input_ranges(controller, controller.evaluate(drawn))
     run = _closed_loop(data, obs) if "est_gain" in data else _steps(obs)
