@@ -106,6 +106,8 @@ class OneOf(gym.Env[Any, Any]):
         try:
             return self.all.env_method(name, *given, indices=[self.number], **named)[0]
         except (EOFError, ConnectionError) as error:
+            if not hasattr(self.all.unwrapped, "remotes"):  # it is the env's own
+                raise
             raise ProcessEndedError(
                 f"The process of env {self.number} has ended: its own error is above, on stderr. "
                 "Let its step return terminated=True in a state that it cannot be in."

@@ -283,7 +283,7 @@ def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> Non
 
 @pytest.mark.parametrize(("header", "first", "said"), [
     ("time", "20260131080000", "time is '20260131080000', expected a number or a time stamp"),
-    ("time [sec]", "0", r"times in 'sec' by its header, and time_unit = 'min'"),
+    ("time [ticks]", "0", r"times in 'ticks' by its header, and time_unit = 'min'"),
 ])  # fmt: skip
 def test_times_in_what_is_no_unit_are_named(write, header: str, first: str, said: str) -> None:
     text = f"{header},level,valve\n{first},1,2\n{int(first) + 10},3,4\n"

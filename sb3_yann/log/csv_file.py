@@ -16,6 +16,7 @@ import numpy as np
 from sb3_yann._validation import Array, warn
 
 SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}  # in a unit of time
+WORDS = {"sec": "s", "min": "min", "hour": "h", "hr": "h", "day": "d"}  # how headers begin them
 
 
 class CsvFile:
@@ -104,6 +105,7 @@ class CsvFile:
     def times(self, name: str, unit: str) -> tuple[Array, str]:
         """Return a column of times (rows,) in a unit, and the unit: without one the header's."""
         own = self.name_and_unit(name)[1]
+        own = next((s for word, s in WORDS.items() if own.lower().startswith(word)), own)
         unit = unit or own
         instants, stamped = np.array([self._time(k, name, unit) for k in range(len(self.rows))]).T
         if np.any(stamped):
@@ -121,7 +123,7 @@ class CsvFile:
         """Return a time as it is given, or an ISO 8601 time stamp in the unit; and which it is."""
         with suppress(ValueError):
             number = self._number(k, name)
-            if not any(1.9 < number / size < 2.1 for size in (1e11, 1e13)):  # 20260131080000
+            if not _is_compact((self.rows[k][name] or "").strip()):
                 return number, False
         text = self.rows[k][name]
         try:
@@ -141,6 +143,14 @@ class CsvFile:
         epoch = datetime(1970, 1, 1, tzinfo=stamp.tzinfo and timezone.utc)
         passed = (stamp - epoch).total_seconds()
         return passed / SECONDS[unit or "s"], True
+
+
+def _is_compact(text: str) -> bool:
+    """Return whether a number is a time stamp as 20260131080000, or without its seconds."""
+    form = {12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}.get(len(text))
+    with suppress(ValueError):
+        return form is not None and 1900 < datetime.strptime(text, form).year < 2100
+    return False
 
 
 def _is_word(text: str) -> bool:

@@ -42,7 +42,7 @@ def cleaned(records: list[Episode], names: dict[str, Any]) -> tuple[list[Episode
             columns = [each[:, i] for each in parts]
             _leave_out_marks(name, columns)
             if of == "state":
-                _leave_out_spikes(name, columns)
+                _leave_out_spikes(name, columns, [each.driven for each in records])
                 periods[name] = _period(columns)
             else:
                 driven.add(_period(columns))
@@ -88,10 +88,11 @@ def _leave_out_marks(name: str, columns: Sequence[Array]) -> None:
         _leave_out(columns, far)
 
 
-def _leave_out_spikes(name: str, columns: Sequence[Array]) -> None:
+def _leave_out_spikes(name: str, columns: Sequence[Array], driven: Sequence[Array]) -> None:
     """Leave out readings that are far beyond the rest: a few, or one value that comes again.
 
-    They stay where there are many: a plant may answer a pulse so.
+    They stay where there are many, or where an input or load is then at an end of its range: a
+    plant may answer a pulse so.
     """
     moves = np.abs(np.concatenate([np.diff(each[np.isfinite(each)]) for each in columns]))
     moves = moves[moves > 0]
@@ -105,11 +106,18 @@ def _leave_out_spikes(name: str, columns: Sequence[Array]) -> None:
     if np.count_nonzero(far) > LONGEST_SPIKE + len(whole) // 1000:
         far[:] = False
     away = np.concatenate([_there_and_back(each, DOWN * typical) for each in columns])
-    for value in np.unique(whole[away & ~far]):
+    values, counts = np.unique(whole[~far], return_counts=True)
+    again = (LONGEST_SPIKE < counts) & (counts <= len(whole) // 20)
+    before = np.concatenate([np.vstack([each[:1], each]) for each in driven])
+    acted = np.nan_to_num(before)  # what led to each row
+    for value in np.intersect1d(values[again], whole[away]):
         down = whole == value
-        rest = whole[~down & ~far & np.isfinite(whole)]
-        if LONGEST_SPIKE < np.count_nonzero(down) <= len(whole) // 20:
-            far |= down & ((value < rest.min()) | (value > rest.max()))
+        rest = ~down & ~far & np.isfinite(whole)
+        beyond = value < whole[rest].min() or value > whole[rest].max()
+        low, high = np.nanquantile(acted[rest], [0.05, 0.95], axis=0)
+        then = np.nanmedian(acted[down], axis=0)
+        if beyond and np.all((low <= then) & (then <= high)):
+            far |= down
     rows = np.flatnonzero(far)
     if len(rows):
         warn(

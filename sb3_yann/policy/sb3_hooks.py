@@ -17,6 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_yann._validation import NonFiniteWarning, warn
+from sb3_yann.control.mpc.bound_excess import Bounds
 from sb3_yann.control.mpc.misreading import STEPS_PER_STATE, misread_states
 
 FIRST_STEPS = 200  # steps of a learn after which what the env shows is compared with the model
@@ -194,8 +195,13 @@ def warn_of_first_steps(policy: Any, algorithm: Any) -> None:
     options = policy.critic_options
     cost = policy.problem.deviations.stage_cost(thetas[0], u)
     expected = options.reward_offset - options.reward_scale * cost
-    # Where it costs most, and of these the median: violations and ends of episodes may cost more.
-    most = np.isfinite(rewards) & (cost > np.mean(cost))
+    # Violations and ends of episodes may cost more; of the others those that cost most, and the
+    # median: the wrappers of an env may know of more.
+    known = np.isfinite(rewards) & (buffer.dones[:rows].reshape(-1) == 0)
+    known &= ~np.any(Bounds.of(policy.problem).beyond(thetas[1]), axis=1)
+    if not known.any():
+        return
+    most = known & (cost > np.mean(cost[known]))
     if not most.any():
         return
     wrong = np.median(np.abs(rewards - expected)[most])

@@ -304,7 +304,7 @@ def warn_of_another_time(slope: Callable[[Array, Array], Array], mpc: LinearMPC)
         )
 
 
-LARGEST_ERROR = 1e-3  # of a substep, in half-widths of theta's box
+LARGEST_ERROR = 1e-3  # of a substep, in half-widths of theta's box, else in sizes of states
 FINEST = 1024  # parts that a substep may be cut into
 
 
@@ -330,7 +330,9 @@ class Equations(gym.Env[Array, Array]):
         self.state: Array = mpc.model.x_ss
         self.model = mpc.model
         half = mpc.theta_half[mpc.layout.state]
-        self.weight = 1 / np.where(np.isfinite(half) & (half > 0), half, 1.0)
+        seen = np.max(np.abs([*start, self.state]), axis=0)
+        size = np.where(np.isfinite(half) & (half > 0), half, seen)
+        self.weight = 1 / np.where(size > 0, size, 1.0)
         self.time = 0.0
         self.fault = ""  # of a step: where f was not finite first
 
