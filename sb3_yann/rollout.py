@@ -308,7 +308,7 @@ class _Envs:
             if not (
                 isinstance(answer, tuple | list)
                 and len(answer) == len(expected.split(", "))
-                and isinstance(answer[-1], dict)
+                and isinstance(answer[-1], Mapping)
             ):
                 kinds = type(answer).__name__
                 if isinstance(answer, tuple | list):

@@ -208,11 +208,15 @@ class CostAudit(BaseCallback):
         normalize = self.model.get_vec_normalize_env()
         # The buffer holds what VecNormalize has not touched, and normalizes samples of it.
         rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
-        # Off-policy ones keep them in [-1, 1]: an env may write into what it is given.
+        # As SB3 makes what the env is given, anew: an env may write into that.
+        policy = self.model.policy
+        space: Any = self.model.action_space
         if "buffer_actions" in self.locals:
-            actions = self.model.policy.unscale_action(self.locals["buffer_actions"])
+            actions = policy.unscale_action(self.locals["buffer_actions"])
+        elif policy.squash_output:
+            actions = policy.unscale_action(self.locals["actions"])
         else:
-            actions = self.locals["clipped_actions"]
+            actions = np.clip(self.locals["actions"], space.low, space.high)
         for i, info in enumerate(self.locals["infos"]):
             done = bool(self.locals["dones"][i])
             terminated = done and not info.get("TimeLimit.truncated", False)

@@ -162,17 +162,22 @@ class Commissioning:
         problem = self.policy.problem
         own = problem.deviations
         parts = [*problem.prediction, problem.stage_matrix, own.theta_min, own.theta_max]
+        parts += [problem.theta_ss, problem.model.u_ss, own.terminal.cost]
+        parts += [problem.price.x, problem.price.u, *own.terminal.set]
         for kind, (value, softness, _) in own.bounded.items():
             parts += [value, softness, *own.limit_rows(kind)]
         parts.append(np.array([own.horizon, own.gamma, own.soft.penalty or 0.0]))
-        numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
-        numbers += f"{own.control_horizon} {own.infeasible}".encode()
+        digest = hashlib.sha256(f"{own.control_horizon} {own.infeasible}".encode())
+        for part in parts:  # to digits that another processor has, too
+            size = float(np.max(np.abs(part[np.isfinite(part)]), initial=0.0)) or 1.0
+            digest.update(f"{size:.6e}".encode())
+            digest.update((np.round(part / size, 7) + 0.0).tobytes())
         names = "batch", "excite", "shadow", "rounds", "updates", "seed"
         begin = {
             **{name: getattr(self, name) for name in names},
             "max_correction": self.smallest,
             "learner": f"{type(model).__name__} {self.policy.actor.net_arch}",
-            "problem": hashlib.sha256(numbers).hexdigest()[:16],
+            "problem": digest.hexdigest()[:16],
             "largest": self.largest,
         }
         self.journal = Journal(record, begin, CommissioningState(self._first_bound))

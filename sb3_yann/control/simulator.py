@@ -318,7 +318,9 @@ def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
     space = simulator.env.observation_space
     if getattr(space, "shape", None) == x.shape and hasattr(space, "low"):
         width = (space.high.astype(np.float64) - space.low) / 2
-        size = np.where(width < 1e6 * size, width, size)  # "no bound" may be the largest float32
+        size = np.where(
+            width < 1e6 + 1e3 * np.abs(x), width, size
+        )  # "no bound" may be the largest float32
     return np.asarray(size)
 
 

@@ -550,8 +550,8 @@ def _certified(
     """
     active = sorted(active)
     tolerance, size = (1e-6, np.abs(d).max()) if np.any(extra) else (1e-9, np.abs(d))
-    try:
-        lam = np.linalg.solve(gram[np.ix_(active, active)], -d[active])
+    try:  # transposed, as slacks are computed: large multipliers show the rounding of the two
+        lam = np.linalg.solve(gram[np.ix_(active, active)].T, -d[active])
     except np.linalg.LinAlgError:
         return None
     if np.any(lam < -tolerance * (1 + np.abs(lam).max(initial=0.0))):

@@ -137,9 +137,9 @@ def _there_and_back(column: Array, least: float) -> NDArray[np.bool_]:
     for i, first in enumerate(jumps):
         for last in jumps[i + 1 : i + 1 + LONGEST_SPIKE]:
             away = slice(first + 1, last + 1)
-            stands = np.ptp(z[away]) == 0  # longer, in which the plant goes on
-            back = min(steps[first], steps[last]) / (3 if stands else 10)
-            if abs(z[last + 1] - z[first]) < back and (stands or last - first <= LONGEST_SPIKE):
+            few = last - first <= LONGEST_SPIKE
+            back = min(steps[first], steps[last]) / (10 if few else 3)  # the plant goes on
+            if abs(z[last + 1] - z[first]) < back and (few or np.ptp(z[away]) == 0):
                 found[rows[away]] = True
     return found
 

@@ -21,7 +21,7 @@ from sb3_yann.control.mpc.bound_excess import Bounds
 from sb3_yann.control.mpc.misreading import STEPS_PER_STATE, misread_states
 
 FIRST_STEPS = 200  # steps of a learn after which what the env shows is compared with the model
-OTHER_REWARD = 0.1  # of the stage cost: a reward that differs by more is another one
+OTHER_REWARD = 0.25  # of the stage cost: a reward that differs by more is another one
 
 
 def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:

@@ -196,6 +196,7 @@ def _delayed(
 
 
 REPEATED_SHARE = 0.05  # of all rows: so many repeated readings of one sensor are too many
+ON_GRID = 1e-3  # of a step of a sensor: readings that are off by more do not count in steps
 LEAST_REPEATS = 10
 TIMES = 10.0
 """Equal readings in a row that a frozen sensor shows at least; how many times as many as usual."""
@@ -226,7 +227,10 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
     for i in range(states[0].shape[1]):
         runs = [*_runs([x[:, i] for x in states], i)]
         usual, rare = np.quantile([*map(len, runs)], [0.5, 0.95])
-        least = max(LEAST_REPEATS, TIMES * usual, 6 * rare)
+        moves = np.abs(np.concatenate([np.diff(x[:, i]) for x in states]))
+        steps = moves[moves > 0] / np.min(moves[moves > 0], initial=np.inf)
+        on_grid = bool(np.all(np.abs(steps - np.round(steps)) < ON_GRID))
+        least = max(LEAST_REPEATS, TIMES * usual, 6 * rare if on_grid else 0.0)
         long = [each for each in runs if len(each) >= least]
         those = _unexplained(states, driven, i, runs, long) if long else []
         if sum(map(len, those)) > REPEATED_SHARE * rows:

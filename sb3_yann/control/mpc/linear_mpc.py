@@ -279,7 +279,7 @@ class LinearMPC(MPCProblem):
             low = np.asarray(shown.low, np.float64)
             high = np.asarray(shown.high, np.float64)
             # "No bound" may be the largest float32.
-            bounded = np.abs([low, high]) < 1e6 * np.maximum(np.abs(model.x_ss), 1.0)
+            bounded = np.abs([low, high]) < 1e6 + 1e3 * np.abs(model.x_ss)
             limits["theta_min"] = np.where(bounded[0], low, -np.inf)
             limits["theta_max"] = np.where(bounded[1], high, np.inf)
         if isinstance(own, LinearMPC):  # a PlantEnv's
@@ -307,9 +307,12 @@ class LinearMPC(MPCProblem):
         at = to_float("theta", theta)
         v = to_float("u", u)
         for name, given, size in ("theta", at, self.n_theta), ("u", v, self.model.n_inputs):
-            if not given.ndim or given.shape[-1] != size:
+            if given.shape[-1:] != (size,) and not (given.ndim == 0 and size == 1):
                 raise ValueError(f"{name} has shape {given.shape}, expected (..., {size}).")
-        return self.units.to_deviations(at), self.units.input_to_deviations(v)
+        return (
+            self.units.to_deviations(np.atleast_1d(at)),
+            self.units.input_to_deviations(np.atleast_1d(v)),
+        )
 
     def simulate(self, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
         """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model.
