@@ -329,7 +329,7 @@ class Equations(gym.Env[Array, Array]):
         self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
         self.state: Array = mpc.model.x_ss
         self.model = mpc.model
-        half = mpc.theta_half[mpc.layout.state]
+        half = (mpc.theta_max - mpc.theta_min)[mpc.layout.state] / 2
         seen = np.max(np.abs([*start, self.state]), axis=0)
         size = np.where(np.isfinite(half) & (half > 0), half, seen)
         self.weight = 1 / np.where(size > 0, size, 1.0)
