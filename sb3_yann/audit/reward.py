@@ -123,8 +123,8 @@ class Rewards(NamedTuple):
         """
         if np.ptp(self.rewards) <= 1e-9 * np.abs(self.rewards).max():
             return "constant", f"every reward is {self.rewards[0]:g}, whatever happens."
+        of_line = (line.offset - self.rewards) / (line.scale or 1.0)
         for width in (EXACT, tolerance):
-            of_line = (line.offset - self.rewards) / (line.scale or 1.0)
             if line.scale != 0 and self.agree(of_line, self.cost, width):
                 return line.cause
             if self.agree(self.implied, self.after, width):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
@@ -13,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._archive import digest_of
 from sb3_yann._progress import bar, shown
 from sb3_yann._validation import Array, Feedback, check_bool, check_int, check_range, check_type
 from sb3_yann.audit.meaning import explained
@@ -167,17 +167,16 @@ class Commissioning:
         for kind, (value, softness, _) in own.bounded.items():
             parts += [value, softness, *own.limit_rows(kind)]
         parts.append(np.array([own.horizon, own.gamma, own.soft.penalty or 0.0]))
-        digest = hashlib.sha256(f"{own.control_horizon} {own.infeasible}".encode())
-        for part in parts:  # to digits that another processor has, too
+        numbers = {"options": np.array([str(own.control_horizon), own.infeasible])}
+        for i, part in enumerate(parts):  # to digits that another processor has, too
             size = float(np.max(np.abs(part[np.isfinite(part)]), initial=0.0)) or 1.0
-            digest.update(f"{size:.6e}".encode())
-            digest.update((np.round(part / size, 7) + 0.0).tobytes())
+            numbers[f"{i} in {size:.6e}"] = np.round(part / size, 7) + 0.0
         names = "batch", "excite", "shadow", "rounds", "updates", "seed"
         begin = {
             **{name: getattr(self, name) for name in names},
             "max_correction": self.smallest,
             "learner": f"{type(model).__name__} {self.policy.actor.net_arch}",
-            "problem": digest.hexdigest()[:16],
+            "problem": digest_of(numbers)[:16],
             "largest": self.largest,
         }
         self.journal = Journal(record, begin, CommissioningState(self._first_bound))

@@ -13,7 +13,7 @@ from sb3_yann._validation import Array, ReadOnlyArrays
 
 NORMAL = 1.96  # standard deviations on either side that hold 95 %
 WIDE = 0.5  # half-width from which an interval says only that the pole is not known
-SLOW = 0.05  # distance of a pole from 1 within which a state goes on and on: for 20 samples
+NEARLY_ONE = 0.05  # distance of a pole from 1 within which a state goes on and on: for 20 samples
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
 SURE_ERRORS = 5.0
 """Standard errors from 1 beyond which a pole does not integrate: those of an integrator are not
@@ -68,7 +68,7 @@ class Gains(ReadOnlyArrays):
         values, own = (np.take_along_axis(each, pick, 0)[0] for each in (found, widths))
         # Of an input that moves one state on and on, the others' gains are beside that pole.
         away = np.sort(np.abs(np.linalg.eigvals(A) - 1))[:integrators]
-        rests = (degrees == 0) & np.any(degrees, axis=0) & np.all(away < SLOW)
+        rests = (degrees == 0) & np.any(degrees, axis=0) & np.all(away < NEARLY_ONE)
         values = np.where(rests, found[3], values)
         own = np.where(rests, widths[3], own)
         beside = (np.where(degrees, each[0], each[3]) for each in (found, widths))

@@ -318,10 +318,16 @@ def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
     space = simulator.env.observation_space
     if getattr(space, "shape", None) == x.shape and hasattr(space, "low"):
         width = (space.high.astype(np.float64) - space.low) / 2
-        size = np.where(
-            width < 1e6 + 1e3 * np.abs(x), width, size
-        )  # "no bound" may be the largest float32
+        size = np.where(width < largest_bound(x), width, size)
     return np.asarray(size)
+
+
+def largest_bound(x: Array) -> Array:
+    """Return what an observation space's bounds at a state x (n,) are none beyond.
+
+    "No bound" may be written as the largest float32, or as 1e10.
+    """
+    return 1e6 + 1e3 * np.abs(x)
 
 
 def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str:

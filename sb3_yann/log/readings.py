@@ -35,6 +35,7 @@ def cleaned(records: list[Episode], names: dict[str, Any]) -> tuple[list[Episode
     empty = []
     periods: dict[str, int] = {}
     driven = set[int]()
+    acted = np.concatenate([np.vstack([each.driven[:1], each.driven]) for each in records])
     for of, letter in ("state", "x"), ("input", "u"), ("disturbance", "d"), ("reference", "r"):
         parts = [getattr(each, f"{of}s").copy() for each in records]
         own = names.get(f"{of}_names") or [f"{letter}[{i}]" for i in range(parts[0].shape[1])]
@@ -42,7 +43,7 @@ def cleaned(records: list[Episode], names: dict[str, Any]) -> tuple[list[Episode
             columns = [each[:, i] for each in parts]
             _leave_out_marks(name, columns)
             if of == "state":
-                _leave_out_spikes(name, columns, [each.driven for each in records])
+                _leave_out_spikes(name, columns, np.nan_to_num(acted))
                 periods[name] = _period(columns)
             else:
                 driven.add(_period(columns))
@@ -88,11 +89,11 @@ def _leave_out_marks(name: str, columns: Sequence[Array]) -> None:
         _leave_out(columns, far)
 
 
-def _leave_out_spikes(name: str, columns: Sequence[Array], driven: Sequence[Array]) -> None:
+def _leave_out_spikes(name: str, columns: Sequence[Array], acted: Array) -> None:
     """Leave out readings that are far beyond the rest: a few, or one value that comes again.
 
-    They stay where there are many, or where an input or load is then at an end of its range: a
-    plant may answer a pulse so.
+    They stay where there are many, or where an input or load, of which ``acted`` has those that led
+    to each row, is then at an end of its range: a plant may answer a pulse so.
     """
     moves = np.abs(np.concatenate([np.diff(each[np.isfinite(each)]) for each in columns]))
     moves = moves[moves > 0]
@@ -108,14 +109,12 @@ def _leave_out_spikes(name: str, columns: Sequence[Array], driven: Sequence[Arra
     away = np.concatenate([_there_and_back(each, DOWN * typical) for each in columns])
     values, counts = np.unique(whole[~far], return_counts=True)
     again = (LONGEST_SPIKE < counts) & (counts <= len(whole) // 20)
-    before = np.concatenate([np.vstack([each[:1], each]) for each in driven])
-    acted = np.nan_to_num(before)  # what led to each row
     for value in np.intersect1d(values[again], whole[away]):
         down = whole == value
-        rest = ~down & ~far & np.isfinite(whole)
-        beyond = value < whole[rest].min() or value > whole[rest].max()
-        low, high = np.nanquantile(acted[rest], [0.05, 0.95], axis=0)
-        then = np.nanmedian(acted[down], axis=0)
+        others = ~down & ~far & np.isfinite(whole)
+        beyond = value < whole[others].min() or value > whole[others].max()
+        low, high = np.quantile(acted[others], [0.05, 0.95], axis=0)
+        then = np.median(acted[down], axis=0)
         if beyond and np.all((low <= then) & (then <= high)):
             far |= down
     rows = np.flatnonzero(far)

@@ -21,7 +21,7 @@ from sb3_yann.control.mpc.bound_excess import Bounds
 from sb3_yann.control.mpc.misreading import STEPS_PER_STATE, misread_states
 
 FIRST_STEPS = 200  # steps of a learn after which what the env shows is compared with the model
-OTHER_REWARD = 0.25  # of the stage cost: a reward that differs by more is another one
+ANOTHER_COST = 0.25  # of the stage cost: a reward that differs by more is another one
 
 
 def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
@@ -206,7 +206,7 @@ def warn_of_first_steps(policy: Any, algorithm: Any) -> None:
         return
     wrong = np.median(np.abs(rewards - expected)[most])
     typical = options.reward_scale * np.median(cost[most])
-    if wrong > OTHER_REWARD * typical:
+    if wrong > ANOTHER_COST * typical:
         warn(
             f"Rewards are not the MPC's cost: of the first {len(rewards)} steps half of the most "
             f"costly {np.count_nonzero(most)} differ by {wrong:.3g} or more from what the critic, "

@@ -123,20 +123,25 @@ class ParametricQP:
         w = self.w - np.where(short, moved, 0.0)
         return replace(self, G=np.where(short[:, None], 0.0, self.G), w=w)
 
-    def without_twins(self) -> ParametricQP:
+    def without_repeated_rows(self) -> ParametricQP:
         """Return the program in which of rows that are the same but for rounding one counts.
 
         Late states of a plant that has come to rest make such rows. Rows are of unit length.
         """
         rows = np.hstack([self.G, self.S])
+        direction = np.random.default_rng(0).normal(size=rows.shape[1])
+        order = np.argsort(rows @ direction)
+        # Along any direction equal rows are neighbors: few others are compared.
+        close = np.diff(rows[order] @ direction) < SAME_ROW * np.abs(direction).sum()
+        some = np.union1d(order[:-1][close], order[1:][close])
         kept = list[int]()
-        twins = list[int]()
-        for i in np.argsort(self.w, kind="stable").tolist():
+        repeated = list[int]()
+        for i in some[np.argsort(self.w[some], kind="stable")].tolist():
             near = kept and np.abs(rows[kept] - rows[i]).max(axis=1).min() < SAME_ROW
-            (twins if near else kept).append(i)
-        none = np.isin(np.arange(len(rows)), twins)
+            (repeated if near else kept).append(i)
+        none = np.isin(np.arange(len(rows)), repeated)
         G, S = (np.where(none[:, None], 0.0, each) for each in (self.G, self.S))
-        return replace(self, G=G, S=S, w=np.where(none, 1.0, self.w)) if twins else self
+        return replace(self, G=G, S=S, w=np.where(none, 1.0, self.w)) if repeated else self
 
     def scaled(self, u_min: Array, u_max: Array, center: Array) -> tuple[ParametricQP, Array]:
         """Return the program in half-widths, of unit rows, and those of U (v,), 1 for slacks.

@@ -97,7 +97,7 @@ class ProgramUnits:
             u_size = u_size + np.abs(program.feedback) @ box / self.reach[:m]
         u_size = np.tile(u_size, (len(program.c) - program.n_slacks) // m)
         u_size = np.append(u_size, np.full(program.n_slacks, np.inf))
-        scaled = scaled.without_short_rows(u_size).without_twins()
+        scaled = scaled.without_short_rows(u_size).without_repeated_rows()
         self.to_inputs = np.eye(m, len(program.c))
         self.equalities = None
         if not _has_interior_point(scaled):

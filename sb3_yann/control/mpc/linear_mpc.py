@@ -51,7 +51,7 @@ from sb3_yann.control.mpc.invariant_sets import KeptSet, completed, hard_rows, k
 from sb3_yann.control.mpc.problem import MPCProblem, Value, value
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.online import LAWS, Law, OnlineLaw, OnlineLawWarning, steepness
-from sb3_yann.control.simulator import borrow
+from sb3_yann.control.simulator import borrow, largest_bound
 
 if TYPE_CHECKING:
     from sb3_yann.control.simulator import Maker
@@ -278,8 +278,7 @@ class LinearMPC(MPCProblem):
         if shown.shape == (model.n_states,):
             low = np.asarray(shown.low, np.float64)
             high = np.asarray(shown.high, np.float64)
-            # "No bound" may be the largest float32.
-            bounded = np.abs([low, high]) < 1e6 + 1e3 * np.abs(model.x_ss)
+            bounded = np.abs([low, high]) < largest_bound(model.x_ss)
             limits["theta_min"] = np.where(bounded[0], low, -np.inf)
             limits["theta_max"] = np.where(bounded[1], high, np.inf)
         if isinstance(own, LinearMPC):  # a PlantEnv's

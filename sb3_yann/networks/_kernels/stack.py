@@ -104,7 +104,7 @@ def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, ou
 
 
 @compiled()
-def block_of(size: int) -> int:
+def _block_of(size: int) -> int:
     """Return how many rows a product with a matrix of so many entries takes at once.
 
     Threads of BLAS wait for one another: where other processes have the cores, ten times as long.
@@ -117,7 +117,7 @@ def block_of(size: int) -> int:
 @compiled()
 def _product(rows: Single, matrix: Single, out: Single) -> None:
     """Write the products of rows, (batch, k), and a matrix, (k, outputs)."""
-    block = block_of(matrix.size)
+    block = _block_of(matrix.size)
     for at in range(0, len(rows), block):
         np.dot(rows[at : at + block], matrix, out[at : at + block])
 
@@ -242,7 +242,7 @@ def _all_backward(
             through[row, a] = back[row, a] * (one - (out[row, a] + b) * (out[row, a] + b))
             by_bias[a] += through[row, a] - pinned * back[row, a] * (one - b * b)
     by[:, inputs] = by_bias
-    block = block_of(inputs * out.shape[1])
+    block = _block_of(inputs * out.shape[1])
     for at in range(0, len(x) if asked else 0, block):
         by[:, :inputs] += np.dot(through[at : at + block].T, x[at : at + block])
     return through
