@@ -40,10 +40,8 @@ EXCESS_SHARE = 0.1
 """Share of the MPC's own excess by which it may be larger: an MPC that rides a bound is no veto."""
 COST_ROUNDING = 1e-6
 """Of a mean cost: what float32 actions and batches of other sizes make of one policy's."""
-WORST_START = 10.0  # with a CVaR: how many times as much as on average a single start may cost more
 FEW_PAIRS = 12
 """Pairs that a drift can line up by the order that is drawn, which no standard error shows."""
-MAX_NEW_HARD = 10  # new starts that join those of every later candidate at a time
 TOO_LITTLE = "too little a gain"
 
 
@@ -184,7 +182,8 @@ class Tolerance:
     typical: float = np.inf
     excess_room: float = EXCESS_ROOM
     bounds: BoundNames = field(default_factory=BoundNames)
-    worst_start: float = WORST_START
+    # 10.0: with a CVaR: how many times as much as on average a single start may cost more
+    worst_start: float = 10.0
     saved: float = 0.0
 
     def exceeded(self, policy: Scores, episode: int, mpc: Scores | None = None) -> str:
@@ -418,7 +417,8 @@ class Starts:
         """Return the hardest of the first starts that a policy loses, else that cost it more."""
         excess = self._excess(policy)
         count = np.count_nonzero(excess > 1.0) or np.count_nonzero(excess > 0)
-        return np.argsort(-excess, kind="stable")[: min(MAX_NEW_HARD, count)]
+        # 10: new starts that join those of every later candidate at a time
+        return np.argsort(-excess, kind="stable")[: min(10, count)]
 
 
 @dataclass

@@ -19,8 +19,6 @@ from gymnasium.vector import VectorEnv
 from sb3_yann._validation import check_type
 from sb3_yann.control.simulator import require_makes
 
-MAX_KEPT_ENVS = 200  # of a pool
-
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
 
 
@@ -163,7 +161,7 @@ class EnvPool:
         except BaseException:
             self.close()
             raise
-        self.close(MAX_KEPT_ENVS)
+        self.close(200)  # of a pool
 
     def close(self, kept: int = 0) -> None:
         """Close all envs but so many."""

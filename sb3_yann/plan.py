@@ -27,25 +27,11 @@ Policy = Callable[[int, Array], Array]  # step and thetas (k, n_theta) -> inputs
 
 SIZES = (1.0, 0.5, 0.2, 0.05)  # parts of a correction that are tried, the first first
 SETTLED = 1e-5  # A start is done when a correction saves less than this part of its cost
-# corrections at most; after how many the best of several guesses goes on
-SWEEPS = 40
-RACE = 4
-BATCH = 100_000  # steps of trajectories at once: more take memory, fewer the interpreter's time
-TIE = 0.1  # by which part of its cost a guess of the caller's may cost more than the best
-SOFT = 1e-2  # bounds count so much less at first: stiff ones would end a search where it meets them
-DAMPED = 10.0
-PATIENCE = 5
-"""Factor of the damping where no correction helps; how often in a row, at most."""
 INSIDE = 1e-3
 WEIGHT = 1e4
 """How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
 a step, in mean costs of a step."""
-BURSTS = 25  # some searches begin with all inputs on a bound, for this part of the episode
 WEIGHTS = 0.1, 10.0  # factors of weights of the MPC, for laws that are tried instead of it
-CHANGED = 0.05
-"""A reference or disturbance that has moved by so many half-widths is planned for anew."""
-DIFFERENCE = 1e-4  # half-widths of theta over which slopes of a feedback are taken
-KEPT_SETS = 16  # of starts, whose members lie in one array
 PAUSE = 10  # steps after a plan for which an estimated disturbance makes no new one
 
 
@@ -68,7 +54,7 @@ class TwinPlant:
             return self.dynamics
         key = rows.tobytes()
         if key not in self._known:
-            if len(self._known) == KEPT_SETS:  # networks take memory
+            if len(self._known) == 16:  # sets of starts: networks take memory
                 self._known.clear()
             chosen = tuple(self.dynamics.members[self.members[row]] for row in rows)
             self._known[key] = dataclasses.replace(self.dynamics, members=chosen)
@@ -291,24 +277,27 @@ def planned(
     preferred: bool = False,
 ) -> Plans:
     """Return the best plan of each of the ``starts`` that the policies' trajectories lead to."""
+    sweeps = 40  # corrections at most; after four the best of several guesses goes on
     k = len(starts)
     turn = plant.turn
-    soft = dataclasses.replace(task, weight=SOFT * task.weight)
+    # 1e-2: bounds count so much less at first: stiff ones would end a search where it meets them
+    soft = dataclasses.replace(task, weight=1e-2 * task.weight)
     found = []
     for thetas, inputs, every in _played(plant, task, policies, starts, steps, rows):
         gains = np.zeros((*inputs.shape, starts.shape[1]))
         first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs), turn)
-        found.append(improved(plant, soft, first, every, RACE if len(policies) > 1 else SWEEPS))
+        found.append(improved(plant, soft, first, every, 4 if len(policies) > 1 else sweeps))
     ranked = np.concatenate([each.costs for each in found]).reshape(-1, k)
     parts = zip(*((each.thetas, each.inputs, each.gains) for each in found), strict=True)
     thetas, inputs, gains = (np.concatenate(each, axis=1) for each in parts)
     raced = Plans(thetas, inputs, gains, ranked.ravel().copy(), turn)
     if preferred:
-        ranked[-1] -= TIE * np.abs(ranked[-1])
+        # 0.1: by which part of its cost a guess of the caller's may cost more than the best
+        ranked[-1] -= 0.1 * np.abs(ranked[-1])
     best = raced.of(np.argmin(ranked, axis=0) * k + np.arange(k))
-    plans = improved(plant, soft, best, rows, SWEEPS)
+    plans = improved(plant, soft, best, rows, sweeps)
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
-    plans = improved(plant, task, hard, rows, SWEEPS)
+    plans = improved(plant, task, hard, rows, sweeps)
     # The last search may have been damped, and its feedback with it.
     _, gains, _ = _backward(plant, task, plans, rows, np.zeros(len(rows)))
     return dataclasses.replace(plans, gains=gains)
@@ -318,7 +307,8 @@ def _played(
     plant: TwinPlant, task: Task, policies: list[Policy], starts: Array, steps: int, rows: Rows
 ) -> Iterator[tuple[Array, Array, Rows]]:
     """Yield thetas, inputs and row numbers of the policies' trajectories, of several at once."""
-    some = max(1, BATCH // (steps * len(starts)))
+    # 100_000: steps of trajectories at once: more take memory, fewer the interpreter's time
+    some = max(1, 100_000 // (steps * len(starts)))
     for first in range(0, len(policies), some):
         group = policies[first : first + some]
 
@@ -332,6 +322,7 @@ def _played(
 
 def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
     """Return plans that no correction improves, or those after so many rounds."""
+    damped = 10.0  # factor of the damping where no correction helps
     plans = copy.deepcopy(plans)
     k = len(rows)
     damping: Array = np.zeros(k)
@@ -363,10 +354,11 @@ def improved(plant: TwinPlant, task: Task, plans: Plans, rows: Rows, rounds: int
             waiting = waiting[~better]
         lost = np.isin(np.arange(len(active)), waiting)
         failed[active] = np.where(lost, failed[active] + 1, 0)
-        more = np.maximum(DAMPED * damping[active], 1.0)
-        damping[active] = np.where(lost, more, damping[active] / DAMPED)
+        more = np.maximum(damped * damping[active], 1.0)
+        damping[active] = np.where(lost, more, damping[active] / damped)
         little = old.costs - plans.costs[active] <= SETTLED * np.abs(old.costs)
-        done = np.where(lost, failed[active] >= PATIENCE, little)
+        # Where five corrections in a row have not helped, none will.
+        done = np.where(lost, failed[active] >= 5, little)
         active = np.asarray(active[~done])
         if not len(active):
             break
@@ -423,7 +415,8 @@ def slopes_of_inputs(
     outside, _ = task.penalty(thetas[1:])
     flat = thetas[:-1].reshape(-1, n)
     limits = task.limits(flat)
-    near = np.where(np.isfinite(problem.theta_half), problem.theta_half, 1.0) * DIFFERENCE
+    # 1e-4: half-widths of theta over which slopes of a feedback are taken
+    near = np.where(np.isfinite(problem.theta_half), problem.theta_half, 1.0) * 1e-4
     gains = [
         (np.clip(act(flat + each), *limits) - np.clip(act(flat - each), *limits)) / (2 * each.sum())
         for each in np.diag(near)
@@ -457,7 +450,8 @@ def initial_guesses(
     """
     problem = task.problem
     own = problem.deviations
-    pushes = [(own.u_min, 0), *((u, steps // BURSTS) for u in (own.u_min, own.u_max))]
+    # Some searches begin with all inputs on a bound, for a 25th of the episode.
+    pushes = [(own.u_min, 0), *((u, steps // 25) for u in (own.u_min, own.u_max))]
     first = [_pushed(*push, law_of(problem)) for push in pushes]
     laws = [lambda theta, K=K: theta @ K.T for K in _gains(problem)]
     others = [_pushed(*push, law) for law in laws for push in pushes]
@@ -532,7 +526,8 @@ class Planning:
             for _ in range(min(t - planned_at, max(problem.layout.previews))):
                 foreseen = foreseen[problem.layout.next]
             away = np.abs(theta[k] - foreseen)[constant] / problem.theta_half[constant]
-            moved = ~(away <= CHANGED)
+            # For a reference or disturbance that has moved by 5 % of its half-width: a new plan.
+            moved = ~(away <= 0.05)
             if t < planned_at + self.pause:  # an estimated disturbance may still settle
                 moved[problem.layout.reference.stop - problem.layout.reference.start :] = False
             changed[k] = moved.any()

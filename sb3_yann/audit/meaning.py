@@ -21,16 +21,10 @@ from sb3_yann.rollout import Trajectories
 from sb3_yann.units import ActionUnits, Units
 from sb3_yann.wrappers.theta import EstimateState, below, require_vector
 
-MOSTLY = 0.5  # share of the starts beyond a box that is no chance
 SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
 FAR = 3.5  # times as far or as little as the model says: a nonlinear plant alone varies more
 SIGN_STEPS = 10  # steps for which it is pushed where outputs are read
-UNLIKE = 0.7  # cosine of answers to pushes and the model's, below which they are others
-ALIKE = 0.95  # the same, above which they are the model's in another order
-LEAST_EFFECT = 1e-3  # of the states' standard deviation: an effect that is smaller may be rounding
-EXPLAINED_REWARD = 0.95  # of the rewards' variance: they are taken for minus the stage cost
-FEWEST_REWARDS = 10  # steps that must be seen
 
 
 class CostMismatchWarning(UserWarning):
@@ -56,7 +50,7 @@ def warn_of_box(problem: LinearMPC, theta: Array) -> None:
     names = labels_of(problem.model)[0]
     share = np.mean((theta < own.theta_min) | (theta > own.theta_max), axis=0)[: len(names)]
     i = int(np.argmax(share))
-    if share[i] > MOSTLY:
+    if share[i] > 0.5:  # share of the starts beyond a box that is no chance
         warn(
             f"{names[i]} reads beyond theta's box, for which the MPC is made, where "
             f"{share[i]:.0%} of the episodes begin: does the env show it in another unit, or in "
@@ -127,7 +121,8 @@ def warn_of_signs(
             expected[~np.isfinite(effect)] = 0  # readings that come now and then
             effect = np.nan_to_num(effect)
             size = float(np.sum(expected**2))
-            if size > 0 and np.linalg.norm(effect) > LEAST_EFFECT:
+            # 1e-3: of the states' standard deviation: an effect that is smaller may be rounding
+            if size > 0 and np.linalg.norm(effect) > 1e-3:
                 gains.append(float(np.sum(effect * expected)) / size)
         if not starts or len(gains) < len(starts):
             continue
@@ -164,7 +159,8 @@ def _swapped(modelled: Array, answers: Array) -> str:
     units = np.maximum(np.linalg.norm(modelled, axis=(0, 1)), 1e-300)
     orders = [*product(permutations(range(q)), permutations(range(m)))] if max(q, m) <= 4 else []
     found = max(orders, key=lambda each: likeness(*each), default=None)
-    if found is None or not likeness(range(q), range(m)) < UNLIKE < ALIKE < likeness(*found):
+    # The cosines of answers to pushes and the model's: these are others, or in another order.
+    if found is None or not likeness(range(q), range(m)) < 0.7 < 0.95 < likeness(*found):
         return ""
     return (
         f"The env seems to show the model's outputs in the order {np.argsort(found[0]).tolist()}, "
@@ -193,10 +189,10 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:
     thetas, inputs, rewards = played.padded()
     costs = [problem.deviations.stage_cost(at, inputs) for at in (thetas[:-1], thetas[1:])]
     known: Mask = np.asarray(np.all(np.isfinite([rewards, *costs]), axis=0), dtype=np.bool_)
-    if np.count_nonzero(known) < FEWEST_REWARDS or not np.any(rewards[known]):
+    if np.count_nonzero(known) < 10 or not np.any(rewards[known]):  # steps that must be seen
         return
     share = max(explained(-cost, rewards, known) for cost in costs)
-    if share < EXPLAINED_REWARD:
+    if share < 0.95:  # of the rewards' variance: they are another cost
         warn(
             f"The env has a reward of its own, and it is ignored: the MPC's stage cost explains "
             f"{100 * share:.0f} % of it over {np.count_nonzero(known)} steps of the MPC. Weights "

@@ -41,11 +41,6 @@ from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
-PAIRS_TO_GIVE_UP = 10  # so many that show no gain end a trial
-MOST_ABOVE_MPC = 0.05  # of the MPC's cost: what a policy may cost more in any case
-SAME_REWARD = 0.95  # share of the episodes' rewards that the same stage cost explains
-ALARMS = 0.25  # share of a policy's episodes, two at least, with an alarm: it is taken back
-
 Whole = tuple[dict[str, Any], list[Any]]  # weights and optimizers: see `whole_policy`
 
 
@@ -480,7 +475,8 @@ def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
     if not np.ptp(rewards) > 1e-9 * np.abs(rewards).max():  # nor does NaN
         return False
     costs = _costs(problem, episodes, False)[:, None]
-    return explained(-costs, rewards, np.isfinite(costs)) < SAME_REWARD
+    # 0.95: share of the episodes' rewards that the same stage cost explains
+    return explained(-costs, rewards, np.isfinite(costs)) < 0.95
 
 
 def why_taken_back(journal: Journal, costs: Costs) -> str:
@@ -495,17 +491,19 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     if costs.longer:
         return costs.longer
     alarms = sum(each.alarm is not None for each in played)
-    if alarms >= max(2.0, ALARMS * len(played)):
+    # After an alarm in a quarter of its episodes, two at least, a policy is taken back.
+    if alarms >= max(2.0, 0.25 * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
     if not costs.difference.pairs:
         return "no pair of episodes shows what it costs"
     more = costs.difference.mean
     room = costs.difference.room(RULE.significance)
-    if not more <= min(room, MOST_ABOVE_MPC * abs(costs.mpc)):  # nor does NaN pass
+    # A policy may cost 5 % more than the MPC in any case.
+    if not more <= min(room, 0.05 * abs(costs.mpc)):  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
     hopeless = costs.difference.is_hopeless(RULE.least_gain * abs(costs.mpc))
-    enough = costs.difference.pairs >= PAIRS_TO_GIVE_UP
+    enough = costs.difference.pairs >= 10  # so many that show no gain end a trial
     return f"{costs.difference.pairs} pairs show no gain" if enough and hopeless else ""
 
 

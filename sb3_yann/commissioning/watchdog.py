@@ -15,14 +15,7 @@ from sb3_yann.twin.log import pieces
 from sb3_yann.twin.plant_twin import PlantTwin
 
 CHART_GAINS = np.array([1.0, 0.2, 0.05, 0.02])  # without a memory; with 5, 20 and 50 samples
-FACTOR = 2.0  # times the largest held-out ratio is a band, with many episodes
-FACTOR_OF_FEW = 7.5  # divided by the number of episodes, so much is added to the factor
-LEAST_RATIO = 0.5  # the largest ratio is taken to be at least this
-LEAST_ERROR = 0.1  # that the residual is taken to be, in standard deviations of one-step errors
-NORMAL_MEDIAN = 0.6745  # of the normal distribution, without its sign, in standard deviations
-NOISE_CORRELATION = 0.3  # of successive errors, below which they are noise: a model's change slowly
 FROZEN = 3  # repeats of a reading from which on it may be frozen
-PREDICTED_MOVE = 3.0  # standard deviations that the twin moves in a sample while a reading stands
 
 
 @dataclass(frozen=True)
@@ -65,10 +58,12 @@ class Bands:
             left.append((each.thetas[1:] - after)[:, row.state])
         squares = np.sum([np.sum(each**2, axis=0) for each in left], axis=0)
         products = np.sum([np.sum(each[1:] * each[:-1], axis=0) for each in left], axis=0)
-        self.noisy = products / np.maximum(squares, 1e-300) < NOISE_CORRELATION
+        # Errors of a model change slowly, and noise does not.
+        self.noisy = products / np.maximum(squares, 1e-300) < 0.3
         self.error = np.maximum(np.sqrt(squares / sum(map(len, left))), 1e-9 * units)
         explained = [twin.dynamics.residual(e.thetas[None, :-1], e.actions[None])[0] for e in log]
-        least = (LEAST_ERROR * self.error) ** 2
+        # The residual is taken to be a tenth of a standard deviation at least.
+        least = (0.1 * self.error) ** 2
         self.size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + least)
         seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log])
         self.low = seen.min(axis=0)
@@ -81,11 +76,13 @@ class Bands:
                 charted.append(charts)
         means, doubted = np.moveaxis(np.array(charted), 1, 0)
         # A median: where an episode leaves what the others show, the doubt explains its errors.
-        self.spread = np.median(np.abs(means), axis=0) / NORMAL_MEDIAN + 1e-9 * self.error
+        # The median of a normal distribution's absolute values is .6745 standard deviations.
+        self.spread = np.median(np.abs(means), axis=0) / 0.6745 + 1e-9 * self.error
         most = np.max(np.abs(means) / np.hypot(self.spread, doubted), axis=0)
-        self.most = np.maximum(most, LEAST_RATIO)
+        self.most = np.maximum(most, 0.5)  # the largest ratio is taken to be at least this
         self.repeats = np.max([_repeats(e.thetas[:, row.state]) for e in twin.episodes], axis=0)
-        self.factor = FACTOR + FACTOR_OF_FEW / len(twin.episodes)
+        # A band is twice the largest held-out ratio; of few episodes that maximum says less.
+        self.factor = 2.0 + 7.5 / len(twin.episodes)
 
     def doubt(self, rows: Array, u: Array) -> Array:
         """Return how far the twin may be wrong, (..., n), at rows (..., size) and u (..., m).
@@ -223,7 +220,8 @@ class Watchdog:
         bands = self.bands
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
         unsure = np.hypot(bands.error, self._charts[1, 0])  # what is not familiar counts
-        moving = np.abs(self._moved) > PREDICTED_MOVE * stands * unsure
+        # The twin moves by three standard deviations in a sample while a reading stands.
+        moving = np.abs(self._moved) > 3.0 * stands * unsure
         problem = self.dynamics.problem
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             name = problem.model.state_names[i] if problem.model.state_names else f"reading {i}"

@@ -13,14 +13,10 @@ from sb3_yann._validation import Array, ReadOnlyArrays
 
 NORMAL = 1.96  # standard deviations on either side that hold 95 %
 WIDE = 0.5  # half-width from which an interval says only that the pole is not known
-NEARLY_ONE = 0.05  # distance of a pole from 1 within which a state goes on and on: for 20 samples
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
 SURE_ERRORS = 5.0
 """Standard errors from 1 beyond which a pole does not integrate: those of an integrator are not
 normal (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74), nor are gains of a pole nearby."""
-FOLLOWS = 3.0  # standard errors from which a state is said to go on and on
-LONG = 100  # samples in which the motion of one must grow by as much as it is, else it is a rate
-ROUNDING = 1e-7  # of a slope, relative to its parts
 CURVED = "Curvature: "  # begins notes on it
 UNTOLD = "Standard errors and intervals do not tell that."  # ends notes on what they leave out
 
@@ -58,9 +54,12 @@ class Gains(ReadOnlyArrays):
         found[2] *= integrators > 1
         widths = np.array([*errors] or np.zeros(found.shape))
         P = np.abs(projector(A, integrators))
-        parts = np.abs(found[1:3]) - ROUNDING * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
-        moves_on, speeds_up = parts > FOLLOWS * widths[1:3]
-        speeds_up &= LONG * parts[1] > parts[0]
+        # 1e-7: of a slope, relative to its parts
+        parts = np.abs(found[1:3]) - 1e-7 * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
+        # 3.0: standard errors from which a state is said to go on and on
+        moves_on, speeds_up = parts > 3.0 * widths[1:3]
+        # 100: samples in which the motion of one must grow by as much as it is, else it is a rate
+        speeds_up &= 100 * parts[1] > parts[0]
         # What one input moves on and on, another may move on too: its interval tells.
         moves_on |= np.any(moves_on | speeds_up, axis=1, keepdims=True) & (widths[1] > 0)
         degrees = np.where(speeds_up, 2, moves_on.astype(int))
@@ -68,7 +67,8 @@ class Gains(ReadOnlyArrays):
         values, own = (np.take_along_axis(each, pick, 0)[0] for each in (found, widths))
         # Of an input that moves one state on and on, the others' gains are beside that pole.
         away = np.sort(np.abs(np.linalg.eigvals(A) - 1))[:integrators]
-        rests = (degrees == 0) & np.any(degrees, axis=0) & np.all(away < NEARLY_ONE)
+        # 0.05: distance of a pole from 1 within which a state goes on and on: for 20 samples
+        rests = (degrees == 0) & np.any(degrees, axis=0) & np.all(away < 0.05)
         values = np.where(rests, found[3], values)
         own = np.where(rests, widths[3], own)
         beside = (np.where(degrees, each[0], each[3]) for each in (found, widths))

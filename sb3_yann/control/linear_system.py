@@ -10,8 +10,6 @@ import numpy as np
 from sb3_yann._validation import Array, ReadOnlyArrays, check_type, is_text
 from sb3_yann.control.gains import Gains
 
-LARGEST_EXPONENT = 709.0  # beyond it the exponential function exceeds what numbers hold
-
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem(ReadOnlyArrays):
@@ -107,7 +105,7 @@ def _why_not_sampled(A: Array, dt: float) -> str:
     """Return why ``exp(A dt)`` and what follows from it are no finite numbers."""
     poles = np.linalg.eigvals(A)
     pole = poles[np.argmax(poles.real)]
-    if pole.real * dt < LARGEST_EXPONENT:
+    if pole.real * dt < 709.0:  # beyond it the exponential function exceeds what numbers hold
         pole = poles[np.argmax(np.abs(poles))]
     if abs(pole) * dt <= 1:
         return (

@@ -35,12 +35,6 @@ if TYPE_CHECKING:
     from sb3_yann.control.simulator import Maker
 
 Rate = Callable[[Array], Array]  # dx/dt (n,), or how far the state moves, at [x, u, d]
-LEVELS = 6
-RATIO = 4.0
-"""Number of steps that approach a point, and how much shorter each is than the one before."""
-NOISE_FLOOR = 100.0
-"""Effects below so many times the noise are none. Hundreds of operations of an integrator round
-ten times as much as one does, and a plant that forgets a state within a sample shows only that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +100,18 @@ def _column(
     actual: Callable[[Array], Array],
 ) -> tuple[Array, Array, float] | str:
     """Return derivatives by coordinate i, their errors and the change; or why there are none."""
+    ratio = 4.0  # how much shorter each step is than the one before
+    levels = 6  # steps that approach a point
     sides: list[Array] = []
     widths = []
-    for level in range(2 * LEVELS):
+    for level in range(2 * levels):
         offset = np.zeros(point.size)
-        offset[i] = longest / RATIO**level
+        offset[i] = longest / ratio**level
         above = actual(point + offset)
         below = actual(point - offset)
         up = above[i] - point[i]
         down = point[i] - below[i]
-        if up <= 0 or down <= 0 or len(sides) == LEVELS:
+        if up <= 0 or down <= 0 or len(sides) == levels:
             break  # the step is lost in the rounding of the point
         slopes = np.array([(f(above) - center) / up, (center - f(below)) / down])
         if np.all(np.isfinite(slopes)):
@@ -127,13 +123,16 @@ def _column(
     span = np.array(widths)[:, None]
     slope = (one + other) / 2
     # Unequal sides (a point that is rounded) would leave a first-order error in the mean.
-    value, error = _extrapolated(slope, RATIO**2, 2 * noise / span)
-    kink, doubt = _extrapolated(one - other, RATIO, 4 * noise / span)
+    value, error = _extrapolated(slope, ratio**2, 2 * noise / span)
+    kink, doubt = _extrapolated(one - other, ratio, 4 * noise / span)
     scale = np.max(np.abs(value))
     steepest = np.max(np.abs(value) + np.abs(kink) / 2)
     if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
         return "its slopes to the two sides differ (a kink)"
-    if np.max(error) > max(0.2 * scale, NOISE_FLOOR * np.max(2 * noise / span[0])):
+    # 100.0: effects below so many times the noise are none. Hundreds of operations of an integrator
+    # round ten times as much as one does, and a plant that forgets a state within a sample shows
+    # only that.
+    if np.max(error) > max(0.2 * scale, 100.0 * np.max(2 * noise / span[0])):
         return "its slope has no limit for short steps (a jump or noise)"
     change = np.max(np.abs(slope[0] - value)) / scale if scale > 0 else 0.0
     return value, error, float(change) if widths[0] > longest else np.nan
@@ -232,14 +231,6 @@ def _least_moved(
     return at(z), float(np.max(np.abs(found.fun)))
 
 
-MOVED = 1e-3  # largest residual of a given steady state in one step, relative to the scale
-AWAY = 1e-2  # largest distance to the linear model's steady state, relative to the scale
-STEADY_RESIDUAL = 1e-6  # largest residual of a steady state that was solved for
-NOTHING = 1e-9  # a solved entry that is smaller, relative to its scale, is zero
-SETTLES = 2_000  # steps in which a plant may come to rest by itself
-SEARCH_STEP = 1e-3  # in scales, as a float32 state needs: SciPy's own would vanish in its rounding
-
-
 def _steady_state(
     simulator: Simulator, motion: Rate, start: Array, free: Mask, scale: Array
 ) -> Array:
@@ -248,30 +239,32 @@ def _steady_state(
     ``motion`` is that of the state in one step, in scales. ``start`` (n+m,) holds the known
     entries, and a guess for the free ones.
     """
+    steady_residual = 1e-6  # largest residual of a steady state that was solved for
     n = scale.size - simulator.space.shape[0]
     low = np.append(np.full(n, -np.inf), simulator.space.low)
     high = np.append(np.full(n, np.inf), simulator.space.high)
 
     def search(start: Array) -> tuple[Array, float]:
-        return _least_moved(motion, start, free, scale, SEARCH_STEP, (low, high))
+        # 1e-3: in scales, as a float32 state needs: SciPy's own would vanish in its rounding
+        return _least_moved(motion, start, free, scale, 1e-3, (low, high))
 
     point, most = search(start)
-    if most > STEADY_RESIDUAL and np.all(free[:n]) and not np.any(free[n:]):
+    if most > steady_residual and np.all(free[:n]) and not np.any(free[n:]):
         # A search may run away from where the plant comes to rest by itself.
         settled = start.copy()
-        for _ in range(SETTLES):
+        for _ in range(2_000):  # steps in which a plant may come to rest by itself
             left = motion(settled)
-            if not STEADY_RESIDUAL < np.max(np.abs(left)) < np.inf:
+            if not steady_residual < np.max(np.abs(left)) < np.inf:
                 break
             settled[:n] += left * scale[:n]
         other = search(settled)
-        if other[1] <= STEADY_RESIDUAL:
+        if other[1] <= steady_residual:
             point, most = other
-    if most > STEADY_RESIDUAL:
+    if most > steady_residual:
         left = motion(point)  # which may be no more than the simulator's own error
         noise = noise_of(simulator.step, point, np.where(np.arange(scale.size) < n, scale, 0.0))
         noise /= scale[:n]
-        if not (np.all(np.abs(left) <= STEADY_RESIDUAL + 5 * noise) and np.all(noise <= MAX_NOISE)):
+        if not (np.all(np.abs(left) <= steady_residual + 5 * noise) and np.all(noise <= MAX_NOISE)):
             at_bound = [
                 f"u[{i - n}] is at its {side} bound, {bound[i]:g}"
                 for side, bound in (("lower", low), ("upper", high))
@@ -284,7 +277,8 @@ def _steady_state(
                 f"{point[n:].tolist()}, which moves in one step by {moves}.{stuck} Leave more "
                 "entries free (NaN), or start closer to it."
             )
-    return np.where(free & (np.abs(point) <= NOTHING * scale), 0.0, point)
+    # 1e-9: a solved entry that is smaller, relative to its scale, is zero
+    return np.where(free & (np.abs(point) <= 1e-9 * scale), 0.0, point)
 
 
 def _require_steady_state(moved: Array, point: Array, slopes: Array, scale: Array) -> None:
@@ -297,15 +291,13 @@ def _require_steady_state(moved: Array, point: Array, slopes: Array, scale: Arra
     slopes = (slopes - np.eye(n, point.size)) * scale / scale[:n, None]
     way = np.linalg.lstsq(slopes, -moved, rcond=1e-9)[0]
     left = moved + slopes @ way
-    if np.max(np.abs(way)) > AWAY or np.max(np.abs(left)) > MOVED:
+    # 1e-3: largest residual of a given steady state in one step, relative to the scale
+    # 1e-2: largest distance to the linear model's steady state, relative to the scale
+    if np.max(np.abs(way)) > 1e-2 or np.max(np.abs(left)) > 1e-3:
         raise ValueError(
             f"x_ss = {point[:n].tolist()}, u_ss = {point[n:].tolist()} is no steady state: one "
             f"step moves it by {(moved * scale[:n]).tolist()}. Set entries to NaN to be solved for."
         )
-
-
-LONGEST_EPISODE = 400  # steps after which an episode counts as one without an end of its own
-EPISODE_SECONDS = 1.0  # after which a slow one does
 
 
 def _time_limit_fault(env: Any, action: Array) -> str:
@@ -333,19 +325,14 @@ def _termination(env: Any, seed: int, action: Array) -> int:
     """Return after how many steps an episode terminates, 0 if it does not or is cut before."""
     env.reset(seed=seed)
     begun = perf_counter()
-    for step in range(1, LONGEST_EPISODE + 1):
+    for step in range(1, 401):  # a longer episode counts as one without an end of its own
         _, _, terminated, truncated, _ = env.step(action.astype(env.action_space.dtype))
-        if terminated or truncated or perf_counter() - begun > EPISODE_SECONDS:
+        if terminated or truncated or perf_counter() - begun > 1.0:  # a slow one
             return step if terminated else 0
     return 0
 
 
 LONGEST_STEP = 0.01  # longest step of a difference, relative to the scale of its coordinate
-LONGEST_SINGLE = 0.05  # the same where states are read in float32
-LONGEST_NOISY = 0.2  # the same where an adaptive integrator leaves noise
-# from where on noise counts: beside rounding, and in scales
-NOISY = 10.0
-LEAST_NOISE = 1e-10
 
 
 def linearize_env(
@@ -453,15 +440,18 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Ja
     of_states = np.where(np.arange(scale.size) < n, scale, 0.0)
     readings = np.array([simulator.step(point + k * LONGEST_STEP / 3 * of_states) for k in (0, 1)])
     single = np.array_equal(readings, readings.astype(np.float32), equal_nan=True)
-    longest = (LONGEST_SINGLE if single else LONGEST_STEP) * scale
+    # Longer steps where states are read in float32.
+    longest = (0.05 if single else LONGEST_STEP) * scale
     spacing = np.finfo(np.float32 if single else np.float64).eps
     rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
     noise = noise_of(lambda z: simulator.step(actual(z)), point, of_states)
-    noise[noise <= np.maximum(NOISY * rounding, LEAST_NOISE * scale[:n])] = 0.0
+    # Noise counts from ten times the rounding on, and from 1e-10 of the scales.
+    noise[noise <= np.maximum(10.0 * rounding, 1e-10 * scale[:n])] = 0.0
     if np.any(noise > MAX_NOISE * scale[:n]):
         noise[:] = 0.0  # no noise that differences could cope with
     rough = float(np.max(noise / scale[:n]))
-    longest = np.maximum(longest, np.minimum(1e6 * rough, LONGEST_NOISY) * scale)
+    # Longer ones where an adaptive integrator leaves noise.
+    longest = np.maximum(longest, np.minimum(1e6 * rough, 0.2) * scale)
     longest[n:] = np.minimum(longest[n:], room)
     labels = names((n, room.size))
     error = np.maximum(rounding, noise)
@@ -469,12 +459,8 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Ja
 
 
 STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
-MOVES = 0.01  # the same relative to its own size: beyond it, a state smaller than 1 gets a warning
-AT_REST = 1e-8  # largest motion in one sample of a steady state that was solved for
 STARTS = (0.0, 1.0, -1.0, 0.1, 10.0, 100.0)
 """Scales of the free entries from which the steady state is sought, in turn."""
-RATE_STEP = 1e-6  # of the slopes that a search takes, in scales
-ANOTHER = 1e-3  # distance, in scales, from which two steady states are different ones
 
 
 def linearize_dynamics(
@@ -582,10 +568,13 @@ def _rest_of(
 
     found: list[Array] = []
     begun = [np.where(free, start * scale, given) for start in STARTS]
-    tried = [_least_moved(motion, each, free, scale, RATE_STEP) for each in begun]
+    # 1e-6: of the slopes that a search takes, in scales
+    tried = [_least_moved(motion, each, free, scale, 1e-6) for each in begun]
     for point, left in tried:
-        apart = (np.max(np.abs(point - other) / scale) > ANOTHER for other in found)
-        if left <= AT_REST and all(apart):
+        # 1e-3: distance, in scales, from which two steady states are different ones
+        apart = (np.max(np.abs(point - other) / scale) > 1e-3 for other in found)
+        # 1e-8: largest motion in one sample of a steady state that was solved for
+        if left <= 1e-8 and all(apart):
             found.append(point)
     if not found:
         best, least = min(tried, key=lambda each: each[1])
@@ -629,7 +618,8 @@ def _require_steady(rate: Rate, parts: list[Array], size: Array, dt: float, scal
             f"{moved.tolist()}, with a scale of {size.tolist()}. Set entries to NaN to have them "
             "solved for."
         )
-    if not scaled and np.any((moved > MOVES * np.abs(x)) & (x != 0) & (moved > 1e-8)):
+    # A state smaller than 1 that moves by 1 % of its own size gets a warning.
+    if not scaled and np.any((moved > 0.01 * np.abs(x)) & (x != 0) & (moved > 1e-8)):
         warn(
             f"In one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
             f"{moved.tolist()}, much beside itself. Pass scale=..., how far each state moves.",

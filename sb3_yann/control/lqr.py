@@ -12,11 +12,6 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import LinearSystem
 
-FAST = 1e6  # times that a mode may grow in a sample: its feedback cancels all but ten digits
-NEAR_CIRCLE = 1e-3
-"""Distance from the unit circle at which rounding may put the poles of a chain of integrators."""
-NUDGE = 1e-12  # of the largest weight: it is given to all inputs where there is no solution without
-
 
 def riccati(
     model: LinearSystem, Q: Array, R: Array, gamma: float = 1.0, cross: Array | None = None
@@ -30,7 +25,8 @@ def riccati(
     A = np.sqrt(gamma) * model.A
     B = np.sqrt(gamma) * model.B
     # Inputs that cost their moves alone may rest anywhere: no more than rounding holds them.
-    for nudge in (0.0, NUDGE):
+    # 1e-12: of the largest weight: it is given to all inputs where there is no solution without
+    for nudge in (0.0, 1e-12):
         weight = R + nudge * np.max(np.abs(R)) * np.eye(len(R))
         try:
             with np.errstate(all="ignore"):
@@ -113,7 +109,8 @@ def unreached(A: Array, B: Array) -> complex | None:
 def _why_no_solution(A: Array, B: Array) -> str:
     """Return which condition of the Riccati equation fails."""
     fastest = np.abs(np.linalg.eigvals(A)).max()
-    if fastest > FAST:
+    # 1e6: times that a mode may grow in a sample: its feedback cancels all but ten digits
+    if fastest > 1e6:
         return (
             f"The model grows {fastest:.2g} times in a sample, and float64 holds no feedback for "
             "that. Is dt in the unit of the model's time? Else sample faster."
@@ -126,7 +123,9 @@ def _why_no_solution(A: Array, B: Array) -> str:
             "sqrt(gamma) A. Remove the mode from the model, add an input, lower gamma, or take "
             "another steady state: model.report() names those that were found."
         )
-    if np.any(np.abs(np.abs(np.linalg.eigvals(A)) - 1) < NEAR_CIRCLE):
+    # 1e-3: distance from the unit circle at which rounding may put the poles of a chain of
+    # integrators.
+    if np.any(np.abs(np.abs(np.linalg.eigvals(A)) - 1) < 1e-3):
         return (
             "The Riccati equation has no stabilizing solution: a mode on the unit circle carries "
             "no weight in Q. Give it a positive weight, use gamma < 1, or pass a Terminal(cost)."

@@ -20,8 +20,6 @@ from sb3_yann._validation import (
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
 
-PERIODS = 40  # of all rates, after which the gain of a filter with several is that of the limit
-
 
 class StateEstimator:
     """A steady-state Kalman filter for states, and for disturbances that are ``estimated``.
@@ -234,17 +232,18 @@ class StateEstimator:
 
     def _gain_of_rates(self, W: Array, V: Array, cross: Array) -> Array:
         """Return the mean gain of each output, over the samples at which it is read."""
+        periods = 40  # of all rates: the gain is that of the limit then
         A = self.A
         C = self.C_aug
         period = int(np.lcm.reduce(self.every))
         total: Array = np.zeros((len(A), len(C)))
         P = W + np.eye(len(A)) * np.trace(W) / len(A)
-        for k in range(PERIODS * period):
+        for k in range(periods * period):
             seen = np.flatnonzero(k % self.every == 0)
             S = C[seen] @ P @ C[seen].T + V[np.ix_(seen, seen)]
             own = np.linalg.solve(S, C[seen] @ P).T
             next_step = np.linalg.solve(S, cross[:, seen].T).T
-            if k >= (PERIODS - 1) * period:
+            if k >= (periods - 1) * period:
                 total[:, seen] += own + np.linalg.lstsq(A, next_step, rcond=None)[0]
             ahead = A @ own + next_step
             moved = A - ahead @ C[seen]

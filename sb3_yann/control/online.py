@@ -268,7 +268,6 @@ class OnlineLaw(PlantLaw):
 
 Law = PiecewiseAffine | OnlineLaw
 LAWS = ("auto", "explicit", "online")
-STEEP = 5e6  # times the inputs' own cost: what a slack costs at most by a default penalty
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,7 +422,8 @@ def steepness(program: ParametricQP, u_min: Array, u_max: Array) -> float:
     """Return how many times as much as by a default penalty the slacks of a program cost."""
     scaled, _ = program.scaled(u_min, u_max, 0 * program.theta_min)
     ratio, _ = slack_costs(scaled)
-    return float(ratio.max()) / STEEP
+    # By a default penalty a slack costs at most 5e6 times the inputs' own cost.
+    return float(ratio.max()) / 5e6
 
 
 def _require_positive_definite(H: Array) -> None:

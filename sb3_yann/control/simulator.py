@@ -243,9 +243,6 @@ def to_vector(value: Any) -> Array | None:
 SPACINGS = (1e-3, 1e-4, 1e-5)
 """Distances of the points at which noise is measured, relative to the scale."""
 POINTS = 10
-ORDER = 6
-"""Points on a line, and the order of the differences that leave nothing of a smooth function."""
-UNLIKE = 4.0  # ratio of what two spacings show from which it is a kink rather than noise
 MAX_NOISE = 1e-3  # largest noise, relative to the scale, that differences can cope with
 
 
@@ -256,20 +253,21 @@ def noise_of(f: Callable[[Array], Array], point: Array, scale: Array) -> Array:
     with the spacing: Hamming's table, as in Moré & Wild (2011), *SIAM J. Sci. Comput.* 33. f takes
     points (c,) and returns values (r,); ``scale`` (c,) is the range of each coordinate.
     """
+    order = 6  # of the differences, which leave nothing of a smooth function
     direction = scale * np.random.default_rng(0).choice([-1.0, 1.0], point.size)
     offsets = np.arange(POINTS) - (POINTS - 1) / 2
     values = np.array([[f(point + h * k * direction) for k in offsets] for h in SPACINGS])
-    shrink = factorial(ORDER) ** 2 / factorial(2 * ORDER)
-    found = np.sqrt(shrink * np.mean(np.diff(values, ORDER, axis=1) ** 2, axis=1))
+    shrink = factorial(order) ** 2 / factorial(2 * order)
+    found = np.sqrt(shrink * np.mean(np.diff(values, order, axis=1) ** 2, axis=1))
     if not np.all(np.isfinite(found)):
         return np.zeros(found.shape[1])
     largest = np.max(found, axis=0)
     # A kink fades with the spacing. At the shortest, noise may be smooth, as of step sizes chosen.
-    steady = largest <= UNLIKE * np.maximum(np.median(found, axis=0), np.finfo(float).tiny)
+    # 4.0: ratio of what two spacings show from which it is a kink rather than noise
+    steady = largest <= 4.0 * np.maximum(np.median(found, axis=0), np.finfo(float).tiny)
     return np.where(steady, largest, 0.0)
 
 
-LONGEST_DELAY = 20  # longest input delay, in samples, that is detected
 UNSEEN = "the plant has states besides these, which setting this one"
 SET_STATE_ADVICE = (
     "Make them part of the state (of a delay, the inputs on their way), have set_state set them "
@@ -370,8 +368,9 @@ def _hidden_state(simulator: Simulator, x: Array, u: Array, first: Array, scale:
     One that setting x leaves alone shows when a step is repeated after other inputs, one that
     setting x resets when the plant goes on by itself.
     """
+    longest_delay = 20  # longest input delay, in samples, that is detected
     push = u + 0.5 * simulator.way(u)
-    for _ in range(LONGEST_DELAY):
+    for _ in range(longest_delay):
         moved = simulator.next_state(x, push)
     again = simulator.next_state(x, u)
     if np.any(np.abs(again - first) > 1e-6 * (scale + np.abs(first))):
@@ -381,7 +380,7 @@ def _hidden_state(simulator: Simulator, x: Array, u: Array, first: Array, scale:
             f"input, an actuator). {SET_STATE_ADVICE}"
         )
     states = [simulator.next_state(x, push)]
-    while len(states) < LONGEST_DELAY and not simulator.over:
+    while len(states) < longest_delay and not simulator.over:
         if not np.all(np.abs(states[-1] - x) <= 10 * scale):
             break
         states.append(simulator.go_on(push))

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 FORMAT = 5  # of the arrays: a reader takes no other
 POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
 KEPT_ROUNDING = 2.5e-7  # that of `units`, which this file does without
-MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
 
 
 class Status(IntFlag):
@@ -438,7 +437,7 @@ class Controller:
     def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the first region that theta violates least, and whether it holds theta."""
         data = self.data
-        rows = max(1, MAX_SLACKS // len(data["b"]))
+        rows = max(1, 4_000_000 // len(data["b"]))  # entries of slacks in memory at a time
         tolerance, tie = data["tolerances"]
         region = np.empty(len(theta), np.int64)
         inside = np.empty(len(theta), bool)

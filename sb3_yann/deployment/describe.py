@@ -28,8 +28,6 @@ from sb3_yann.policy.observations import AffineObservation, keeps_entries
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.units import ActionUnits
 
-MAX_THETA = 1e12  # theta ends at so many times its box: beyond, slacks would overflow
-
 
 @dataclass(frozen=True)
 class Checks:
@@ -436,7 +434,8 @@ def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:
         "middle": middle / half,
     }
     arrays["box_middle"], arrays["box_per_half"] = law.box
-    far = MAX_THETA * np.abs(arrays["box"]).max(0)
+    # Beyond 1e12 times theta's box slacks would overflow.
+    far = 1e12 * np.abs(arrays["box"]).max(0)
     arrays["ends"] = np.array([law.clamp(-far), law.clamp(far)])
     arrays["bounds"][:, finite] = [[-1.0], [1.0]]  # to the bit
     arrays["resting"] = np.clip(-middle / half, *arrays["bounds"])

@@ -32,13 +32,6 @@ RESERVED = re.compile(
     re.IGNORECASE,
 )
 """Words of the language that a function block cannot be called, and what is no name in it."""
-MAX_REAL = 1e37
-MIN_REAL = 1e-37
-"""Larger readings count as infinite, which no standard function asks; smaller entries are zero.
-
-Both are for LREAL too: MatIEC, the compiler of OpenPLC and Beremiz, reads its literals as REAL
-first. It also leaves out a FOR loop of one turn, so all loops are WHILE.
-"""
 
 
 def st_text(data: ControllerArrays, precision: str, about: str) -> str:
@@ -152,17 +145,22 @@ def _chosen(text: str, flags: set[str]) -> str:
 
 def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:
     """Return declarations of numbers and tables; these are flat, their rows follow each other."""
+    # No standard function asks whether a reading is infinite: beyond 1e37 it counts as such, and
+    # entries below 1e-37 are zero. Both are for LREAL too: MatIEC, the compiler of OpenPLC and
+    # Beremiz, reads its literals as REAL first. It also leaves out a FOR loop of one turn, so all
+    # loops are WHILE.
+    max_real = 1e37
     tolerances = code.search_tolerances(data, precision)
     fade_start, fade_end = data["fades"]
     reals = {
         "TOLERANCE": tolerances["tolerance"],
         "TIE": tolerances["tie"],
-        "BEYOND_ALL": MAX_REAL,
-        "REACH": min(float(data["reach"]), MAX_REAL),
+        "BEYOND_ALL": max_real,
+        "REACH": min(float(data["reach"]), max_real),
         "FADES_FROM": fade_start,
         "FADES_TO": fade_end,
         "KEPT_ROUNDING": KEPT_ROUNDING,
-        "LATE_AFTER": min(float(data["late_after"]), MAX_REAL),
+        "LATE_AFTER": min(float(data["late_after"]), max_real),
         "DRIVING": DRIVING,
     }
     lines = [f"{name} : {kind} := {decimal(value, precision)};" for name, value in reals.items()]
@@ -170,7 +168,7 @@ def _constants(data: ControllerArrays, precision: str, kind: str) -> list[str]:
         lines.append(f"{name.upper()} : DINT := {int(data[name])};")
     numbers, indices = code.controller_tables(data, precision, walk=False)
     for name, values in numbers.items():
-        kept = np.where(np.abs(values) < MIN_REAL, 0.0, np.clip(values, -MAX_REAL, MAX_REAL))
+        kept = np.where(np.abs(values) < 1e-37, 0.0, np.clip(values, -max_real, max_real))
         lines.append(_array(name, kind, [decimal(each, precision) for each in kept.flat]))
     for name, values in indices.items():
         lines.append(_array(name, "DINT", [str(each) for each in values.flat]))

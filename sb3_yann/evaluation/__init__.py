@@ -9,7 +9,6 @@ from sb3_yann.compare import Difference
 from sb3_yann.rollout import Trajectories, as_played, evaluate
 
 __all__ = ["Trajectories", "comparison_table", "evaluate"]
-MAX_ROWS = 20  # episodes that have a row each, at most
 
 
 def comparison_table(
@@ -47,7 +46,7 @@ def comparison_table(
             "same seeds, one at least. Pass both what evaluate returns for these seeds."
         )
     lines = [title]
-    if counts[0] <= MAX_ROWS:
+    if counts[0] <= 20:  # episodes that have a row each, at most
         lines.append(f"  {'episode':<13}{names[0]:>12}{names[1]:>12}{'change':>12}")
         for number, (old, new) in enumerate(zip(before.costs, after.costs, strict=True), start=1):
             lines.append(f"  {number:<13}{old:>12,.2f}{new:>12,.2f}{new - old:>+12,.2f}")

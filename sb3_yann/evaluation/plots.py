@@ -48,7 +48,6 @@ Runs = Mapping[str, Trajectories]
 Quantity = int | str
 Frame = tuple[ArrayLike, ArrayLike]
 MAX_LINES = 6  # so many episodes are drawn one by one; of more, the median and bands
-MAX_REGIONS = 30  # in a picture of visits: those visited most
 
 
 def _entry_of(problem: LinearMPC, quantity: Quantity, inputs: bool = False) -> int:
@@ -269,7 +268,7 @@ def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figur
     apart = np.abs(inputs_of(problem, policy, theta) - law(theta)) / problem.u_half
     distance = 100 * apart.max(axis=1)
     regions, where, visits = np.unique(law.locate(theta), return_inverse=True, return_counts=True)
-    order = np.argsort(-visits, kind="stable")[:MAX_REGIONS]
+    order = np.argsort(-visits, kind="stable")[:30]  # in a picture of visits: those visited most
     mean = (np.bincount(where, weights=distance) / visits)[order]
     largest = [float(distance[where == k].max()) for k in order]
     figure = new_figure(6.8, 4.8)

@@ -41,9 +41,6 @@ from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Rows, Trajectories, preserve_rng, rollout
 
 FIRST_STARTS = 5  # starts of a trial of its first look
-FIRST_FINAL_LOOK = 40  # the same at the end: the worst 5 % of so many are two
-INTERIM_LEVEL = 0.2
-"""Of what confirms a policy until the end, one-sided: it has passed on the known starts."""
 PARTS_OF_THE_WAY = 0.5, 0.25
 """How far towards a refused candidate, and which shares of a correction that lost, are tried."""
 
@@ -295,11 +292,12 @@ def _confirm(
     """
     rule = settings.rule
     strict = significance is not None and not rule.cvar_alpha
-    level = INTERIM_LEVEL
+    level = 0.2  # one-sided, until the end: the policy has passed on the known starts
     counts = looks(FIRST_STARTS, settings.n_new_starts)
     demands: dict[str, Any] = {}
     if significance is not None:
-        counts = looks(FIRST_FINAL_LOOK, settings.n_final_starts)
+        # The worst 5 % of forty are two.
+        counts = looks(40, settings.n_final_starts)
         demands = {"least_gain": settings.least_gain, "tail_errors": rule.standard_errors}
         demands["must_gain"] = not strict
     verdict = Verdict()

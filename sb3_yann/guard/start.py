@@ -24,7 +24,6 @@ from sb3_yann.guard.state import Decision, Evidence, GuardState
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.rollout import Trajectories, preserve_rng, require_finite, require_repeated
 
-REPEATED = 2  # starts from which the MPC plays twice: a simulator repeats itself
 OTHER_REWARD = 0.01  # of the mean cost: a reward that differs by more is another one
 
 
@@ -76,14 +75,15 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
 
     The actor plays, not the law in float64: the MPC must be no worse than itself to the last bit.
     """
+    repeated = 2  # starts from which the MPC plays twice: a simulator repeats itself
     name = settings.env
     mpc = player.episodes(player.mpc, seeds)
     require_finite(f"the guard's env {name}", seeds, mpc.costs)
     with preserve_rng():  # an env that draws from these would else repeat itself by accident
         random.random()
         np.random.random()  # noqa: NPY002
-        again = player.episodes(player.mpc, seeds[:REPEATED])
-    for seed, first, second in zip(seeds[:REPEATED], mpc.costs, again.costs, strict=False):
+        again = player.episodes(player.mpc, seeds[:repeated])
+    for seed, first, second in zip(seeds[:repeated], mpc.costs, again.costs, strict=False):
         require_repeated(f"the guard's env {name}", seed, first, second)
     first = mpc.observations[0][0]
     alike = all(np.array_equal(each[0], first) for each in mpc.observations)

@@ -26,8 +26,6 @@ from sb3_yann.policy.policies import StartsAsMPC
 Play = Callable[[ActorCheckpoint, Sequence[int]], Scores]
 """From a checkpoint and seeds to the scores of its episodes."""
 DecisionKind = Literal["accepted", "accepted in part", "rejected"]
-MAX_PASSED = 5  # earlier accepted checkpoints that are kept, at most
-MAX_PASSED_BYTES = 10_000_000  # their size, at most
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,8 @@ class Evidence:
         if checkpoint.has_networks_of(self.mpc):  # which is always there
             return kept
         passed = (*kept.passed, checkpoint)
-        most = min(len(passed), MAX_PASSED, max(1, MAX_PASSED_BYTES // checkpoint.size))
+        # Of earlier accepted checkpoints at most five are kept, or 10 MB.
+        most = min(len(passed), 5, max(1, 10_000_000 // checkpoint.size))
         return replace(kept, passed=passed[-most:])
 
 

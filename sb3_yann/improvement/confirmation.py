@@ -39,11 +39,6 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
 
 MARGIN = 0.01  # what one start around the log may cost more on one member, in mean costs of the MPC
-AROUND = 0.005
-RAREST = 10.0
-"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
-many times as much at most where it is rare."""
-FURTHER = 0.01  # how much farther than the MPC a run may leave what the log shows, in its widths
 WINDOW = 200  # steps that are planned of a run of more than twice as many
 
 
@@ -165,7 +160,8 @@ class Trial:
             costs, excess = costs_of(twin.problem, twin.dynamics.row.shown(thetas), inputs)
         costs = costs.ravel()
         excess = BoundExcess(*(each.ravel() for each in excess))
-        left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
+        # 0.01: how much farther than the MPC a run may leave what the log shows, in its widths
+        left = ~(self._beyond(thetas) <= self.far + 0.01) & self.known
         unsafe = unsafe_columns(left, 0, ~np.isfinite(costs), excess)
         return Scores(costs, unsafe, np.zeros((len(costs), 0), dtype=bool))
 
@@ -228,8 +224,9 @@ class Trial:
     def room(self) -> Array:
         """Return what each start may cost more than with the MPC."""
         chance = self.twin.starts.chance_beyond(self.starts).ravel()
-        rare = np.clip(RARE / np.maximum(chance, 1e-300), 1.0, RAREST)
-        around = AROUND * rare * np.abs(self.mpc.costs) * ~self.known
+        # A start outside the log may cost .5 % more of what it costs the MPC, a rare one 5 %.
+        rare = np.clip(RARE / np.maximum(chance, 1e-300), 1.0, 10.0)
+        around = 0.005 * rare * np.abs(self.mpc.costs) * ~self.known
         return np.asarray(MARGIN * self.mean + around)
 
     def scenarios(self, rng: np.random.Generator) -> Scenarios:

@@ -25,29 +25,10 @@ from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.env import LearntModel
 from sb3_yann.twin.plant_twin import PlantTwin
 
-BATCH = 512  # rows in a step of Adam
-RATE = 1e-2  # of Adam at first; it falls to zero
-NEARBY = 3  # states beside each of a plan that its feedback answers
-SPREAD = 0.1  # how far they are, in standard deviations of the states in the episodes
-HUBER = 0.1
-"""Errors of an action, in half-ranges, from which they count by their size rather than its square:
-where plans go one way or the other, their mean goes nowhere. Labels on a bound lie as far beyond
-it, so that the slope does not vanish on the way."""
 FITS = 8  # fits to plans in a model, at most: after each the policy's own states are planned from
 HARDEST = 40  # scenarios that are planned anew after a fit or a check, at most
-HEAVIEST = 8  # times that a start counts which a policy loses: twice as often after each fit
 DESCENTS = 10  # steps down the costs of a model's episodes, after the fits
-DESCENT_ROWS = 48_000  # steps of episodes whose slopes each of these follows, about
-MOVE = 0.1  # of an action in the first of these, root mean square
-LONGER = 1.5  # times the last one's is the next, where the policy got better; else half of it
-SHORTEST_MOVE = 0.02  # so small a one ends the descent
-FINER = 4  # times as many steps, and as small ones, where a policy cannot know what plans do
-FARTHEST = 3.0  # moves of an action, in times their root mean square
-STEEPEST = 10.0  # slopes of an episode, in times the median's, at most
 NEARLY = 0.5
-PRICE = 40.0
-"""How often a start counts, at first, that costs so much of what it may cost more than with the
-MPC; twice as often after each look with an objection."""
 NEAR = 0.02
 """Share of what plans gain that a policy may lack when its fits end; a fit that brings less than
 half of it, to a policy that gains half of what they do, is the last; so is a step of the descent,
@@ -131,7 +112,8 @@ class Teacher:
         if played:
             chosen, begins = self.hardest(played)
             lost = chosen[~(played.costs[chosen] <= self.mpc.costs[chosen])]
-            self.weights[lost] = np.minimum(2 * self.weights[lost], HEAVIEST)
+            # 8: times that a start counts which a policy loses: twice as often after each fit
+            self.weights[lost] = np.minimum(2 * self.weights[lost], 8)
         self.known[chosen] = True
         scenarios = self.scenarios.of(chosen)
         mpc = self.mpc.of(chosen)
@@ -168,10 +150,12 @@ class Teacher:
         """Keep the inputs of an episode at its thetas, and the answers to states near each."""
         thetas = played.thetas[:-1, i]
         inputs = played.inputs[:, i]
-        near = np.repeat(thetas[:, None], NEARBY, axis=1)
+        # 3: states beside each of a plan that its feedback answers
+        near = np.repeat(thetas[:, None], 3, axis=1)
         states = near[..., self.problem.layout.state]
         coordinates = self.scenarios.model.dynamics.coordinates
-        states += SPREAD * coordinates.units * self.rng.standard_normal(states.shape)
+        # 0.1: how far they are, in standard deviations of the states in the episodes
+        states += 0.1 * coordinates.units * self.rng.standard_normal(states.shape)
         rows = near.reshape(-1, near.shape[-1])
         answered = np.clip(answers(near).reshape(len(rows), -1), *self.task.limits(rows))
         coordinates.wrap(rows)
@@ -299,9 +283,12 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
         return 0.0
     room = NEARLY * RULE.tolerance(mpc[known]).allowed(mpc)
     is_family = isinstance(scenarios.model, Family)
-    price = PRICE * (teacher.caution if is_family else 1.0)
-    finer = FINER if is_family else 1
-    size = MOVE / finer
+    # 40.0: how often a start counts, at first, that costs so much of what it may cost more than
+    # with the MPC; twice as often after each look with an objection.
+    price = 40.0 * (teacher.caution if is_family else 1.0)
+    # 4: times as many steps, and as small ones, where a policy cannot know what plans do
+    finer = 4 if is_family else 1
+    size = 0.1 / finer  # of an action in the first of these, root mean square
     weight = 0.0
     last = teacher.mpc
     most = (False, -np.inf)
@@ -321,16 +308,18 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
             objects = not passes
             present = copy.deepcopy(layer.state_dict())
             last = played
-            size *= LONGER if k else 1.0
+            # 1.5: times the last one's is the next, where the policy got better; else half of it
+            size *= 1.5 if k else 1.0
             weight = price * bool(is_family and np.any(last.costs > mpc + room))
         else:
             layer.load_state_dict(present)
             size /= 2
-        if k == finer * DESCENTS or size < SHORTEST_MOVE / finer or slow:
+        if k == finer * DESCENTS or size < 0.02 / finer or slow:  # so small a one ends the descent
             break
         if objects:
             price *= 2
-        count = DESCENT_ROWS // teacher.steps + 1
+        # 48_000: steps of episodes whose slopes each of these follows, about
+        count = 48_000 // teacher.steps + 1
         chosen = teacher.rng.permutation(known[np.isfinite(last.costs[known])])[:count]
         if not len(chosen):
             break
@@ -353,15 +342,17 @@ def _downhill(
 
     Each of the k episodes has its price; the moves' root mean square is ``size``.
     """
+    farthest = 3.0  # moves of an action, in times their root mean square
     problem = teacher.problem
     act = policy_of(layer, problem)
     slopes = slopes_of_inputs(scenarios.plant, teacher.task, act, played.rows, played.inputs)
     slopes *= problem.u_half
     sizes = np.linalg.norm(slopes, axis=(0, 2))
     steep = np.maximum(sizes, np.finfo(float).tiny)
-    slopes *= (prices * np.minimum(1.0, STEEPEST * np.median(sizes) / steep))[:, None]
+    # 10.0: slopes of an episode, in times the median's, at most
+    slopes *= (prices * np.minimum(1.0, 10.0 * np.median(sizes) / steep))[:, None]
     moves = -slopes / (np.sqrt(np.mean(slopes**2)) or 1.0)
-    moves = size * np.clip(moves, -FARTHEST, FARTHEST).reshape(-1, moves.shape[-1])
+    moves = size * np.clip(moves, -farthest, farthest).reshape(-1, moves.shape[-1])
     at = th.as_tensor(played.thetas[:-1].reshape(len(moves), -1))
     with th.no_grad():
         return at, layer(at) + th.as_tensor(moves, dtype=th.float32)
@@ -379,11 +370,15 @@ def fit_layer(
 
     Rows that are not finite are left out. The networks go on from where they are.
     """
+    # Errors of an action, in half-ranges, from which they count by their size rather than its
+    # square: where plans go one way or the other, their mean goes nowhere. Labels on a bound lie as
+    # far beyond it, so that the slope does not vanish on the way.
+    huber = 0.1
     wanted = np.clip((inputs - problem.deviations.u_min) / problem.u_half - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
-    wanted += HUBER * np.sign(wanted) * (np.abs(wanted) == 1)
+    wanted += huber * np.sign(wanted) * (np.abs(wanted) == 1)
     at = th.as_tensor(rows[finite])
-    _fit(layer, at, th.as_tensor(wanted[finite], dtype=th.float32), HUBER, rng, updates)
+    _fit(layer, at, th.as_tensor(wanted[finite], dtype=th.float32), huber, rng, updates)
 
 
 def _fit(
@@ -397,7 +392,9 @@ def _fit(
     """Fit a layer to actions (rows, m) at theta (rows, n_theta), see :meth:`LawLayer.descend`."""
     count = range(updates if len(at) else 0)
     shown = bar("the policy learns: steps of Adam", count, timed=True)
-    steps = ((rng.integers(len(at), size=BATCH), RATE * (1 - k / updates)) for k in shown)
+    # 512: rows in a step of Adam
+    # 1e-2: of Adam at first; it falls to zero
+    steps = ((rng.integers(len(at), size=512), 1e-2 * (1 - k / updates)) for k in shown)
     layer.descend(at, to, largest, steps)
 
 

@@ -66,11 +66,8 @@ from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.units import FLOAT32_ROUNDING
 
-CAUTION = 8.0  # times as much as before count lost starts after each refusal on new ones
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
 PROMISED = 0.95  # share of a gain in the model that the simulator must show from the same starts
-LITTLE_MORE = 0.02  # share of a gain by which another round must raise it
-OTHERS = 9  # scenarios beside each that is planned, in which a policy shows what it has not learnt
 
 
 def of_estimates(problem: LinearMPC) -> str:
@@ -680,11 +677,13 @@ class _Work:
         # Twice each: as it began, and elsewhere with the same references.
         chosen = [each for one in lost[: self.n_starts // 4] for each in (one, one)]
         chosen = [*chosen, *(simulator.episodes[i] for i in order)][: self.n_starts]
-        drawn = self.rng.integers(len(order), size=OTHERS * self.n_starts)
+        # Beside each scenario that is planned nine show what a policy has not learnt.
+        drawn = self.rng.integers(len(order), size=9 * self.n_starts)
         others = [simulator.episodes[i] for i in drawn]
         midway = len(others) // 2
         scenarios = Scenarios.like(model, chosen + others, self.rng, midway)
-        caution = CAUTION ** max(0, number + 1 - self.rounds)
+        # After each refusal on new starts, lost ones count eight times as much as before.
+        caution = 8.0 ** max(0, number + 1 - self.rounds)
         sizes = len(chosen), len(scenarios) - midway
         teacher = Teacher(scenarios, self.seed + number, *sizes, caution)
         teacher.show(self.act() if number else None)
@@ -716,7 +715,8 @@ class _Work:
             self.note(found, how, verdict)
             lost = trial.lost
             useful = found.safe and found.change < least
-            stalls = least < best and found.change > (1 + LITTLE_MORE) * least
+            # Another round must raise the gain by 2 %.
+            stalls = least < best and found.change > 1.02 * least
             # Ten starts may hold none that gains: the confirmation has others.
             hopes = least == best and found.safe and found.change - promised < 2 * best
             if useful or hopes:

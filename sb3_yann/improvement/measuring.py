@@ -41,7 +41,6 @@ from sb3_yann.twin.selection import reidentified
 LITTLE = 0.005
 """A gain below this, relative to the MPC's cost, is not worth an observer or a new model."""
 WORTH = 0.02  # A gain below this is not worth learning, which finds a part of it
-SAME_COST = 1e-9  # of an episode's cost: so much more is the same
 CURE = (
     "mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, observer, "
     "mpc.disturbances.d_min, mpc.disturbances.d_max) of sb3_yann.wrappers."
@@ -182,7 +181,7 @@ class Headroom:
         if costs is None:
             return f"not played: {self.why[name]}" if name in self.why else "not played"
         each = (costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
-        more = np.count_nonzero(each > SAME_COST)
+        more = np.count_nonzero(each > 1e-9)  # of an episode's cost: so much more is the same
         return (
             f"{change_in_percent(-gain(self.mpc_costs, costs))} as it was played, worst start "
             f"{change_in_percent(each.max())} of its own cost; {more} of {len(costs)} cost more"
@@ -247,13 +246,6 @@ def verdict_of(offset: float, model_error: float, nonlinearity: float, doubt: fl
     if sum(parts) < worth or WORTH > sum(parts) < doubt:
         return "keep the MPC"
     return verdict if sum(parts) >= doubt else UNKNOWN
-
-
-SURE = 2.0  # standard errors that a gain on a random plant must exceed
-ROUNDS = 4  # how often a model is fitted and planned in, at most
-LEFT = 0.05  # half-widths from its plan at which an MPC has a random plant again: see `Planning`
-KEPT = 1e-3
-"""A plan is played anew where the plant broke its promise by so much of the MPC's mean cost."""
 
 
 def headroom(
@@ -444,6 +436,7 @@ class _Search:
 
     def plan(self) -> None:
         """Play plans: those of a twin, or of a model that learns from what was played."""
+        rounds = 4  # how often a model is fitted and planned in, at most
         base = self.base
         simulator = self.simulator
         unit = max(float(np.abs(base.costs).sum() / base.lengths.sum()), 1e-300)
@@ -460,7 +453,7 @@ class _Search:
         self.say(f"{some} episodes with random inputs")
         todo: NDArray[np.intp] = np.arange(len(base.costs))
         latest = base.costs.copy()
-        for number in range(ROUNDS):
+        for number in range(rounds):
             began = time.monotonic()
             now = todo[: simulator.affordable()]
             if not len(now):
@@ -478,12 +471,13 @@ class _Search:
             self.fair[f"plan {number}"] = latest.copy()
             simulator.learn(loops, seeds)
             costlier = loops.costs - planning.promised(len(now))
-            kept = safe & (costlier <= KEPT * np.abs(base.costs).mean())
+            # Anew where the plant broke a plan's promise by .1 % of the MPC's mean cost.
+            kept = safe & (costlier <= 1e-3 * np.abs(base.costs).mean())
             todo = np.setdiff1d(todo, now[kept])
             self.say(
-                f"plans, round {number + 1} of at most {ROUNDS}: {kept.sum()} of {len(now)} kept "
+                f"plans, round {number + 1} of at most {rounds}: {kept.sum()} of {len(now)} kept "
                 "what they promised",
-                (ROUNDS - 1 - number) * (time.monotonic() - began) * bool(len(todo)),
+                (rounds - 1 - number) * (time.monotonic() - began) * bool(len(todo)),
             )
             if not len(todo) or (number and self.random and not self.poor):  # noise is not learnt
                 break
@@ -495,10 +489,12 @@ class _Search:
         rows = np.empty(0, dtype=np.intp)
         if not self.random:
             return Planning(plant, task, steps, pause)
-        return Planning(plant, task, steps, pause, LEFT, lambda theta: self.law(0, theta, rows))
+        # 0.05: half-widths from its plan at which an MPC has a random plant again: see `Planning`
+        return Planning(plant, task, steps, pause, 0.05, lambda theta: self.law(0, theta, rows))
 
     def figures(self, note: str) -> Headroom:
         """Return the figures."""
+        sure = 2.0  # standard errors that a gain on a random plant must exceed
         base = self.base.costs
         if ended := int(self.base.terminated.sum()):
             which = f"{ended} of {len(base)} episodes of the MPC are ended by the env"
@@ -519,13 +515,13 @@ class _Search:
         offset, known = (min(gain(base, each), total) for each in (observer, model))
         parts = offset, max(0.0, known - offset), total - max(offset, known)
         whole = Headroom(base, observer, model, best, *parts, "", self.source, **self.found)
-        verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
+        verdict = verdict_of(*parts, doubt=sure * whole.standard_error * self.random)
         if verdict == [*ADVICE][1]:  # where it loses from some starts, others may bring less
-            if not offset > SURE * dataclasses.replace(whole, best_costs=observer).standard_error:
+            if not offset > sure * dataclasses.replace(whole, best_costs=observer).standard_error:
                 verdict = UNKNOWN
         more = self.played.get("plan", base) - base
         lost = float(more.mean() / (abs(base.mean()) or 1.0)) if self.twin is None else 0.0
-        if not self.poor and more.mean() < SURE * np.std(more, ddof=1) / np.sqrt(len(more)):
+        if not self.poor and more.mean() < sure * np.std(more, ddof=1) / np.sqrt(len(more)):
             lost = 0.0  # it may be noise
         unplanned = int(np.count_nonzero(~self.planned))
         if (lost > 0 or unplanned) and verdict_of(*parts) == "keep the MPC":

@@ -49,14 +49,7 @@ from sb3_yann.twin.selection import fit_ensemble, fit_family
 from sb3_yann.wrappers.theta import SetPoint, below
 
 FIRST = 3_000_000  # seed of the first episode: far from those that people try first
-APART = 1_000_000  # how far the episodes of two seeds are apart
 EPISODES = 20  # of the MPC, with and without random inputs, that the first model is fitted to
-SHORT = 3_000  # steps that they have at least: of short episodes there are more
-MOST = 60  # of such episodes, at most
-PUSH = 0.5  # half-widths by which inputs are moved at random, at most
-OFTEN = 0.7  # share of the time in which they are
-ASIDE = 0.01  # half-widths of a state, by which the MPC rests beside its target
-HELD = 5  # steps for which they stay
 
 
 class OutOfStepsError(Exception):
@@ -140,7 +133,7 @@ class Simulator:
             self.unaware = below(one, SetPoint) is not None  # its reward, of set-points
             require_spaces(problem, one)
             self.name = name_of(one if callable(env) else env)
-        self.new_seeds = NewSeeds(FIRST + APART * seed)
+        self.new_seeds = NewSeeds(FIRST + 1_000_000 * seed)
         self.longest = 0
         self.episodes: list[Episode] = []
         self.rests_aside = False
@@ -176,7 +169,8 @@ class Simulator:
     def usual(self) -> int:
         """How many episodes a first model is fitted to."""
         count = EPISODES
-        while count < MOST and count * self.longest < SHORT:
+        # 3,000 steps at least, of at most sixty episodes.
+        while count < 60 and count * self.longest < 3_000:
             count += EPISODES // 2
         return count
 
@@ -314,7 +308,8 @@ def rests_aside(row: RowLayout, episodes: Sequence[Episode]) -> bool:
     wanted = ends[:, layout.reference][:, : len(C)] if layout.n_references else 0.0
     left = (ends[:, layout.state] @ C.T - wanted) / (np.abs(C) @ problem.theta_half[layout.state])
     error = 3 * left.std(axis=0, ddof=1) / np.sqrt(len(left))
-    return bool(np.any(np.abs(left.mean(axis=0)) > np.maximum(ASIDE, error)))
+    # 0.01: half-widths of a state, by which the MPC rests beside its target
+    return bool(np.any(np.abs(left.mean(axis=0)) > np.maximum(0.01, error)))
 
 
 def of_law(problem: LinearMPC) -> Controller:
@@ -329,7 +324,7 @@ class Excited:
 
     problem: LinearMPC
     seed: int
-    push: float = PUSH
+    push: float = 0.5  # half-widths by which inputs are moved at random, at most
 
     def __post_init__(self) -> None:
         self.law = of_law(self.problem)
@@ -338,18 +333,12 @@ class Excited:
         """Return the inputs (r, m): those of an episode do not depend on what others there are."""
         problem = self.problem
         every = (int(rows.max(initial=-1)) + 1, self.problem.model.n_inputs)
-        moves, times = (np.random.default_rng([self.seed, t // HELD, i]) for i in range(2))
+        # Every five steps inputs move anew, for 70 % of the time.
+        moves, times = (np.random.default_rng([self.seed, t // 5, i]) for i in range(2))
         moved = self.push * problem.u_half * moves.uniform(-1, 1, every)
-        moved *= times.random((len(moved), 1)) < OFTEN
+        moved *= times.random((len(moved), 1)) < 0.7
         u = self.law(t, theta, rows) + moved[rows]
         return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))
-
-
-MEMBERS = 2  # networks of a model of a simulator, which repeats its steps
-NOISE = 0.01  # standard deviations of the states: what errs less in most steps has no noise
-EXPLAINED = 0.03  # share of the errors' squares that hidden constants leave, at most
-LACKING = 0.5  # share of the errors of neighboring steps that is not alike: more is noise
-DOUBT = 10.0  # mean costs of a step for members that differ by a standard deviation of a state
 
 
 def one_step_error(row: RowLayout, episodes: Sequence[Episode]) -> float:
@@ -370,7 +359,8 @@ def model_of(
 ) -> LearntModel:
     """Return networks on top of the given model, fitted to episodes in the observer's rows."""
     coordinates = Coordinates.of(RowLayout(problem, observer), episodes)
-    members = fit_ensemble(coordinates, [episodes] * MEMBERS, seed)
+    # Two networks: a simulator repeats its steps.
+    members = fit_ensemble(coordinates, [episodes] * 2, seed)
     return LearntModel(problem, tuple(episodes), Dynamics(problem, coordinates, tuple(members)))
 
 
@@ -396,7 +386,8 @@ class Family(LearntModel):
         before = [missed_of(model, each) for each in episodes]
         left = sum(np.sum(((each - each.mean(axis=0)) / coordinates.units) ** 2) for each in before)
         now = sum(np.sum((missed_of(found, each) / coordinates.units) ** 2) for each in episodes)
-        return found if now <= EXPLAINED * left else model
+        # 0.03: share of the errors' squares that hidden constants leave, at most
+        return found if now <= 0.03 * left else model
 
     def member_of(self, episode: Episode) -> int:
         """Return the number of the member that predicts an episode best."""
@@ -438,8 +429,10 @@ def lacks(model: LearntModel) -> tuple[bool, bool]:
     other = cKDTree(points).query(points, k=2)[1][:, 1]
     apart = float(np.mean((errors - errors[other]) ** 2)) / 2
     whole = float(np.mean(errors**2))
-    errs = bool(np.median(np.abs(errors), axis=0).max() > NOISE)
-    return errs, errs and apart < LACKING * whole
+    # 0.01: standard deviations of the states: what errs less in most steps has no noise
+    errs = bool(np.median(np.abs(errors), axis=0).max() > 0.01)
+    # 0.5: share of the errors of neighboring steps that is not alike: more is noise
+    return errs, errs and apart < 0.5 * whole
 
 
 def task_of(model: LearntModel, unit: float, priced: bool = True) -> Task:
@@ -449,7 +442,8 @@ def task_of(model: LearntModel, unit: float, priced: bool = True) -> Task:
     """
     doubt = None
     if priced and model.dynamics.row.observer is None:
-        doubt = Disagreement(model.dynamics, DOUBT * unit)
+        # 10.0: mean costs of a step for members that differ by a standard deviation of a state
+        doubt = Disagreement(model.dynamics, 10.0 * unit)
     end = value_at_end(model.problem)
     limits = model.limits
     return Task(model.problem, limits.low, limits.high, end.P, WEIGHT * unit, doubt, end.slope)

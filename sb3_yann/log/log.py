@@ -17,11 +17,6 @@ from sb3_yann.log.csv_file import SECONDS, CsvFile
 from sb3_yann.log.episodes import Arrays, Episode, in_names, records_of
 from sb3_yann.log.readings import cleaned
 
-OFTEN_READ = 2 / 3
-"""Share of the samples below which isolated readings make a state one that is read now and then."""
-SHORT_RUN = 4  # readings, on average between two gaps, from which on a state is cut at each of them
-FEWEST_RUNS = 10  # so many that an average says something
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Log:
@@ -329,10 +324,10 @@ def _read_now_and_then(records: Sequence[Episode]) -> NDArray[np.bool_]:
     # A reading whose sample before has none begins a run; records count as one.
     runs = np.sum(read[1:] > read[:-1], axis=0) + read[0]
     count = np.sum(read, axis=0)
-    isolated = (count < OFTEN_READ * len(read)) & (runs > count / 2)
-    return np.asarray(
-        (0 < count) & (isolated | ((runs >= FEWEST_RUNS) & (runs > count / SHORT_RUN)))
-    )
+    # Isolated readings of less than two thirds of the samples: a state is read now and then.
+    isolated = (count < 2 / 3 * len(read)) & (runs > count / 2)
+    # With four readings or more, on average, between gaps, a state is cut at each; ten runs say so.
+    return np.asarray((0 < count) & (isolated | ((runs >= 10) & (runs > count / 4))))
 
 
 def _cut(

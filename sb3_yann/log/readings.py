@@ -19,12 +19,8 @@ UNITS = (
     *((1.8, 32.0), (1 / 1.8, -32 / 1.8)),
 )
 """Units that are mistaken for each other: factors, and what is added."""
-JUMP = 5.0  # times any other step of a column that a change of its unit is, at least
 LEAST_READ = 10  # readings on either side of it
-REGULAR = 0.9  # share of a column's changes that are as many rows apart, where it repeats readings
-SPIKE = 50.0  # times nearly all other steps of a state are the two to and from a spike
 LONGEST_SPIKE = 3  # readings, unless all are one value
-DOWN = 10.0  # times nearly all other steps are those to and from what a dead transmitter sends
 
 
 def cleaned(records: list[Episode], names: dict[str, Any]) -> tuple[list[Episode], list[str]]:
@@ -101,12 +97,14 @@ def _leave_out_spikes(name: str, columns: Sequence[Array], acted: Array) -> None
         return
     typical = float(np.quantile(moves, 0.9))
     whole = np.concatenate(columns)
-    far = np.concatenate([_there_and_back(each, SPIKE * typical) for each in columns])
+    # 50.0: times nearly all other steps of a state are the two to and from a spike
+    far = np.concatenate([_there_and_back(each, 50.0 * typical) for each in columns])
     rest = whole[~far & np.isfinite(whole)]
     far &= np.abs(whole - np.median(rest)) > 1.5 * np.ptp(rest)
     if np.count_nonzero(far) > LONGEST_SPIKE + len(whole) // 1000:
         far[:] = False
-    away = np.concatenate([_there_and_back(each, DOWN * typical) for each in columns])
+    # 10.0: times nearly all other steps are those to and from what a dead transmitter sends
+    away = np.concatenate([_there_and_back(each, 10.0 * typical) for each in columns])
     values, counts = np.unique(whole[~far], return_counts=True)
     again = (LONGEST_SPIKE < counts) & (counts <= len(whole) // 20)
     for value in np.intersect1d(values[again], whole[away]):
@@ -152,7 +150,8 @@ def _warn_of_another_unit(name: str, column: Array, is_state: bool) -> None:
     if not LEAST_READ <= k < len(steps) - LEAST_READ:
         return
     before, after = (np.sqrt(np.mean(each**2)) for each in (steps[:k], steps[k + 1 :]))
-    alone = abs(steps[k]) > JUMP * np.max(np.abs(np.delete(steps, k)))
+    # 5.0: times any other step of a column that a change of its unit is, at least
+    alone = abs(steps[k]) > 5.0 * np.max(np.abs(np.delete(steps, k)))
     for factor, shift in UNITS if alone and before * after > 0 else ():
         near = abs(z[k + 1] - factor * z[k] - shift) < 4 * max(factor * before, after)
         # An input may well be stepped by as much as zeros of units differ.
@@ -185,4 +184,5 @@ def _period(parts: Sequence[Array]) -> int:
         return 1
     found, counts = np.unique(apart, return_counts=True)
     every = int(found[np.argmax(counts)])  # some readings are equal, and change nothing
-    return every if np.mean(np.array(apart) % every == 0) > REGULAR else 1
+    # 0.9: share of a column's changes that are as many rows apart, where it repeats readings
+    return every if np.mean(np.array(apart) % every == 0) > 0.9 else 1

@@ -36,8 +36,6 @@ from sb3_yann.policy.checks import require_own_problem
 from sb3_yann.policy.observations import SeesTheta, keeps_entries, without_entries
 from sb3_yann.policy.sb3_hooks import KeepsPrecision, what_is_not_finite
 
-MAX_VALUE_SAMPLES = 100
-"""Samples that a cost counts for good as, at most."""
 NETWORKS = ("per_region", "shared")
 CRITICS = ("afterstate", "state_action")
 
@@ -310,7 +308,7 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
     @property
     def share_of_a_step(self) -> float:
         """What one step is of the sum of equal stage costs, discounted for good."""
-        return max(1 - self.gamma, 1 / MAX_VALUE_SAMPLES)
+        return max(1 - self.gamma, 1 / 100)  # for good: a hundred samples at most
 
     def stage_cost_of_batch(self) -> float:
         """Return the mean stage cost of the latest points to learn from."""

@@ -22,8 +22,6 @@ from sb3_yann.policy.exploring import SpreadActor
 from sb3_yann.policy.policies import StartsAsMPC, require_yann_policy
 
 Tensors = dict[str, th.Tensor]
-DIVERGED_SIZE = 1e9
-"""Parameters beyond this count as diverged: the actor's sums could overflow."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,8 @@ class ActorCheckpoint:
 
     def has_diverged(self) -> bool:
         """Return whether a trainable parameter is not a finite number, or too large."""
-        small = [bool((each.abs() <= DIVERGED_SIZE).all()) for each in self.networks().values()]
+        # 1e9: parameters beyond this count as diverged: the actor's sums could overflow.
+        small = [bool((each.abs() <= 1e9).all()) for each in self.networks().values()]
         return not all(small)  # nor does nan pass
 
     def has_learned(self) -> bool:

@@ -314,9 +314,6 @@ FREE = {"clamped", "confines", "margin", "value_scale"}
 """Buffers of theirs that are not stored, or follow from what was learnt."""
 OF_ORDER_ONE = {"offsets", "resting", "half_space_b", "change"}
 """Those that are in units of a range: zeros among them are not exact."""
-SAME_LAW = 1e-6
-SMALLEST = 1e-9
-"""A law that another machine has solved differs by less, of each number and of the largest."""
 
 
 class OtherProblemError(ValueError, RuntimeError):
@@ -360,8 +357,9 @@ def _difference(part: nn.Module, prefix: str, state: Mapping[str, Any], strict: 
 
 def _agree(part: nn.Module, name: str, value: th.Tensor, wanted: th.Tensor) -> bool:
     """Return whether numbers are the same but for the rounding of another machine."""
+    same_law = 1e-6  # a law that another machine has solved differs by less of each number
     if isinstance(part, SharedYannLayer) and name == "samples":
-        return part.answers_as(value, SAME_LAW)
+        return part.answers_as(value, same_law)
     ours = wanted.double().cpu()
     theirs = value.double().cpu()
     size = _largest(ours)
@@ -370,7 +368,7 @@ def _agree(part: nn.Module, name: str, value: th.Tensor, wanted: th.Tensor) -> b
     if name == "middle":  # of the inputs, often zero: in their ranges
         ranges = "half_range" if isinstance(part, LawLayer) else "to_input"
         size = max(size, _largest(part.get_buffer(ranges)))
-    return th.allclose(theirs, ours, rtol=SAME_LAW, atol=SMALLEST * size)
+    return th.allclose(theirs, ours, rtol=same_law, atol=1e-9 * size)
 
 
 def _largest(numbers: th.Tensor) -> float:

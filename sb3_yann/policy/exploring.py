@@ -23,8 +23,6 @@ from sb3_yann.policy.sb3_hooks import restore_learning_rate, single_precision
 MIN_LOG_STD = math.log(1e-4)
 MAX_LOG_STD = math.log(2.0)
 """Bounds of the logarithm of a standard deviation, of actions in [-1, 1]."""
-EDGE = 1e-12
-"""A quantile stays so far from 0 and 1, where the normal distribution's inverse is not finite."""
 HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 
 
@@ -53,8 +51,9 @@ class TruncatedNormal:
 
     def sample(self) -> th.Tensor:
         """Return actions (batch, m), with a gradient by center and spread."""
+        edge = 1e-12  # at quantiles 0 and 1 the normal distribution's inverse is not finite
         quantile = self.below + th.rand_like(self.m) * self.mass
-        away = th.special.ndtri(quantile.clamp(EDGE, 1 - EDGE))
+        away = th.special.ndtri(quantile.clamp(edge, 1 - edge))
         actions: th.Tensor = (self.m + self.std * away).clamp(-1, 1).to(self.center.dtype)
         return actions
 

@@ -64,11 +64,6 @@ OF_THE_LAYER = (
     "max_correction", "pin_equilibrium", "law", "networks", "keep_bounds", "bounds_margin",
 )  # fmt: skip
 """Keywords of an actor, and of its policy, that are of its layer around the law."""
-EPS = 1e-8
-"""Of Adam, for gradients in units of the values' scale."""
-SCALE_CHECK = 10
-RECENT = 0.1
-"""Updates after which the values' scale is checked; share of that batch in the mean cost."""
 if TYPE_CHECKING:
     _AnyPolicy = TD3Policy
 else:
@@ -268,16 +263,19 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         many orders of magnitude*, 2016). The mean takes in that of the batch after every tenth of
         ``taken`` updates.
         """
-        if taken % SCALE_CHECK:
+        scale_check = 10  # updates after which the values' scale is checked
+        if taken % scale_check:
             return
         mean = self.mean_stage_cost
-        share = max(SCALE_CHECK / (taken + SCALE_CHECK), RECENT)
+        # The batch's share in the mean cost.
+        share = max(scale_check / (taken + scale_check), 0.1)
         mean.add_(share * (self.critic.stage_cost_of_batch() - mean))
         if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
             self.critic_target.load_state_dict(self.critic.state_dict())
         scale = self.critic.scale * self.critic.rescale(float(mean), self.critic.optimizer)
         self.critic_target.rescale(float(mean))
-        eps = self.optimizer_kwargs.get("eps", EPS)
+        # Adam's default is for gradients in units of the values' scale.
+        eps = self.optimizer_kwargs.get("eps", 1e-8)
         for network, power in ((self.actor, 1), (self.critic, 2)):
             for group in network.optimizer.param_groups:
                 group["eps"] = eps * scale**power

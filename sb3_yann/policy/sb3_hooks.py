@@ -20,9 +20,6 @@ from sb3_yann._validation import NonFiniteWarning, warn
 from sb3_yann.control.mpc.bound_excess import Bounds
 from sb3_yann.control.mpc.misreading import STEPS_PER_STATE, misread_states
 
-FIRST_STEPS = 200  # steps of a learn after which what the env shows is compared with the model
-ANOTHER_COST = 0.25  # of the stage cost: a reward that differs by more is another one
-
 
 def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
     """Return the algorithm that is building a policy, None where nobody is.
@@ -173,7 +170,8 @@ def warn_of_first_steps(policy: Any, algorithm: Any) -> None:
     buffer = getattr(algorithm, "replay_buffer", None)
     if policy.states_checked or not isinstance(buffer, ReplayBuffer):
         return
-    count = max(FIRST_STEPS, STEPS_PER_STATE * policy.problem.model.n_states)
+    # 200: steps of a learn after which what the env shows is compared with the model
+    count = max(200, STEPS_PER_STATE * policy.problem.model.n_states)
     rows = -(-count // buffer.n_envs)
     if buffer.size() < rows or buffer.optimize_memory_usage:
         return
@@ -206,7 +204,7 @@ def warn_of_first_steps(policy: Any, algorithm: Any) -> None:
         return
     wrong = np.median(np.abs(rewards - expected)[most])
     typical = options.reward_scale * np.median(cost[most])
-    if wrong > ANOTHER_COST * typical:
+    if wrong > 0.25 * typical:  # of the stage cost: a reward that differs by more is another one
         warn(
             f"Rewards are not the MPC's cost: of the first {len(rewards)} steps half of the most "
             f"costly {np.count_nonzero(most)} differ by {wrong:.3g} or more from what the critic, "

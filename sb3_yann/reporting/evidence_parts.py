@@ -57,7 +57,6 @@ from sb3_yann.twin.env import TwinEnv
 from sb3_yann.units import FLOAT32_ROUNDING
 
 NO_ENV = "No env was given: closed loops are left out. Pass report(model, env=...) to play them."
-FAR = 50.0  # % of the range of an input: as far from the MPC as its middle from a bound
 
 
 def loops_part(subject: Subject) -> Part:
@@ -341,7 +340,8 @@ def distance_part(subject: Subject) -> Part:
     largest = f"The policy is at most {share} % of the range of {name} from the MPC, at {where}."
     if policy.actor.mu.network.is_zero():
         largest = "The policy is the MPC: its networks add nothing."
-    kind = "look" if float(share) > FAR else "note"
+    # 50.0: % of the range of an input: as far from the MPC as its middle from a bound
+    kind = "look" if float(share) > 50.0 else "note"
     findings = make_finding(inside, text), Finding(kind, largest)
     return Part("Where and how far the policy leaves the MPC", join(content), findings)
 

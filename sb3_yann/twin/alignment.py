@@ -27,15 +27,11 @@ from sb3_yann.twin.selection import basis
 STANDARD_ERRORS = 4.0  # so far from a value a coefficient of a regression differs from it
 CLEARLY_BETTER = 0.25  # share of the squared error that another reading of a log leaves at most
 EXACT_SHARE = 4e-4  # of an input's variance: a regression that leaves less explains all of it
-DITHERED_SHARE = 0.7  # the most of an input's variance that a dither on top of the law may be
 SLOPE_TOLERANCE = 0.1  # from one, of an input on the law: sensors' noise lowers the slope
 LEAST_GAIN = 0.6  # times the model's: a gain below, or above the inverse, must be confirmed
 MUCH_BETTER = 0.8  # share of the model's squared error that a unit's factor leaves at most
-ROUNDING = 1e-9  # of a half-width: an input that moves by less stands still
 PACES = 1, 2, 3, 4, 5  # so many samples of the model may lie between two rows
 LEAST_ROWS = 20  # rows of a regression on the law, at least
-LAW = 1e-3  # how far an input may be from the MPC's own, in half-widths
-PROVING = 0.2  # share of the rows, where the law is inside of its bounds, that it has made
 CONFIRM = (
     "If its units were checked, and the plant or its controller is so: "
     "PlantTwin.fit(..., units_confirmed=True)."
@@ -64,12 +60,14 @@ class Logged:
     @cached_property
     def made_by_law(self) -> NDArray[np.bool_]:
         """Which inputs (m,) are the MPC's own in enough rows, in which it moves: in its units."""
-        room = LAW * self.problem.u_half
+        # 1e-3: how far an input may be from the MPC's own, in half-widths
+        room = 1e-3 * self.problem.u_half
         own = self.problem.deviations
         law = self.act(self.row.shown(self.rows))
         inside = (law > own.u_min + room) & (law < own.u_max - room)
         same = inside & (np.abs(self.inputs - law) <= room)
-        found = same.sum(axis=0) >= np.maximum(LEAST_ROWS, PROVING * inside.sum(axis=0))
+        # 0.2: share of the rows, where the law is inside of its bounds, that it has made
+        found = same.sum(axis=0) >= np.maximum(LEAST_ROWS, 0.2 * inside.sum(axis=0))
         for j in np.flatnonzero(found):
             moves = np.std(law[same[:, j], j])
             found[j] = moves > max(10 * room[j], 0.5 * np.std(law[inside[:, j], j]))
@@ -149,7 +147,8 @@ class _OnLaw(NamedTuple):
     @property
     def alone(self) -> NDArray[np.bool_]:
         """Where the law explains an input, and theta adds nothing to it, (m, m)."""
-        made = (self.left < self.left_of_rows + EXACT_SHARE) & (self.left < DITHERED_SHARE)
+        # 0.7: the most of an input's variance that a dither on top of the law may be
+        made = (self.left < self.left_of_rows + EXACT_SHARE) & (self.left < 0.7)
         return (made & self.unique[:, None]) | (self.left < EXACT_SHARE)
 
     @property
@@ -333,7 +332,8 @@ def _other_pace(log: Logged) -> Iterator[str]:
         rest -= rest.mean(axis=0)
         u = (log.inputs - log.inputs.mean(axis=0))[:, None] * (driven / log.unit[:, None])
         gains = np.linalg.lstsq(u.reshape(-1, m), rest.ravel(), rcond=1e-9)[0]
-        left.append(np.var(rest - u @ gains, axis=0) + ROUNDING)
+        # 1e-9: of a half-width: an input that moves by less stands still
+        left.append(np.var(rest - u @ gains, axis=0) + 1e-9)
     ratio = np.array(left) / left[0]
     best = int(np.argmin(ratio.mean(axis=1)))
     if ratio[best].min() < CLEARLY_BETTER and ratio[best].max() < 1.5:

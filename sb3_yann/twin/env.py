@@ -19,8 +19,6 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann_envs.spaces import ProblemBox
 
-WIDEST_DRAW = 3.0  # boxes of starts: as wide others are drawn at most
-WIDEST = 2.0  # times as wide as the log's starts their box is at most
 RARE = 0.05  # how likely a start is, in one coordinate, beyond what the log shows
 
 
@@ -107,14 +105,15 @@ class Starts:
         How wide is drawn evenly, and wider where :meth:`chance_beyond` says so. Those that the law
         has no solution for are replaced by logged ones.
         """
+        widest_draw = 3.0  # boxes of starts: as wide others are drawn at most
         drawn = self.draw_between(count, rng)
         own = self.row.problem.deviations
         n = len(self.low)
         k = len(self.first)
         nearest = (1 + _widened(k)) / 2
         ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
-        wide = np.maximum(ranges / _widened(k), rng.uniform(1, WIDEST_DRAW, (count, 1)))
-        reach = np.minimum(wide, WIDEST_DRAW) * (self.high - self.low) / 2
+        wide = np.maximum(ranges / _widened(k), rng.uniform(1, widest_draw, (count, 1)))
+        reach = np.minimum(wide, widest_draw) * (self.high - self.low) / 2
         drawn[:, :n] = (self.high + self.low) / 2 + reach * rng.uniform(-1, 1, (count, n))
         shown = np.clip(self.row.shown(drawn), own.theta_min, own.theta_max)
         outside = ~self.row.problem.law().in_domain(shown)
@@ -140,10 +139,10 @@ class Starts:
 
 def _widened(k: int) -> float:
     """Return how many times as wide as the range of k starts their box is."""
-    return min(WIDEST, (k + 1) / max(k - 1, 1))
+    # 2.0: times as wide as the log's starts their box is at most
+    return min(2.0, (k + 1) / max(k - 1, 1))
 
 
-ON_BOUND = 1e-9
 PLANNED = 200  # runs of the MPC on its own model that tell where it means to go
 
 
@@ -180,7 +179,7 @@ class Limits:
             low = np.minimum(low, least - width)
             high = np.maximum(high, most + width)
         soft = problem.soft.x > 0
-        room = ON_BOUND * problem.theta_half[:n]
+        room = 1e-9 * problem.theta_half[:n]
         low = np.maximum(low, np.where(soft, -np.inf, own.x_min)) - room
         high = np.minimum(high, np.where(soft, np.inf, own.x_max)) + room
         return cls(coordinates.row, low, high)

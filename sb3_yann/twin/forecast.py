@@ -24,20 +24,12 @@ from sb3_yann.twin.dynamics import Dynamics, law_of, play
 from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
-ONE_SIDED = 0.95  # probability that a change is not above an interval's end, or not below
-REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
-TINY_SQUARE = 1e-20  # of squared errors, in how far the states move
 EACH = 5  # episodes, at least, that show by themselves how much they vary
 AGO = 1, 2  # so many samples ago is what a memory knows
 REMEMBERED = (
     "errors that follow earlier inputs and errors, as in this log, perhaps because of a lag or a "
     "load that lasts"
 )
-LESS = 0.02  # share of the errors of one step that it must explain on held-out episodes
-MEMORY_RIDGE = 1e-3  # of its standardized regressors
-MIN_RUNS = 100  # from new starts, at least
-DRAWS = 10_000  # of the weights of episodes or starts: fifty lie beyond the farthest end, at .5 %
-STEPS_PER_WEIGHT = 4  # steps of a log for each coefficient, at least
 
 
 @dataclass(frozen=True)
@@ -103,7 +95,8 @@ class _Replays:
             self.errors = np.where(alive, self.errors - remembered, 0.0)
         number = np.arange(len(episodes))
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
-        sizes = np.log(np.sum(unseen**2, axis=-1) + TINY_SQUARE)
+        # 1e-20: of squared errors, in how far the states move
+        sizes = np.log(np.sum(unseen**2, axis=-1) + 1e-20)
         self.left = np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0)
 
     def new_given(self, some: int, rng: np.random.Generator) -> Array:
@@ -174,7 +167,8 @@ class _Replays:
         """
         count = self.rows.shape[1]
         plain = 1 + self.errors.shape[3] + self.inputs.shape[2]
-        if self.alive.sum() < STEPS_PER_WEIGHT * basis.shape[-1] or count < 2:
+        # 4: steps of a log for each coefficient, at least
+        if self.alive.sum() < 4 * basis.shape[-1] or count < 2:
             return None
         known = self.alive.copy()
         known[: max(AGO)] = False
@@ -190,7 +184,8 @@ class _Replays:
             short = _ridge(z[fit][:, :plain], e[fit])
             rests = e - z @ weights[-1], e - z[..., :plain] @ short
             left += [np.sum((each[test] / self.units) ** 2) for each in rests]
-        self.explains = bool(left[0] < (1 - LESS) * left[1])
+        # 0.02: share of the errors of one step that it must explain on held-out episodes
+        self.explains = bool(left[0] < (1 - 0.02) * left[1])
         return np.array(weights)
 
 
@@ -199,7 +194,7 @@ def _ridge(z: Array, y: Array) -> Array:
     size = np.sqrt(np.mean(z**2, axis=0))
     size = np.where(size > 0, size, 1.0)
     z = z / size
-    gram = z.T @ z + MEMORY_RIDGE * len(z) * np.eye(z.shape[1])
+    gram = z.T @ z + 1e-3 * len(z) * np.eye(z.shape[1])  # of its standardized regressors
     return np.asarray(np.linalg.solve(gram, z.T @ y) / size[:, None])
 
 
@@ -223,7 +218,7 @@ def forecast(
     independent = sum(len(each[::2]) for each in records(problem, episodes))
     count = len(episodes)
     rng = np.random.default_rng(0)
-    some = -(-MIN_RUNS // count)
+    some = -(-100 // count)  # from new starts, at least
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
     plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
     logged = np.stack([each.thetas[:1] for each in episodes]), None
@@ -273,7 +268,8 @@ def surely_worse(behind: Array) -> NDArray[np.bool_]:
     known = behind[..., np.isfinite(behind).reshape(-1, behind.shape[-1]).all(axis=0)]
     error = known.std(axis=-1, ddof=1) / np.sqrt(known.shape[-1])
     each = (known > 0).all(axis=-1) & (known.shape[-1] >= EACH)
-    return np.asarray((known.mean(axis=-1) > REFUTED * error) | each)
+    # 2.0: standard errors by which a judge predicts held-out episodes worse that is refuted
+    return np.asarray((known.mean(axis=-1) > 2.0 * error) | each)
 
 
 def _changed(
@@ -284,6 +280,7 @@ def _changed(
     ``runs``, (members, .) of MPC and policy, are from new starts: of few episodes they tell how
     much starts vary. Fits to so few err alike, which is why the interval has room then.
     """
+    one_sided = 0.95  # probability that a change is not above an interval's end, or not below
     if independent >= EACH:
         runs = mpc, policy
     with np.errstate(all="ignore"):
@@ -294,16 +291,17 @@ def _changed(
     if not np.isfinite([*ratios, about]).all() or independent < 2:
         return 0.0, -np.inf, np.inf
     mean = float(ratios.mean())
-    likely = [stats.t.ppf(ONE_SIDED, k - 1) for k in (independent, max(len(ratios), 2))]
+    likely = [stats.t.ppf(one_sided, k - 1) for k in (independent, max(len(ratios), 2))]
     room = 0.0
     if independent < EACH:
-        likely[0] = stats.norm.ppf(ONE_SIDED)
+        likely[0] = stats.norm.ppf(one_sided)
         room = RULE.least_gain * bool(np.any(policy != mpc) or changes.any())
     count = changes.shape[1]
     # Most of a gain or a loss may lie in few starts: weights at random (Rubin, Ann. Stat. 9,
     # 1981), as far out as brings normal changes to what is likely of them.
     rng = np.random.default_rng(0)
-    weights = rng.dirichlet(np.full(count, independent / count), DRAWS)
+    # 10_000: of the weights of episodes or starts: fifty lie beyond the farthest end, at .5 %
+    weights = rng.dirichlet(np.full(count, independent / count), 10_000)
     cost = np.maximum(weights @ size.mean(axis=0), 1e-300)
     drawn = weights @ changes.mean(axis=0) / cost - about
     out = stats.norm.cdf(likely[0] * np.sqrt((1 + 1 / independent) / (1 - 1 / count)))

@@ -19,15 +19,15 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import Setting, basis, shrinkage_of
 
 SHOOTING_STEPS = (5, 15, 60)  # steps of the windows: long ones begin where short ones have led
-CORRECTIONS = 15  # of a search, at most
-LEAST_SAVED = 1e-3  # a search is done when a correction saves less than this part of its errors
 GUESS = 1e-5  # weight of the given states where windows begin, beside the outputs'
-KNOWN = 1e-2  # weight of states that another fit found: the hidden ones keep their coordinates
-FARTHEST = 3.0  # times the largest magnitude in the log, of a residual while it is fitted
 
 
 def shoot(
-    coordinates: Coordinates, episodes: Sequence[Episode], setting: Setting, trust: float = KNOWN
+    # 1e-2: weight of states that another fit found: the hidden ones keep their coordinates
+    coordinates: Coordinates,
+    episodes: Sequence[Episode],
+    setting: Setting,
+    trust: float = 1e-2,
 ) -> tuple[Residual, list[Episode]]:
     """Return the residual of the plant's states, and episodes with the states that it found.
 
@@ -38,7 +38,8 @@ def shoot(
     C = row.observer.C
     state = row.state
     units = coordinates.units
-    box = FARTHEST * coordinates.scale
+    # 3.0: times the largest magnitude in the log, of a residual while it is fitted
+    box = 3.0 * coordinates.scale
     wide = replace(coordinates, low=-box, high=box)
     constant = row.problem.layout.has_constants
     price = sum(map(len, episodes)) * shrinkage_of(setting, row.problem, len(box))
@@ -128,7 +129,7 @@ def _descended(
 
     damping = 1e-2
     cost, e, J = judged(weights, begin)
-    for _ in range(CORRECTIONS):
+    for _ in range(15):  # of a search, at most
         of_begin, of_weights = np.split(J, [n], axis=2)
         own = of_begin.swapaxes(1, 2) @ of_begin + trust * np.eye(n)
         cross = of_weights.swapaxes(1, 2) @ of_begin
@@ -156,6 +157,7 @@ def _descended(
         begin = start
         e, J = now
         damping = max(damping / 10, 1e-9)
-        if before - cost < LEAST_SAVED * before:
+        # 1e-3: a search is done when a correction saves less than this part of its errors
+        if before - cost < 1e-3 * before:
             break
     return weights, begin

@@ -18,8 +18,6 @@ from sb3_yann.env_pool import is_vec_env
 from sb3_yann.log import SECONDS, Log, as_matrices, require_one_state_more
 
 SHORTEST = 5  # steps that an episode has at least
-ROUNDED = 1e-6  # so near to its bound, relative to their distance, an estimate may lie beyond it
-EXPLAINED = 1e-3  # an estimate's moves follow the model's errors but for so much of their squares
 
 
 @dataclass(frozen=True)
@@ -246,7 +244,8 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
     if not parts.n_disturbances:
         return
     d_min, d_max = (each[parts.disturbance] for each in (own.theta_min, own.theta_max))
-    room = ROUNDED * (d_max - d_min)
+    # 1e-6: so near to its bound, relative to their distance, an estimate may lie beyond it
+    room = 1e-6 * (d_max - d_min)
     errors = []
     moves = []
     for each in episodes:
@@ -262,7 +261,8 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
     if len(e) <= 2 * parts.n_states or not np.any(np.std(moved, axis=0) > 1e-6 * half):
         return
     left = moved - e @ np.linalg.lstsq(e, moved, rcond=None)[0]
-    if np.sum((left / half) ** 2) <= EXPLAINED * np.sum((moved / half) ** 2):
+    # 1e-3: an estimate's moves follow the model's errors but for so much of their squares
+    if np.sum((left / half) ** 2) <= 1e-3 * np.sum((moved / half) ** 2):
         warn(
             "The disturbances of the log follow the model's errors, as an observer's estimate "
             "does. A twin takes them for measured ones, which the policy does not move. Pass "

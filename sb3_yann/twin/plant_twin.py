@@ -56,12 +56,9 @@ from sb3_yann.twin.trust import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BLOCKS = 40  # pieces of a log of few episodes that its members are fitted to some of
-WINDOW_STEPS = 20  # steps of the windows that networks are fitted to
 HIDDEN_SETTINGS = Setting(1, 1e-4, 1.0), Setting(2, 1e-4, 1.0), Setting(2, 1e-6, 1.0)
 """How the residuals of states that nothing shows are fitted, the least free first."""
 LONG_LOG = 100  # steps of a log that networks are tried on
-LACKS = 0.01  # error of predicted costs, relative to their mean, from which networks are tried
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -304,7 +301,8 @@ def _fitted(
         box = Coordinates.of(row, log)
         coordinates = replace(coordinates, low=box.low, high=box.high, units=box.units)
     parts = pieces(log, FOLDS)
-    blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
+    # 40: pieces of a log of few episodes that its members are fitted to some of
+    blocks = log if len(log) >= FOLDS else pieces(log, 40)
     draws = np.random.default_rng(seed).integers(len(blocks), size=(n_members - 1, len(blocks)))
     drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
     kept = without_each_fold(parts)
@@ -322,8 +320,9 @@ def _fitted(
     known = costs_of_each(coordinates, parts, choices[chosen].by_fold)
     long = sum(map(len, parts)) >= LONG_LOG and len(parts) > 1 and not row.hidden
     members: list[Residual] = []
-    if "network" in residuals and (alone or (long and not relative_error(*known) <= LACKS)):
-        ahead = WINDOW_STEPS
+    # 0.01: error of predicted costs, relative to their mean, from which networks are tried
+    if "network" in residuals and (alone or (long and not relative_error(*known) <= 0.01)):
+        ahead = 20  # steps of the windows that networks are fitted to
         networks = fit_ensemble(coordinates, [*kept, *drawn], seed, ahead=ahead, updates=updates)
         choices.append(Candidate("network", tuple(networks[: len(kept)])))
         runs = held_out(coordinates, parts, choices)

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array, check_type
 from sb3_yann.control import DisturbanceObserver, LinearMPC, StateEstimator
 
-SINGULAR = 1e10  # condition number from which on a matrix is not inverted
-
 
 @dataclass(frozen=True)
 class RowLayout:
@@ -63,7 +61,8 @@ class RowLayout:
             return None
         told = self.hidden or (isinstance(found, DisturbanceObserver) and found.C.shape == (n, n))
         matrices = [found.gain[:n]] if self.hidden else [found.gain[:n], found.C]
-        determined = told and max(map(np.linalg.cond, matrices)) < SINGULAR
+        # 1e10: condition number from which on a matrix is not inverted
+        determined = told and max(map(np.linalg.cond, matrices)) < 1e10
         return found if determined else None
 
     @property

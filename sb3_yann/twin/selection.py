@@ -29,14 +29,8 @@ from sb3_yann.twin.forecast import Judge, surely_worse
 from sb3_yann.twin.log import Episode, pieces
 from sb3_yann.units import FLOAT32_ROUNDING
 
-HIDDEN = 48  # units in each of two hidden layers
-CURVATURES = 50  # pairs that L-BFGS remembers
-WINDOWS = 32  # windows of a log in a step of Adam
-FIT_RATE = 1e-3  # of Adam at first; it falls to zero
 FAMILY_UPDATES = 1000  # iterations of the fit of a family
 CONSTANTS = 2  # numbers that a fit of a family takes to differ from seed to seed
-UNSEEN = 0.1  # size of the hidden constants that a fit begins with, in standard deviations
-RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
 
 
 def fit_ensemble(
@@ -110,6 +104,7 @@ class _Networks:
         dtype: th.dtype,
         of_row: NDArray[np.intp] | None = None,
     ) -> None:
+        hidden = 48  # units in each of two hidden layers
         self.alike = alike
         self.of_row = of_row
         self.generator = generator
@@ -131,15 +126,16 @@ class _Networks:
             return th.zeros((count, rows, columns), dtype=dtype)
 
         more = CONSTANTS * (of_row is not None)
-        self.weights = [drawn(k + more, HIDDEN), zeros(1, HIDDEN), drawn(HIDDEN, HIDDEN)]
+        self.weights = [drawn(k + more, hidden), zeros(1, hidden), drawn(hidden, hidden)]
         mean = self.tensor([y.mean(0, keepdims=True) for _, y in pairs])
-        self.weights += [zeros(1, HIDDEN), zeros(HIDDEN, n), mean / self.unit]
+        self.weights += [zeros(1, hidden), zeros(hidden, n), mean / self.unit]
         # Scaled as all else: a step of Adam is small beside what it changes, whatever its unit.
         own = self.tensor(linear) * self.width.mT / self.unit
         self.weights.append(th.cat([own, zeros(more, n)], dim=1))
         if of_row is not None:
             size = 1, int(of_row.max()) + 1, CONSTANTS
-            self.weights.append(UNSEEN * th.randn(size, generator=generator, dtype=dtype))
+            # 0.1: size of the hidden constants that a fit begins with, in standard deviations
+            self.weights.append(0.1 * th.randn(size, generator=generator, dtype=dtype))
         for each in self.weights:
             each.requires_grad_()
 
@@ -189,12 +185,13 @@ class _Networks:
             return value.item(), parameters_to_vector(slopes).double().numpy()
 
         with threadpool_limits(1):  # of this thread
+            # 50: pairs that L-BFGS remembers
             found = optimize.minimize(
                 loss,
                 parameters_to_vector(weights).detach().double().numpy(),
                 jac=True,
                 method="L-BFGS-B",
-                options={"maxiter": iterations, "maxcor": CURVATURES, "ftol": 0.0},
+                options={"maxiter": iterations, "maxcor": 50, "ftol": 0.0},
                 callback=done,
             )
         vector_to_parameters(self.tensor(found.x), weights)
@@ -224,10 +221,11 @@ class _Networks:
         )
         turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
         per_turn = th.where(turn > 0, 1 / turn, 0.0)
-        adam = th.optim.Adam(self.weights, lr=FIT_RATE)
+        adam = th.optim.Adam(self.weights, lr=1e-3)  # of Adam at first; it falls to zero
         schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
         for _ in bar("networks of a model: steps of Adam", range(updates), timed=True):
-            chosen = th.randint(data.shape[1], (WINDOWS,), generator=self.generator)
+            # 32: windows of a log in a step of Adam
+            chosen = th.randint(data.shape[1], (32,), generator=self.generator)
             window = data[:, chosen]
             x = window[..., :n, 0]
             loss = th.zeros((), dtype=self.dtype)
@@ -277,7 +275,8 @@ def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
     """Return the linear part (k, n) of y, and the deviation (1, n) of what it leaves."""
     about = z - z.mean(axis=0)
     y = y - y.mean(axis=0)
-    ridge = RIDGE * (np.trace(about.T @ about) / z.shape[1] + 1e-300)
+    # 1e-6: of the linear part, relative to the variance of what it is fitted to
+    ridge = 1e-6 * (np.trace(about.T @ about) / z.shape[1] + 1e-300)
     linear = np.linalg.solve(about.T @ about + ridge * np.eye(z.shape[1]), about.T @ y)
     left = y - about @ linear
     return linear, np.sqrt(np.mean(left**2, axis=0, keepdims=True))
@@ -297,11 +296,7 @@ def _of_one_seed(log: Sequence[Episode]) -> NDArray[np.intp] | None:
 KINDS = ("none", "linear", "quadratic", "network")  # of polynomials the degree is the number
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 INPUT_FACTORS = (1.0, 30.0)  # times as strongly inputs are shrunk: closed loops show little of them
-LONGEST_RUN = 100  # steps of a free run, at most
-RUNS = 20  # free runs in an episode
 GAINS = (0.6, 1.7)  # times the model's: an input may act so, unless the log refutes it
-LOOSE = 1e-3  # shrinkage of what fits a log around such a gain
-FIRM = 1e3  # times as much of its inputs
 
 
 class Setting(NamedTuple):
@@ -447,7 +442,7 @@ def held_out(
     """Return the errors of free runs of candidates over episodes, each without its fold."""
     if len(parts) < 2:
         return FreeRuns(np.array([1]), np.full((len(choices), 1, 1), np.inf))
-    longest = min(LONGEST_RUN, int(np.median([*map(len, parts)])))
+    longest = min(100, int(np.median([*map(len, parts)])))  # steps of a free run, at most
     horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
     errors = np.full((len(choices), len(parts), len(horizons)), np.nan)
     # Stepped as one: those with hidden units, and those without.
@@ -456,7 +451,8 @@ def held_out(
     for i, episode in enumerate(bar("candidates on held-out episodes", parts)):
         known = horizons[horizons <= len(episode)]  # a short piece says nothing of more
         steps = int(known.max(initial=0))
-        starts = np.unique(np.linspace(0, len(episode) - steps, RUNS).astype(int))
+        # 20: free runs in an episode
+        starts = np.unique(np.linspace(0, len(episode) - steps, 20).astype(int))
         actual = episode.thetas[starts[:, None] + known, coordinates.row.state]
         for same in alike:
             members = tuple(choices[j].by_fold[i % FOLDS] for j in same)
@@ -481,7 +477,8 @@ def judges(
     degree = 1 if chosen.setting is None else chosen.setting.degree
     names = labels_of(problem.model)[1]
     gains = [*product(range(len(names)), GAINS)]
-    others = [Setting(degree, LOOSE, FIRM, gain) for gain in gains]
+    # Around such a gain a log is fitted with little shrinkage, but of its inputs.
+    others = [Setting(degree, 1e-3, 1e3, gain) for gain in gains]
     fits = [ridge(coordinates, each, others) for each in without_each_fold(parts)]
     rivals = [Candidate("", tuple(fit[i] for fit in fits)) for i in range(len(others))]
     worse = surely_worse(held_out(coordinates, parts, rivals).scores - scores)

@@ -19,10 +19,7 @@ from sb3_yann.twin.selection import FreeRuns
 from sb3_yann.units import FLOAT32_ROUNDING
 
 COST_ERROR = 0.25  # of predicted episode costs, relative to their mean: the largest that is trusted
-STILL = 1e-4  # an input that moves by less, in half-widths, does not move
-FOREIGN = 10.0  # A model that errs by so many times what moves describes another plant
 OUTSIDE = 0.05  # share of logged rows beyond the box of theta from which on units are doubted
-PREVIOUS = 0.01  # how far theta's previous input may be from the one before it, in half-widths
 ALONE = 0.02  # share of an input's variance that is its own, from which on its gain is known
 
 
@@ -138,7 +135,7 @@ def judge(
         )
     named = [*names] or [f"u[{k}]" for k in range(len(moves))]
     for name, own, moved in zip(named, share, moves, strict=True):
-        if moved < STILL:
+        if moved < 1e-4:  # an input that moves by less, in half-widths, does not move
             problems.append(f"{name} never moves: what it does is not in the log.")
             advice.append(f"Make a small step test on {name}, or log another set-point.")
         elif own < ALONE:
@@ -147,7 +144,8 @@ def judge(
                 "gain rests on the given B. A small step test would tell."
             )
     units = "Compare units, operating point and sampling time of the log and the model."
-    if several and runs.errors[0][0] / max(standing[0], 1e-300) > FOREIGN:
+    # 10.0: A model that errs by so many times what moves describes another plant
+    if several and runs.errors[0][0] / max(standing[0], 1e-300) > 10.0:
         problems.append(
             f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing "
             f"moves' ({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
@@ -205,7 +203,8 @@ def evidence(
     if problem.layout.n_previous:
         held = np.concatenate([each.thetas[1:, problem.layout.previous] for each in log])
         apart = np.abs(held - logged.inputs) / problem.u_half
-        share = float(np.mean(np.any(apart > PREVIOUS, axis=1)))
+        # 0.01: how far theta's previous input may be from the one before it, in half-widths
+        share = float(np.mean(np.any(apart > 0.01, axis=1)))
         wrong = f"In {100 * share:.3g} % of the rows theta does not hold the input before it."
         problems += [wrong] * (share > OUTSIDE)
     problems += objections(logged)

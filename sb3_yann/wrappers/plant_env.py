@@ -304,10 +304,6 @@ def warn_of_another_time(slope: Callable[[Array, Array], Array], mpc: LinearMPC)
         )
 
 
-LARGEST_ERROR = 1e-3  # of a substep, in half-widths of theta's box, else in sizes of states
-FINEST = 1024  # parts that a substep may be cut into
-
-
 class Equations(gym.Env[Array, Array]):
     """A plant that shows outputs ``C x`` of its state and takes its inputs.
 
@@ -377,25 +373,27 @@ class Equations(gym.Env[Array, Array]):
         The error of a step is that of the third-order formula that its slopes and the first one of
         the next make; where it is too large the step is cut in half.
         """
+        finest = 1024  # parts that a substep may be cut into
+        largest_error = 1e-3  # of a substep, in half-widths of theta's box, else in sizes of states
         self.fault = ""
         x = self.state
         k1 = self.slope(x, u)
-        step = FINEST
-        left = FINEST * self.substeps
+        step = finest
+        left = finest * self.substeps
         while left:
-            h = self.dt / self.substeps * (step / FINEST)
+            h = self.dt / self.substeps * (step / finest)
             k2 = self.slope(x + h / 2 * k1, u)
             k3 = self.slope(x + h / 2 * k2, u)
             k4 = self.slope(x + h * k3, u)
             after = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             following = self.slope(after, u)
             error = h / 6 * float((np.abs(following - k4) * self.weight).max())
-            if error <= LARGEST_ERROR:
+            if error <= largest_error:
                 x = after
                 k1 = following
                 left -= step
-                if error < LARGEST_ERROR / 16 and left % (2 * step) == 0:
-                    step = min(2 * step, FINEST)
+                if error < largest_error / 16 and left % (2 * step) == 0:
+                    step = min(2 * step, finest)
             elif step > 1:
                 self.fault = ""
                 step //= 2

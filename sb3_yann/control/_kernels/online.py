@@ -23,20 +23,6 @@ SOLVED = 1
 UNCERTIFIED = 2
 """What comes of a point. What is UNCERTIFIED has no certificate, and another solver is asked."""
 
-ENTERING_TOL = 1e-10
-"""Relative to 1 + |d|: a constraint that is violated by more enters the active set."""
-ANSWER_TOL = 1e-9
-"""Of an answer: the same, and of multipliers relative to 1 + the largest."""
-SOFT_TOL = 1e-6
-"""The same where constraints give way, relative to 1 + the largest |d|.
-
-Multipliers are violations over softness, a million times as large as d: sums of them round.
-"""
-DEPENDENCE_TOL = 1e-11
-"""A constraint whose part beyond the span of others is smaller depends on them."""
-PROBES = 8
-"""Places of the table in which a point may lie."""
-
 
 @compiled()
 def _factorize(
@@ -96,7 +82,8 @@ def _most_violated(d: Array, slack: Array) -> int:
     worst = -1
     lowest = 0.0
     for j in range(len(d)):
-        if slack[j] < lowest and slack[j] < -ENTERING_TOL * (1 + abs(d[j])):
+        # 1e-10: relative to 1 + |d|: a constraint that is violated by more enters the active set.
+        if slack[j] < lowest and slack[j] < -1e-10 * (1 + abs(d[j])):
             worst = j
             lowest = slack[j]
     return worst
@@ -119,6 +106,8 @@ def _add(
 
     This is the step of Goldfarb & Idnani (Math. Programming 27, 1983), Section 3. -2 is a failure.
     """
+    # A constraint whose part beyond the span of others is smaller depends on them.
+    dependence_tol = 1e-11
     own = 0.0
     while True:
         for i in range(size):
@@ -136,7 +125,7 @@ def _add(
             if step[i] > 0 and lam[i] < most * step[i]:
                 most = lam[i] / step[i]
                 leaving = i
-        full = violation / rest if rest > DEPENDENCE_TOL else np.inf
+        full = violation / rest if rest > dependence_tol else np.inf
         length = min(most, full)
         if length == np.inf:
             return -1
@@ -152,7 +141,7 @@ def _add(
             active[size] = entering
             lam[size] = own
             return size + 1
-        if rest > DEPENDENCE_TOL:
+        if rest > dependence_tol:
             violation -= length * rest
         for i in range(leaving, size - 1):
             active[i] = active[i + 1]
@@ -238,7 +227,10 @@ def solve_batch(
     """
     rows = len(d0)
     soft = bool(np.any(extra > 0))
-    tolerance = SOFT_TOL if soft else ANSWER_TOL
+    # 1e-9: of an answer: the same, and of multipliers relative to 1 + the largest.
+    # 1e-6: the same where constraints give way, relative to 1 + the largest |d|. Multipliers are
+    # violations over softness, a million times as large as d: sums of them round.
+    tolerance = 1e-6 if soft else 1e-9
     factor = np.empty((most, most))
     step = np.empty(most)
     column = np.empty(most)
@@ -311,6 +303,7 @@ def _slot(theta: Integers, at: int, keys: Integers) -> tuple[Any, Any, Any, bool
 
     A row that is new gets a free place of its own, or another one's.
     """
+    probes = 8  # Places of the table in which a point may lie.
     first = np.int64(-7046029254386353131)
     second = np.int64(1609587929392839161)
     for j in range(theta.shape[1]):
@@ -321,13 +314,13 @@ def _slot(theta: Integers, at: int, keys: Integers) -> tuple[Any, Any, Any, bool
     first ^= first >> 31
     second |= 1  # 0 is no point
     mask = len(keys) - 1
-    for probe in range(PROBES):
+    for probe in range(probes):
         place = (first + probe) & mask
         if keys[place, 1] == second and keys[place, 0] == first:
             return first, second, place, True
         if keys[place, 1] == 0:
             return first, second, place, False
-    return first, second, (first + ((second >> 7) & (PROBES - 1))) & mask, False
+    return first, second, (first + ((second >> 7) & (probes - 1))) & mask, False
 
 
 @compiled("int64(int64[:, ::1], int64[:, ::1], float64[:, ::1], float64[:, ::1], int64[::1])")

@@ -17,7 +17,6 @@ ROW_NORM_TOL = 1e-7
 
 Where such a bound is active, the law is so steep that its own rounding shows.
 """
-SAME_ROW = 1e-9  # by how much entries of unit rows differ that rounding tells apart
 DEPENDENT = 1e-9
 """Constraints whose part across those of an active set is smaller, relative to all, depend on it.
 """
@@ -128,16 +127,17 @@ class ParametricQP:
 
         Late states of a plant that has come to rest make such rows. Rows are of unit length.
         """
+        same_row = 1e-9  # by how much entries of unit rows differ that rounding tells apart
         rows = np.hstack([self.G, self.S])
         direction = np.random.default_rng(0).normal(size=rows.shape[1])
         order = np.argsort(rows @ direction)
         # Along any direction equal rows are neighbors: few others are compared.
-        close = np.diff(rows[order] @ direction) < SAME_ROW * np.abs(direction).sum()
+        close = np.diff(rows[order] @ direction) < same_row * np.abs(direction).sum()
         some = np.union1d(order[:-1][close], order[1:][close])
         kept = list[int]()
         repeated = list[int]()
         for i in some[np.argsort(self.w[some], kind="stable")].tolist():
-            near = kept and np.abs(rows[kept] - rows[i]).max(axis=1).min() < SAME_ROW
+            near = kept and np.abs(rows[kept] - rows[i]).max(axis=1).min() < same_row
             (repeated if near else kept).append(i)
         none = np.isin(np.arange(len(rows)), repeated)
         G, S = (np.where(none[:, None], 0.0, each) for each in (self.G, self.S))

@@ -124,10 +124,7 @@ def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Arr
     return A, B
 
 
-MOST_EARLY = 3  # rows by which inputs may stand too early, at most
 EARLY = 0.1  # share of a state's squared errors that inputs of later rows leave, where they act
-HELD = 1 / 3
-"""Share of the rows in which no input moves, at least: in these a feedback would tell no noise."""
 
 
 def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
@@ -135,15 +132,17 @@ def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
 
     It is looked for where inputs are held: those of a feedback follow the noise of each sample.
     """
-    longer = [each for each in episodes if len(each) > lags + MOST_EARLY + 1]
+    most_early = 3  # rows by which inputs may stand too early, at most
+    longer = [each for each in episodes if len(each) > lags + most_early + 1]
     moves = [np.any(np.diff(each.inputs, axis=0), axis=1) for each in longer]
-    if not longer or np.mean(np.concatenate(moves)) > 1 - HELD:
+    # Where inputs rest in a third of the rows, a feedback law did not answer noise.
+    if not longer or np.mean(np.concatenate(moves)) > 2 / 3:
         return []
     left = []
-    for early in range(MOST_EARLY + 1):
+    for early in range(most_early + 1):
         moved = []
         for each in longer:
-            rows = len(each) - MOST_EARLY
+            rows = len(each) - most_early
             moved.append(Episode(each.states[: rows + 1], each.inputs[early : rows + early]))
         known, after = stacked(with_lags(moved, lags + 1, lags))
         known = np.column_stack([np.ones(len(known)), known])
@@ -165,9 +164,6 @@ def early_note(episodes: Sequence[Episode], lags: int = 0) -> list[str]:
     ]
 
 
-EFFECT_LEVEL = 0.01  # significance level of an input's effect
-
-
 def input_notes(found: Regression, episodes: list[Episode]) -> list[str]:
     """Return notes on inputs and disturbances without effect, or with a delay.
 
@@ -177,7 +173,7 @@ def input_notes(found: Regression, episodes: list[Episode]) -> list[str]:
     lags = found_delays(episodes, m + d)
     notes = []
     for column, (name, lag) in enumerate(zip(names(found.sizes)[n:], lags, strict=True), n):
-        idle = no_effect(found, [column], EFFECT_LEVEL)
+        idle = no_effect(found, [column], 0.01)  # significance level of an input's effect
         if lag:
             start = f"{name} has no effect beyond chance, and t" if idle else "T"
             cure = f" Move its measurements {lag} samples down, in the log and on the plant."

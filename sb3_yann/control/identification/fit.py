@@ -41,8 +41,6 @@ from sb3_yann.control.identification.residuals import (
 from sb3_yann.control.linear_system import LinearSystem, names
 from sb3_yann.log import Episode, Log, split_episodes
 
-UNSURE = 3.0  # standard errors within which an effect may be none
-
 
 def fit_log(
     log: Log,
@@ -132,7 +130,8 @@ def _require_excited(found: Regression, episodes: list[Episode], n: int, m: int)
     known = np.column_stack([np.ones(len(x)), x, d])
     share = np.mean(project_out(known, u) ** 2, axis=0) / np.maximum(np.var(u, axis=0), 1e-300)
     own = slice(n, n + m)
-    unsure = np.abs(found.coefficients) < UNSURE * found.standard_errors
+    # Within three standard errors an effect may be none.
+    unsure = np.abs(found.coefficients) < 3.0 * found.standard_errors
     tied = within_rounding(known, u) & (share < TIED) & np.all(unsure[:, own], axis=0)
     if tied.any():
         raise ValueError(
@@ -196,10 +195,6 @@ def _delayed(
 
 
 REPEATED_SHARE = 0.05  # of all rows: so many repeated readings of one sensor are too many
-ON_GRID = 1e-3  # of a step of a sensor: readings that are off by more do not count in steps
-LEAST_REPEATS = 10
-TIMES = 10.0
-"""Equal readings in a row that a frozen sensor shows at least; how many times as many as usual."""
 
 
 @dataclass(frozen=True)
@@ -229,8 +224,10 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
         usual, rare = np.quantile([*map(len, runs)], [0.5, 0.95])
         moves = np.abs(np.concatenate([np.diff(x[:, i]) for x in states]))
         steps = moves[moves > 0] / np.min(moves[moves > 0], initial=np.inf)
-        on_grid = bool(np.all(np.abs(steps - np.round(steps)) < ON_GRID))
-        least = max(LEAST_REPEATS, TIMES * usual, 6 * rare if on_grid else 0.0)
+        # 1e-3: of a step of a sensor: readings that are off by more do not count in steps
+        on_grid = bool(np.all(np.abs(steps - np.round(steps)) < 1e-3))
+        # A frozen sensor shows ten equal readings in a row, and ten times as many as usual.
+        least = max(10, 10.0 * usual, 6 * rare if on_grid else 0.0)
         long = [each for each in runs if len(each) >= least]
         those = _unexplained(states, driven, i, runs, long) if long else []
         if sum(map(len, those)) > REPEATED_SHARE * rows:

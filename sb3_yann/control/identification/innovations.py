@@ -25,8 +25,6 @@ from sb3_yann.control.lqr import spectral_radius
 from sb3_yann.log import Episode
 
 LAGS = (1, 2, 4, 6, 9, 13, 19, 28)  # lags of the ARX models that are tried
-CHUNK = 2000  # longest stretch of samples whose first state is estimated on its own
-FORGOTTEN = 20.0  # errors of a filter's states fall to exp(-20) within a chunk
 CHANCE = 0.001  # significance level of the effects of inputs
 CHANCES = (CHANCE, 1e-6)  # the levels that are tried
 FLOOR = 1e-14  # variance, relative to the output's, below which all is rounding
@@ -251,7 +249,8 @@ class Chunks:
     def __init__(self, episodes: Sequence[Episode]) -> None:
         parts = []
         for each in episodes:
-            count = -(-len(each) // CHUNK)
+            # 2000: longest stretch of samples whose first state is estimated on its own
+            count = -(-len(each) // 2000)
             edges = np.linspace(0, len(each) + 1, count + 1).round().astype(int)
             driven = np.vstack([each.driven, np.zeros((1, each.driven.shape[1]))])
             parts += [(each.states[a:b], driven[a:b]) for a, b in pairwise(edges) if b - a > 1]
@@ -280,7 +279,8 @@ class Chunks:
         """
         often = ~self.rare
         between = model.A - model.K[:, often] @ model.C[often]
-        slowest = max(1 - FORGOTTEN / self.y.shape[1], (1 + spectral_radius(model.A)) / 2)
+        # 20.0: errors of a filter's states fall to exp(-20) within a chunk
+        slowest = max(1 - 20.0 / self.y.shape[1], (1 + spectral_radius(model.A)) / 2)
         return spectral_radius(model.inner) < min(slowest, 1) and spectral_radius(between) < 1
 
     def covariance(self, model: Innovations) -> Array:

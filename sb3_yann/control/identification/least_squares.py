@@ -15,9 +15,6 @@ from sb3_yann.control.linear_system import combination, names
 from sb3_yann.log import Episode, split_episodes
 from sb3_yann.units import FLOAT32_ROUNDING
 
-WEAKEST = 1e-6  # least excitation, below which float32 rounding alone may be what moves
-
-SMALL = 0.05  # relative weight below which a regressor is left out of a combination
 NOT_EXCITED = (
     "What does not move cannot be identified. Add a test signal to each input, independent of the "
     "state (a feedback law alone ties the inputs to it), leave out states that are constant or "
@@ -74,7 +71,8 @@ def regress(
     scale = np.where(still, 1.0, spread)
     left, singular, right = np.linalg.svd(np.where(still, 0.0, centered / scale), False)
     labels = names(sizes)
-    missing = [v for s, v in zip(singular, right, strict=True) if s <= WEAKEST * singular[0]]
+    # 1e-6: least excitation, below which float32 rounding alone may be what moves
+    missing = [v for s, v in zip(singular, right, strict=True) if s <= 1e-6 * singular[0]]
     if missing and ridge == 0:
         fixed = [f"{_direction(v, scale, labels)} never changes" for v in missing]
         raise ValueError(f"The data do not excite the plant: {'; '.join(fixed)}. {NOT_EXCITED}")
@@ -111,7 +109,8 @@ def _direction(weights: Array, scale: Array, labels: list[str]) -> str:
     """Return a combination of the scaled regressors in words, without terms of small weight."""
     largest = np.argmax(np.abs(weights))
     factors = weights / scale
-    small = np.abs(weights) <= SMALL * np.abs(weights[largest])
+    # 0.05: relative weight below which a regressor is left out of a combination
+    small = np.abs(weights) <= 0.05 * np.abs(weights[largest])
     return combination(np.where(small, 0.0, factors / factors[largest]), labels, 4)
 
 
@@ -125,8 +124,6 @@ def neighbors(residuals: Array, episodes: Sequence[Episode]) -> Array:
 
 WEAK = 0.01  # excitation below which a log is weak
 RIDGES = 10.0 ** np.arange(-9, 0)  # ridges that are tried, relative to the number of steps
-BLIND = 1.0  # error of free runs, in spreads of the states, from which the mean says as much
-FREE_RUN = 50  # steps of a free run
 
 
 def regularized(
@@ -146,7 +143,8 @@ def regularized(
     inner, outer = (fitted, tested) if tested else split_episodes(fitted, 0.2)
     ridges = np.array([0.0, *RIDGES]) * found.steps
     errors = np.array([_free_run(regress(inner, origin, r), outer) for r in ridges])
-    if np.min(errors) >= BLIND:
+    # 1.0: error of free runs, in spreads of the states, from which the mean says as much
+    if np.min(errors) >= 1.0:
         raise ValueError(
             f"The log is too weakly excited: {found.weakest} moved {found.excitation:.1e} times as "
             "much as the most excited combination, and with any ridge free runs over the data held "
@@ -167,13 +165,14 @@ def regularized(
 
 def _free_run(found: Regression, episodes: list[Episode]) -> float:
     """Return the error of free runs, root mean square in spreads of the states."""
+    free_run = 50  # steps of a free run
     n = found.reached.size
     squares = []
     unit = np.where(found.spread[:n] > 0, found.spread[:n], 1.0)
     for episode in episodes:
-        for start in range(0, len(episode), FREE_RUN):
+        for start in range(0, len(episode), free_run):
             x = episode.states[start]
-            for k in range(start, min(start + FREE_RUN, len(episode))):
+            for k in range(start, min(start + free_run, len(episode))):
                 x = found.predict(np.concatenate([x, episode.driven[k]])[None])[0]
                 # One that runs away is as bad as can be, and its size says nothing.
                 error = np.minimum(np.abs(x - episode.states[k + 1]) / unit, 1e3)
@@ -198,11 +197,9 @@ def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
     return values[order], errors[order]
 
 
-STEP = 1e-3  # of a standard deviation, in which responses are linear
-
-
 def gains_of(found: Regression) -> Gains:
     """Return what held inputs do to states in the end, with errors by the delta method."""
+    step = 1e-3  # of a standard deviation, in which responses are linear
     n, m, _ = found.sizes
     A, B = np.split(found.coefficients[:, : n + m], [n], axis=1)
     part = found.correlation[: n + m, : n + m]
@@ -214,9 +211,9 @@ def gains_of(found: Regression) -> Gains:
     errors = np.zeros((4, n, m))
     for of_rows in _root(found.covariance):
         for of_columns in _root(part):
-            by = STEP * np.outer(of_rows, of_columns)  # independent of the others
+            by = step * np.outer(of_rows, of_columns)  # independent of the others
             more, less = (responses(A + d[:, :n], B + d[:, n:], count) for d in (by, -by))
-            errors += ((more - less) / (2 * STEP)) ** 2
+            errors += ((more - less) / (2 * step)) ** 2
     return Gains.of(A, B, count, np.sqrt(errors))
 
 

@@ -34,18 +34,6 @@ from sb3_yann.control.identification.residuals import (
 from sb3_yann.log import Episode, split_episodes
 
 RUN_AHEAD = 20  # samples of the free runs over held-out data
-MAX_ORDER = 16
-BETTER = 0.85
-"""Mean square of free runs, relative to the criterion's choice, below which another is taken."""
-AS_LIKELY = 0.1
-"""For each output, how much larger its criterion may be: errors of one step are 5 % larger then."""
-ORDER_PATIENCE = 4  # orders without a better criterion after which none is tried any more
-SURE_DELAY = 10.0  # by so much, over all steps, dead time must lower the criterion
-NO_MOVE = 1e-12
-SETTLING = 30  # samples in which a filter finds the first state
-FOLLOWS = 0.1  # share of an input that its feedback law leaves, below which the notes say so
-WORSE = 1.1
-"""Mean square of free runs, relative to those without dead time, from which it is not taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +89,10 @@ def delayed(
     searches = [Search(fitted, judged, lags, tries) for lags in trials]
     rough = [each.rough(order) for each in searches]
     best = int(np.argmin([each.criterion for each in rough]))
-    sure = rough[best].criterion < rough[0].criterion - SURE_DELAY / sum(map(len, fitted))
-    if not sure or rough[best].error > rough[0].error * WORSE:
+    # Dead time must lower the criterion by 10 over all steps.
+    sure = rough[best].criterion < rough[0].criterion - 10.0 / sum(map(len, fitted))
+    # Nor is dead time taken where free runs err by 10 % more.
+    if not sure or rough[best].error > rough[0].error * 1.1:
         best = 0
     if fast.all():
         return [searches[best]]
@@ -114,6 +104,7 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
 
     ValueError for an input that is a function of earlier outputs and inputs alone, all as rounded.
     """
+    no_move = 1e-12
     q, m, d = episodes[0].sizes
     width = q + m + d
     rows = [each.regressors for each in with_lags(episodes, lags + 1, lags)]
@@ -121,7 +112,7 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
         return []
     whole = np.concatenate(rows)
     spread = whole.std(axis=0)
-    still = spread <= NO_MOVE * np.abs(whole).max(axis=0)
+    still = spread <= no_move * np.abs(whole).max(axis=0)
     whole = (whole - whole.mean(axis=0)) / np.where(still, 1.0, spread)
     past = whole.reshape(-1, lags + 1, width)
     now = past[:, 0, q : q + m]
@@ -129,15 +120,16 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
     known = np.hstack([own, past[..., :q].reshape(len(now), -1)])
     alone = np.mean(project_out(own, now) ** 2, axis=0)
     rest = project_out(known, now)
-    left = np.mean(rest**2, axis=0) / np.maximum(alone, NO_MOVE)
-    moves = alone > NO_MOVE  # of scaled inputs
-    tied = moves & ((left < NO_MOVE) | (within_rounding(known, now) & (left < TIED)))
+    left = np.mean(rest**2, axis=0) / np.maximum(alone, no_move)
+    moves = alone > no_move  # of scaled inputs
+    tied = moves & ((left < no_move) | (within_rounding(known, now) & (left < TIED)))
     if tied.any():
         raise ValueError(
             f"u[{np.argmax(tied)}] is a function of earlier outputs and inputs, to within their "
             f"rounding: a feedback law alone sets it. {NOT_EXCITED}"
         )
-    return [(j, float(left[j])) for j in range(m) if moves[j] and left[j] < FOLLOWS]
+    # Where a feedback law leaves less than a tenth of an input, the notes say so.
+    return [(j, float(left[j])) for j in range(m) if moves[j] and left[j] < 0.1]
 
 
 class Search:
@@ -158,7 +150,7 @@ class Search:
         self.delays = delays
         # Of delayed inputs, or stand-ins would answer too soon.
         self.past = Past(stand_ins(self.fitted, earlier), self.chunks.rare)
-        self.largest = min(MAX_ORDER, self.past.limit)
+        self.largest = min(16, self.past.limit)
         self.tried: list[Structure] = []
 
     def rough(self, order: int | None) -> Structure:
@@ -166,7 +158,8 @@ class Search:
         for n in range(1, self.largest + 1) if order is None else [min(order, self.past.limit)]:
             self.tried.append(self.assessed(self.past.model(n)))
             best = int(np.argmin([each.criterion for each in self.tried]))
-            if len(self.tried) - best > ORDER_PATIENCE:
+            # After four orders without a better criterion none is tried any more.
+            if len(self.tried) - best > 4:
                 break
         return self.tried[best]
 
@@ -184,11 +177,13 @@ class Search:
                     break
                 n += step
         best = min(found.values(), key=lambda each: each.criterion)
-        limit = best.criterion + AS_LIKELY * len(best.model.C)
+        # Errors of one step may be 5 % larger: .1 in the criterion, for each output.
+        limit = best.criterion + 0.1 * len(best.model.C)
         rough = [] if self.chunks.rare.any() else self.tried  # those read slow outputs never
         near = [each for each in (*rough, *found.values()) if each.criterion <= limit]
         free = min(near, key=lambda each: each.error)
-        return free if free.error < BETTER * best.error else best
+        # Another than the criterion's choice must lower the mean square of free runs by 15 %.
+        return free if free.error < 0.85 * best.error else best
 
     def trial(self, order: int, *, refine: bool = True) -> Structure:
         """Return the model of an order, refined where that lowers the criterion.
@@ -235,7 +230,8 @@ class Search:
         parts = []
         for each in self.fitted:
             left = each.states[1:] - predicted(model, each, start, 1)
-            parts.append(left[min(SETTLING, len(each) // 5) :])
+            # A filter finds the first state within thirty samples.
+            parts.append(left[min(30, len(each) // 5) :])
         errors = np.concatenate(parts)
         read = ~np.isnan(errors)
         steps, q = errors.shape
@@ -275,9 +271,6 @@ def predicted(
     for step in range(1, ahead):
         x = x @ model.A.T + moved[step : step + rows]
     return np.asarray(x @ model.C.T + model.y_0)
-
-
-STAND_IN_RIDGE = 1e-3  # of the number of readings: filtered signals depend on each other
 
 
 def stand_ins(episodes: Sequence[Episode], earlier: Structure | None = None) -> list[Episode]:
@@ -333,6 +326,7 @@ def _regressed(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Arr
         at = np.isfinite(y[:, i])
         count = max(at.sum(), 1)  # the part that is fitted may have none
         mean = y[at, i].sum() / count
-        gram = rows[at].T @ rows[at] + STAND_IN_RIDGE * count * np.eye(rows.shape[1])
+        # 1e-3: of the number of readings: filtered signals depend on each other
+        gram = rows[at].T @ rows[at] + 1e-3 * count * np.eye(rows.shape[1])
         found[:, i] = mean + rows @ np.linalg.solve(gram, rows[at].T @ (y[at, i] - mean))
     return np.split(found, np.cumsum([*map(len, parts)])[:-1])

@@ -23,11 +23,7 @@ from sb3_yann.control.identification.least_squares import (
 from sb3_yann.log import Episode
 from sb3_yann.units import FLOAT32_ROUNDING
 
-STEPS_PER_FEATURE = 4  # steps for each feature, at least: with fewer the features fit anything
-MAX_COMPONENTS = 12  # main components, at most: a long log with many states must not take minutes
 CURVATURE_SHARE = 0.1
-CURVATURE_LEVEL = 1e-3
-"""Least share of the residuals' variance, and its significance, from which curvature is named."""
 
 
 def features(regressors: Array) -> Array:
@@ -38,9 +34,10 @@ def features(regressors: Array) -> Array:
     k, p = regressors.shape
     spread = np.sqrt(np.mean(regressors**2, axis=0))
     z = regressors / np.where(spread > 0, spread, 1.0)
-    room = k // STEPS_PER_FEATURE - p - 1
+    room = k // 4 - p - 1  # steps for each feature, at least: with fewer the features fit anything
     kept = 0
-    while kept < min(p, MAX_COMPONENTS) and (kept + 1) * (kept + 4) / 2 <= room:
+    # 12: main components, at most: a long log with many states must not take minutes
+    while kept < min(p, 12) and (kept + 1) * (kept + 4) / 2 <= room:
         kept += 1
     if not kept:
         return np.zeros((k, 0))
@@ -74,7 +71,8 @@ def curvature_test(found: Regression, episodes: list[Episode]) -> tuple[Array, A
     rest = np.where(real, rest, 1.0)
     share = 1 - (rest / free) / (size / (free + q))
     ratio = ((size - rest) / q) / np.maximum(rest / free, np.finfo(float).tiny)
-    sure = real & (np.asarray(fdtrc(q, free, ratio)) < CURVATURE_LEVEL)
+    # 1e-3: the significance from which curvature is named
+    sure = real & (np.asarray(fdtrc(q, free, ratio)) < 1e-3)
     return np.asarray(np.where(sure & (share > CURVATURE_SHARE), share, 0.0)), after
 
 
@@ -201,8 +199,6 @@ def _held_out(basis: Array, values: Array, parts: list[NDArray[np.int64]]) -> Ar
 
 
 LONG_PREDICTION = 10  # steps of the longer prediction whose fit is stated
-MUCH = 0.5  # share of the residuals from which on curvature explains their colour too
-POOR_FIT = 50.0  # percent of the longer prediction's fit below which a model is called poor
 
 
 def quality_notes(
@@ -269,7 +265,8 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
         # What curvature explains is no noise.
         colored &= np.abs(neighbors(rest, fitted)[:n]) > 3 / np.sqrt(found.steps)
         # Where it explains much, what it leaves is curvature of higher order.
-        colored &= share < MUCH
+        # 0.5: share of the residuals from which on curvature explains their colour too
+        colored &= share < 0.5
     elif np.any(explained > 100 * (1 - NOISE_SHARE)):
         return [
             f"Earlier states and inputs explain {listed(explained)} % of the residuals' variance, "
@@ -297,7 +294,8 @@ def _words_for(fits: tuple[Array, Array], steps: int) -> str:
     text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
     if len(words) < len(fits):
         text += f" No episode of them is {LONG_PREDICTION} steps long."
-    if np.any(fits[1] < POOR_FIT):
+    # 50.0: percent of the longer prediction's fit below which a model is called poor
+    if np.any(fits[1] < 50.0):
         text += f" Poor: {LONG_PREDICTION} steps ahead the model says little of the plant."
     return text
 

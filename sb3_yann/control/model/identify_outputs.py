@@ -42,10 +42,6 @@ from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
 from sb3_yann.log import Arrays, Episode, Log
 
-EARLY_LAGS = 4  # earlier outputs beside which inputs of later rows are tried
-FEWEST = 30  # readings of an output that is read now and then: a model fits fewer by heart
-MAX_CONDITION = 1e3  # condition number of C up to which outputs serve as states
-
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedOutputs(ReadOnlyArrays):
@@ -220,6 +216,7 @@ def identify_outputs(
     >>> found.order, found.delays, found.predict(x[:, :1], u, ahead=5).shape
     (2, (0,), (396, 1))
     """
+    fewest = 30  # readings of an output that is read now and then: a model fits fewer by heart
     if isinstance(outputs, Log):
         given = {"inputs": inputs, "dt": dt, "disturbances": disturbances}
         if beside := [name for name, value in given.items() if value is not None]:
@@ -234,8 +231,8 @@ def identify_outputs(
     read = list(log.episodes)
     for i, each in enumerate(np.concatenate([e.states for e in read]).T):
         count = np.isfinite(each).sum()
-        if log.every[i] > 1 and count < FEWEST:
-            words = f"y[{i}] has {count} readings, and fewer than {FEWEST} tell no dynamics"
+        if log.every[i] > 1 and count < fewest:
+            words = f"y[{i}] has {count} readings, and fewer than {fewest} tell no dynamics"
             raise ValueError(log.in_names(f"{words}: leave it out, or log for longer."))
     episodes = stand_ins(read)
     try:
@@ -246,7 +243,7 @@ def identify_outputs(
         scaled = [_scaled(each, center, scale, q, m) for each in read]
         filled = [_scaled(each, center, scale, q, m) for each in episodes]
         follows = feedback(filled)
-        early = early_note(filled, EARLY_LAGS)
+        early = early_note(filled, 4)  # earlier outputs beside which inputs of later rows are tried
     except ValueError as error:
         words = str(error).replace("x[", "y[").replace(", or pass ridge > 0", "")
         raise ValueError(log.in_names(words)) from None
@@ -331,7 +328,8 @@ def _in_plant_units(
     rest = center[:q] + unit * model.y_0
     sizes = np.linalg.svd(model.C, compute_uv=False)
     T = np.eye(n)
-    if n >= q and sizes[-1] * MAX_CONDITION > sizes[0]:
+    # 1e3: condition number of C up to which outputs serve as states
+    if n >= q and sizes[-1] * 1e3 > sizes[0]:
         T = np.vstack([C, linalg.null_space(model.C).T])
     back = np.linalg.inv(T)
     C = C @ back

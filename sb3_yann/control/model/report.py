@@ -12,16 +12,7 @@ from sb3_yann.control.linear_system import LinearSystem, combination, labels_of,
 from sb3_yann.log import in_names
 
 MAY_INTEGRATE = f"may integrate: it is 1 within {SURE_ERRORS:g} standard errors"
-UNREACHED = 1e-6
-SAME_SCALE = 2.0  # factor of balancing up to which states are of one size
-HARDLY_REACHED = 1e-3  # motions of a direction by the inputs, relative to the largest
-DOUBLINGS = 16  # doublings of the Gramian's horizon: 65,536 samples
 GONE = 0.1  # time constant, in samples, below which a mode counts as a delay
-SLOW_SAMPLING = 1.0
-FAST_SAMPLING = 50.0
-"""Time constants, in samples, below which sampling is too slow, and above too fast.
-
-Åström and Wittenmark (*Computer-Controlled Systems*) advise 4 to 10 samples per rise time."""
 
 
 def describe(model: LinearSystem) -> str:
@@ -120,7 +111,7 @@ def reach(model: LinearSystem) -> tuple[Array, Array]:
     gramian = B @ B.T
     power = A
     # Smith's doubling sums positive terms: bad scaling does not spoil it as it does an equation.
-    for _ in range(DOUBLINGS):
+    for _ in range(16):  # doublings of the Gramian's horizon: 65,536 samples
         gramian = gramian + power @ gramian @ power.T
         power = power @ power
     moved = np.sqrt(np.maximum(np.diag(gramian), 0))
@@ -139,11 +130,11 @@ def _reach(model: LinearSystem) -> list[str]:
     axes = np.array([axis / axis[np.argmax(np.abs(axis))] for axis in axes])
     axes[np.abs(axes) <= 1e-3] = 0.0
     words = [combination(axis, labels_of(model)[0], 3) for axis in axes]
-    rank = int(np.sum(sizes > UNREACHED))
+    rank = int(np.sum(sizes > 1e-6))
     lines = [f"Controllability: the inputs reach {rank} of {sizes.size} directions of the state."]
     if rank < sizes.size:
         lines += [f"  Nothing moves {each}." for each in words[rank:]]
-    elif sizes[-1] < HARDLY_REACHED:
+    elif sizes[-1] < 1e-3:  # motions of a direction by the inputs, relative to the largest
         lines.append(f"  {words[-1]} is moved {sizes[-1]:.1e} times as far as the most.")
     idle = np.flatnonzero(~np.any(model.B, axis=0))
     return lines + [f"  {labels_of(model)[1][i]} has no effect." for i in idle]
@@ -158,7 +149,7 @@ def _scaling(model: LinearSystem) -> list[str]:
     if not effects.size:
         return []
     line = f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}"
-    if spread > SAME_SCALE:
+    if spread > 2.0:  # factor of balancing up to which states are of one size
         line += f"; balancing A would rescale its states by up to {spread:.3g} against each other"
     return [f"{line}.{' Consider other units.' if spread > 1e3 else ''}"]
 
@@ -241,6 +232,9 @@ def _beside(model: LinearSystem, gains: Gains | None) -> Array:
 
 def _sampling(model: LinearSystem) -> list[str]:
     """Return the lines on the sampling time."""
+    # Time constants, in samples, below which sampling is too slow, and above too fast. Åström and
+    # Wittenmark (*Computer-Controlled Systems*) advise 4 to 10 samples per rise time.
+    fast_sampling = 50.0
     found = poles(model)
     constants = [abs(time_constant(pole)) for pole in found]
     moving = [constant for constant in constants if GONE <= constant < np.inf]
@@ -257,13 +251,13 @@ def _sampling(model: LinearSystem) -> list[str]:
             f"Sampling: the fastest time constant is {min(moving):.3g} samples, the slowest "
             f"{max(moving):.3g}. A horizon of as many steps sees such a mode change e-fold."
         ]
-    if min(moving, default=np.inf) < SLOW_SAMPLING or period < 6:
+    if min(moving, default=np.inf) < 1.0 or period < 6:
         lines.append(
             "  Slow: the fastest mode decays, or swings round, within so few samples that inputs "
             "come too late for it. Sample faster, or leave it out of the model. Is dt in the unit "
             "of time of the equations, or of the log?"
         )
-    elif min(moving, default=0.0) > FAST_SAMPLING and period > 2 * np.pi * FAST_SAMPLING:
+    elif min(moving, default=0.0) > fast_sampling and period > 2 * np.pi * fast_sampling:
         lines.append(
             "  Fast: even the fastest mode hardly moves in one sample, and a short horizon sees "
             "little of the plant. Sample slower, or lengthen the horizon. Is dt in the unit of "

@@ -23,7 +23,6 @@ from sb3_yann.control.observer import DisturbanceObserver, StateEstimator
 
 SHARE = 0.05
 """Of the half-widths of the box of states: what a disturbance moves in a sample, at most."""
-SLOW = 0.03  # a disturbance's step from sample to sample, in the noise of its reading
 
 
 def offset_free(
@@ -121,7 +120,8 @@ def offset_free(
         if every is not None:
             raise ValueError(f"every = {every}, but the estimator has {rates}: leave every out.")
         every = rates
-        drifts = SLOW * np.sqrt(np.diag(estimator.noise["measurement_noise"]))
+        # 0.03: a disturbance's step from sample to sample, in the noise of its reading
+        drifts = 0.03 * np.sqrt(np.diag(estimator.noise["measurement_noise"]))
         noise = {**estimator.noise, "disturbance_noise": drifts}
     return found, DisturbanceObserver(found.model, C, every=1 if every is None else every, **noise)
 

@@ -13,8 +13,6 @@ from sb3_yann.control.mpc.groups import Terminal
 from sb3_yann.control.mpc.problem import MPCProblem
 from sb3_yann.control.polyhedra import bounded_region, farthest_points
 
-STEADY_MARGIN = 0.01
-"""How far inside the bounds steady states must lie, relative to the bounds."""
 MAX_FACETS = 200
 MAX_STEPS = 500
 Facets = tuple[Array, Array]  # half-spaces F theta <= g
@@ -111,7 +109,8 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Facets:
     wide, ends = _around(problem, half, 1e3)
     box = wide, ends - wide @ (rest / half)
     moving = np.any(np.abs(steady) > 1e-12, axis=1)
-    inside = steady[moving], (1 - STEADY_MARGIN) * bounds[moving]
+    # Steady states must lie inside the bounds by 1 % of them.
+    inside = steady[moving], 0.99 * bounds[moving]
     found = _reduced(_joined((rows, bounds), inside), box)
     later = rows
     for step in range(MAX_STEPS):  # until the bounds of a later step say nothing new
@@ -158,8 +157,6 @@ def hard_rows(
 
 ZERO_LENGTH = 1e-9
 """A column or a radius, in half-widths, that counts as zero."""
-UNPLANNED_MOVE = 1e-5
-"""Half-widths that inputs which the MPC does not plan leave from one step to the next."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +224,8 @@ def kept_set(problem: MPCProblem, most_steps: int = 100, most_rows: int = 60) ->
     most_steps = 0 if nothing else problem.horizon if ends else most_steps
     while steps < most_steps and not settled:
         # What the MPC does not plan itself needs room: an unstable plant leaves an edge at once.
-        earlier = before(found, UNPLANNED_MOVE if not ends and steps >= problem.horizon else 0.0)
+        # Inputs that the MPC does not plan leave 1e-5 half-widths from one step to the next.
+        earlier = before(found, 1e-5 if not ends and steps >= problem.horizon else 0.0)
         earlier = None if earlier is None else _reduced(_joined(bounds, earlier), box)
         if earlier is None or len(earlier[1]) > most_rows:
             break

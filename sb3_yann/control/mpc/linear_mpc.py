@@ -63,9 +63,6 @@ REGIONS = 5000
 """The most regions of a law that "auto" takes."""
 LARGE = 50_000
 """Constraints times parameters beyond which a single region takes long, and none is looked for."""
-DRIFT = 1e-3
-BEYOND = 0.5
-"""In widths: the drift in a sample that warns; how far theta's box reaches beyond soft bounds."""
 ONLINE_CHOSEN = "_online_chosen"
 """Notes in a problem that its online law was chosen, and travels with it."""
 
@@ -218,7 +215,8 @@ class LinearMPC(MPCProblem):
         rest += [parametric_box(names, problem.limits)]
         rest += [u] if layout.n_previous else []
         width = x[1] - x[0]
-        beyond = np.where((soft.x > 0) & np.isfinite(width), BEYOND * width, 0.0)
+        # Theta's box reaches half a width beyond soft bounds.
+        beyond = np.where((soft.x > 0) & np.isfinite(width), 0.5 * width, 0.0)
         box = x[0] - beyond, x[1] + beyond
         low, high = theta_box(layout, (theta_min, theta_max), box, rest)
         problem = replace(problem, theta_min=low, theta_max=high)
@@ -599,7 +597,7 @@ def _warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
     """Warn of an operating point that moves noticeably: the law would rest beside it."""
     width = (upper - lower) / 2
     size = np.where(np.isfinite(width), width, np.maximum(np.abs(model.x_ss), 1.0))
-    if np.any(np.abs(model.drift) > DRIFT * size):
+    if np.any(np.abs(model.drift) > 1e-3 * size):
         warn(
             f"x_ss = {model.x_ss.tolist()} with u_ss = {model.u_ss.tolist()} is no steady state: "
             f"there the plant moves by {model.drift.tolist()} in one sample, and the law will rest "

@@ -12,14 +12,7 @@ from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.log import UNITS
 
-WRONG = 0.5
-"""Share of the states' movement in a step that the model leaves open, at least, as they are shown.
-"""
-RIGHT = 0.05
-"""The most that it leaves open in another order, or in other units, where those are meant: no noise
-and no wrong model does that."""
 STEPS_PER_STATE = 10  # steps for each state that must be seen
-MOST_REORDERED = 5  # states of which all orders are tried; of more, two are exchanged
 Reading = tuple[Array, Array]
 """A matrix M (n, n) and an offset v (n,): what is shown as x, in plant units, may mean M x + v."""
 
@@ -36,7 +29,9 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
         return ""
     n = problem.model.n_states
     shown = _left_open(problem, (np.eye(n), np.zeros(n)), *steps)
-    if not shown > WRONG:
+    # The model must leave half of the states' movement in a step open, as they are shown, and
+    # hardly any in the order or the units that are meant: no noise and no wrong model does that.
+    if not shown > 0.5:
         return ""
     is_clear = False
     best = np.inf, "", ""  # a factor of units may explain more than the order that is told
@@ -44,7 +39,7 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
         left = _left_open(problem, reading, *steps)
         # States in the wrong order drive the plant where no model holds: there it is by far better.
         reorders = not np.array_equal(reading[0], np.eye(n)) and np.isin(reading[0], (0, 1)).all()
-        is_clear |= bool(left < RIGHT * (max(1.0, shown) if reorders else 1.0))
+        is_clear |= bool(left < 0.05 * (max(1.0, shown) if reorders else 1.0))
         best = min(best, (left, what, cure), key=lambda each: each[0])
     left, what, cure = best
     return is_clear * (
@@ -55,13 +50,14 @@ def misread_states(problem: LinearMPC, theta: Array, u: Array, following: Array)
 
 def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:
     """Yield what the states that are shown may mean, in words, and what to do."""
+    most_reordered = 5  # states of which all orders are tried; of more, two are exchanged
     names = labels_of(problem.model)[0]
     x_ss = problem.model.x_ss
     n = len(names)
     same = np.eye(n)
     # All orders of a few states; of more, two are exchanged.
-    orders = [[*each] for each in permutations(range(n))][1:] if n <= MOST_REORDERED else []
-    if n > MOST_REORDERED:
+    orders = [[*each] for each in permutations(range(n))][1:] if n <= most_reordered else []
+    if n > most_reordered:
         orders = [[{i: j, j: i}.get(k, k) for k in range(n)] for i, j in combinations(range(n), 2)]
     for order in orders:
         back = np.argsort(order).tolist()

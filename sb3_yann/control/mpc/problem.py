@@ -454,13 +454,12 @@ class MPCProblem(ReadOnlyArrays):
         return f"{type(self).__name__}({', '.join([sizes, options, *shown])})"
 
 
-TOLERANCE = 1e-9
-"""How far beyond a bound a steady state still counts as within, relative to the bound."""
 BOUNDED_KINDS = "x", "u", "y", "mixed"
 
 
 def margins(problem: MPCProblem, r: Given, d: Given, thetas: Array | None = None) -> Array:
     """Return the room to the upper, then the lower bounds of x, u, y and mixed ones, at thetas."""
+    tolerance = 1e-9  # relative to a bound: a steady state so little beyond counts as within
     constant = _constants(problem, r, d)
     x = constant @ problem.steady_states.x.T
     u = constant @ problem.steady_states.u.T
@@ -471,8 +470,8 @@ def margins(problem: MPCProblem, r: Given, d: Given, thetas: Array | None = None
         rows = own.bounded[kind].rows
         value = x @ rows[:, own.layout.state].T + u @ rows[:, own.n_theta :].T
         low, high = own.limits[kind] if thetas is None else own.limits_at(kind, thetas)
-        below.append(high - value + TOLERANCE * np.where(np.isfinite(high), np.abs(high), 0.0))
-        above.append(value - low + TOLERANCE * np.where(np.isfinite(low), np.abs(low), 0.0))
+        below.append(high - value + tolerance * np.where(np.isfinite(high), np.abs(high), 0.0))
+        above.append(value - low + tolerance * np.where(np.isfinite(low), np.abs(low), 0.0))
     return np.concatenate([*below, *above], axis=-1)
 
 
@@ -488,10 +487,6 @@ def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:
         parts.append(check_array(name, array, shape) - rest)
     rows = np.broadcast_shapes(parts[0].shape[:-1], parts[1].shape[:-1])
     return np.concatenate([np.broadcast_to(a, (*rows, a.shape[-1])) for a in parts], axis=-1)
-
-
-REST_STEPS = 100_000
-"""After so many a law that does not rest is given up."""
 
 
 class Value(NamedTuple):
@@ -528,6 +523,7 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
 
     That point is reached from the operating point, with r and d at zero.
     """
+    rest_steps = 100_000  # a law that does not rest by then is given up
     if gamma >= 1:
         raise ValueError(
             "With a price the law pays at rest too: its cost for good is infinite without a "
@@ -535,7 +531,7 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
         )
     A, B = problem.prediction
     theta = problem.theta_rest
-    for _ in range(REST_STEPS):
+    for _ in range(rest_steps):
         u = law(theta)
         before = theta
         theta = A @ theta + B @ u
@@ -543,7 +539,7 @@ def _priced_value(problem: MPCProblem, law: Law, gamma: float) -> Value:
             break
     else:
         raise ValueError(
-            f"The law comes to no rest in {REST_STEPS} steps from the operating point, so that "
+            f"The law comes to no rest in {rest_steps} steps from the operating point, so that "
             "no quadratic form is its value there. Lengthen the horizon, or give states and "
             "inputs weights."
         )

@@ -18,7 +18,6 @@ from sb3_yann.control.online import Law, OnlineLaw
 LOOP_STEPS = 50  # of a closed loop on the model
 BEYOND = 0.1  # widths of theta's box beyond it, in which states are tried
 APART = 0.05  # of an input's range, by which laws that differ by more are named
-FAINT = 0.01  # of what the state that costs the most does, below which a state hardly counts
 BOUND = "bound of entry {}, which may move in"
 
 
@@ -101,7 +100,8 @@ def _weights(problem: MPCProblem) -> Iterator[str]:
     if not named:
         return
     yield f"Half its range costs, in a step: {', '.join(f'{n} {cost:.3g}' for n, cost in named)}."
-    if small := [n for n, cost in named[: np.count_nonzero(states)] if cost < FAINT * max(states)]:
+    # States that cost a hundredth of the dearest one hardly count.
+    if small := [n for n, cost in named[: np.count_nonzero(states)] if cost < 0.01 * max(states)]:
         yield f"  Little beside others: {', '.join(small)}. Weights are in plant units."
 
 

@@ -17,9 +17,6 @@ from sb3_yann._validation import Single
 WEIGHT_TYPES = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
 """Types of nodes, second, last and pinned, see :func:`network`."""
 
-BLOCK = 128  # rows of a product of narrow matrices: as a whole it takes BLAS twice as long
-ONE_THREAD = 262_144  # multiplications of a product that OpenBLAS does not share out among threads
-
 
 def to_numpy(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
     """Return what compiled code takes for a tensor, without its gradient: the same memory if so."""
@@ -110,8 +107,10 @@ def _block_of(size: int) -> int:
     Threads of BLAS wait for one another: where other processes have the cores, ten times as long.
     Large matrices are worth it.
     """
-    few = ONE_THREAD // size
-    return few if BLOCK // 4 <= few < BLOCK else BLOCK
+    block = 128  # rows of a product of narrow matrices: as a whole it takes BLAS twice as long
+    # 262_144: multiplications of a product that OpenBLAS does not share out among threads
+    few = 262_144 // size
+    return few if block // 4 <= few < block else block
 
 
 @compiled()
