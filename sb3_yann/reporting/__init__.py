@@ -101,8 +101,6 @@ def report(
     target = Path(path)
     with ExitStack() as stack:
         try:
-            if target.is_dir():
-                raise IsADirectoryError("it is a folder")
             target.parent.mkdir(parents=True, exist_ok=True)
             unfinished = stack.enter_context(atomic_write(target))
             unfinished.touch()

@@ -35,6 +35,7 @@ from sb3_yann.guard.start import OTHER_REWARD
 from sb3_yann.guard.state import summary_of
 from sb3_yann.improvement.improving import fingerprint, of_estimates
 from sb3_yann.reporting.subject import (
+    NOT_SHOWN,
     OF_MPC,
     OF_POLICY,
     Finding,
@@ -42,12 +43,11 @@ from sb3_yann.reporting.subject import (
     Part,
     Subject,
     is_rewarded,
-    join,
-    left_out,
     lines,
     make_finding,
     number,
     paragraph,
+    part_of,
     picture,
     table,
     tag,
@@ -61,10 +61,9 @@ NO_ENV = "No env was given: closed loops are left out. Pass report(model, env=..
 
 def loops_part(subject: Subject) -> Part:
     """Return the closed loops against the MPC: costs, and a picture in plant units."""
-    title = "Closed loops against the MPC"
     loops = subject.loops
     if loops is None:
-        return left_out(title, NO_ENV)
+        return part_of("", [], Finding("note", NO_ENV))
     mpc = loops[OF_MPC]
     policy = loops[OF_POLICY]
     averages = ("mean cost", np.mean), ("median cost", np.median), ("worst cost", np.max)
@@ -119,27 +118,22 @@ def loops_part(subject: Subject) -> Part:
     episodes = table(head, single[:1000])
     if not apart.any() and np.array_equal(mpc.violations, policy.violations):
         episodes = paragraph("Each costs what it costs with the MPC, and violates as often.")
-    content = join(
-        [
-            paragraph(how, warning if known else ""),
-            table(["", "MPC", "policy", "change"], rows),
-            picture(partial(plots.plot_gains, loops), gains),
-            picture(partial(plots.loops_figure, subject.problem, subject.shown_loops), caption),
-            tag("h3", "Every episode"),
-            episodes,
-        ]
-    )
+    content = [
+        paragraph(how, warning if known else ""),
+        table(["", "MPC", "policy", "change"], rows),
+        picture(partial(plots.plot_gains, loops), gains),
+        picture(partial(plots.loops_figure, subject.problem, subject.shown_loops), caption),
+        tag("h3", "Every episode"),
+        episodes,
+    ]
     less = less_safe(policy.unsafe(), mpc.unsafe())[:, :INPUT_STEP]  # the next part has the bounds
     bad = int(np.sum(less.any(axis=1)))
-    finding = make_finding(
-        not bad,
-        "Episodes in which the policy violates more than the MPC, ends sooner, or has no finite "
-        f"cost: {bad} of {count}.",
-    )
-    findings = [finding, *_exceeded(subject.problem, loops)]
+    text = "Episodes in which the policy violates more than the MPC, ends sooner, or has no finite "
+    findings = [make_finding(not bad, f"{text}cost: {bad} of {count}.")]
+    findings += _exceeded(subject.problem, loops)
     if words := misread_states(subject.problem, *mpc.steps()):
         findings.append(make_finding(False, words))
-    return Part(title, content, tuple(findings))
+    return part_of("Closed loops against the MPC", content, *findings)
 
 
 def _exceeded(problem: LinearMPC, loops: Mapping[str, Trajectories]) -> Iterator[Finding]:
@@ -192,14 +186,14 @@ def statistics_part(subject: Subject) -> Part:
     """Return what the closed loops prove, in words."""
     title = "Statistics in words"
     if subject.loops is None:
-        return left_out(title)
+        return NOT_SHOWN
     mpc = subject.loops[OF_MPC]
     policy = subject.loops[OF_POLICY]
     change = policy.costs - mpc.costs
     count = len(change)
     if not np.all(np.isfinite(change)):
         text = "Some costs are not finite: no average says anything."
-        return Part(title, paragraph(text), (make_finding(False, text),))
+        return part_of(title, [paragraph(text)], make_finding(False, text))
     scale = abs(float(np.mean(mpc.costs))) or 1.0
     mean = 100 * float(change.mean()) / scale
     passed: bool | None = None
@@ -237,7 +231,7 @@ def statistics_part(subject: Subject) -> Part:
     ]
     beyond = _beyond(subject)
     sentences.append(beyond.text)
-    return Part(title, join(map(paragraph, sentences)), (make_finding(passed, text), beyond))
+    return part_of(title, map(paragraph, sentences), make_finding(passed, text), beyond)
 
 
 def _beyond(subject: Subject) -> Finding:
@@ -314,14 +308,9 @@ def distance_part(subject: Subject) -> Part:
             f"({len(kept.g)} half-spaces, margin {margin:g} % of a half-width)."
         )
     head = ["input", "at", "mean", "95 % are below", "largest", "largest, % of the range"]
+    whole = f"The policy is the MPC's law plus what {networks} {adds}, clipped to the bounds of "
     content = [
-        paragraph(
-            f"The policy is the MPC's law plus what {networks} {adds}, clipped to the bounds of "
-            "the inputs.",
-            most,
-            counts,
-            keeps,
-        ),
+        paragraph(f"{whole}the inputs.", most, counts, keeps),
         table(head, rows),
         *_pictures(subject),
     ]
@@ -341,9 +330,9 @@ def distance_part(subject: Subject) -> Part:
     if policy.actor.mu.network.is_zero():
         largest = "The policy is the MPC: its networks add nothing."
     # 50.0: % of the range of an input: as far from the MPC as its middle from a bound
-    kind = "look" if float(share) > 50.0 else "note"
-    findings = make_finding(inside, text), Finding(kind, largest)
-    return Part("Where and how far the policy leaves the MPC", join(content), findings)
+    far = Finding("look" if float(share) > 50.0 else "note", largest)
+    title = "Where and how far the policy leaves the MPC"
+    return part_of(title, content, make_finding(inside, text), far)
 
 
 def _pictures(subject: Subject) -> list[Html]:
@@ -388,12 +377,12 @@ def _pictures(subject: Subject) -> list[Html]:
 
 def guard_part(subject: Subject) -> Part:
     """Return every decision of the guard with its reason, and whether its policy is this one."""
-    title = "Decisions of the guard"
     state = subject.state
     if state is None:
         if subject.improved is not None:
-            return left_out(title)
-        return left_out(title, "No guard was at work: nothing has confirmed it on new starts.")
+            return NOT_SHOWN
+        text = "No guard was at work: nothing has confirmed it on new starts."
+        return part_of("", [], Finding("note", text))
     passed: bool | None = state.accepted.is_actor_of(subject.policy)
     text = "The policy is the one that the guard accepted last."
     if not passed and subject.improved is not None:
@@ -428,7 +417,7 @@ def guard_part(subject: Subject) -> Part:
         )
         parts += [picture(partial(plots.plot_decisions, state.decisions), caption)]
         parts += _decisions(state.decisions)
-    return Part(title, join(parts), (make_finding(passed, text),))
+    return part_of("Decisions of the guard", parts, make_finding(passed, text))
 
 
 def _decisions(decisions: Sequence[Decision]) -> list[Html]:
@@ -456,35 +445,34 @@ IMPROVE_SETTINGS = {
 
 def improve_part(subject: Subject) -> Part:
     """Return what `improve` did, in what, with how many episodes, and whose the policy is."""
-    title = "What improve did"
     found = subject.improvements
     if not found:
-        return left_out(title)
+        return NOT_SHOWN
     now = subject.improved
     state = subject.state
     is_mpc = subject.policy.actor.mu.network.is_zero()
+    passed: bool | None = None
     if now is not None:
+        passed = True
         text = (
             f"The policy is the one that improve accepted last, in {now.where} ({now.episodes} "
             f"episodes): {now.change_in_words}."
         )
-        finding = make_finding(True, text)
     elif not any(each.accepted for each in found):
         whose = "The policy is the MPC: " * is_mpc
-        finding = Finding("note", f"{whose}improve was at work. {found[-1].reason}")
+        text = f"{whose}improve was at work. {found[-1].reason}"
     elif is_mpc:
         text = "The policy is the MPC again: what improve accepted is gone."
-        finding = Finding("note", text)
     elif state is not None and state.accepted.is_actor_of(subject.policy):
-        finding = Finding("note", "The guard has accepted another policy after improve.")
+        text = "The guard has accepted another policy after improve."
     else:
+        passed = False
         text = "The policy is NOT the one that improve accepted last: it was changed since."
-        finding = make_finding(False, text)
     rows = []
     tried = []
     for k, each in enumerate(found, start=1):
-        rows.append([str(k), f"{each.where}: {each.source}", str(each.episodes)])
-        rows[-1].append(str(len(each.checks)))
+        where = f"{each.where}: {each.source}"
+        rows.append([str(k), where, str(each.episodes), str(len(each.checks))])
         for j, of in enumerate(each.checks, start=1):
             changes = map(change_in_percent, (of.change, of.worst))
             tried.append([f"{k}.{j}", of.starts_in_words, *changes, of.verdict])
@@ -500,7 +488,7 @@ def improve_part(subject: Subject) -> Part:
         table(["", "starts", "change", "worst start", "verdict"], tried),
     ]
     content = [
-        paragraph(finding.text),
+        paragraph(text),
         paragraph(how),
         table(["", "in", "episodes", "candidates"], rows),
         *(lines(f"{k}. {each.report()}") for k, each in enumerate(found, start=1)),
@@ -508,36 +496,34 @@ def improve_part(subject: Subject) -> Part:
         tag("h3", "Settings of the last improvement"),
         table(["setting", "value", "what it is"], settings),
     ]
-    return Part(title, join(content), (finding,))
+    return part_of("What improve did", content, make_finding(passed, text))
 
 
 def twin_part(subject: Subject) -> Part:
     """Return the twin's report and evidence."""
     twin = subject.twin
-    title = "The twin and its verdict"
     if twin is None:
-        return left_out(title)
+        return NOT_SHOWN
     text = "The twin is trusted." if twin.trusted else "The twin is NOT trusted."
     caption = (
         "Left: costs of held-out episodes. Right: how the error of free runs grows with the steps "
         "that they look ahead."
     )
     shown = picture(lambda: plots.plot_twin(twin.trust)[0], caption)
-    content = join([paragraph(text), lines(twin.report()), shown])
-    return Part(title, content, (make_finding(twin.trusted, text),))
+    content = paragraph(text), lines(twin.report()), shown
+    return part_of("The twin and its verdict", content, make_finding(twin.trusted, text))
 
 
 def headroom_part(subject: Subject) -> Part:
     """Return the headroom: how much could be gained over the MPC, and of which kind."""
     found = subject.headroom
-    title = "Headroom"
     if found is None:
-        return left_out(title)
+        return NOT_SHOWN
     caption = "The gain over the MPC part by part; the bar of the total has its standard error."
     shown = picture(partial(plots.plot_headroom, found), caption)
     text = f"Headroom: {100 * found.total:.2f} % below the MPC's mean cost"
     finding = Finding("note", f"{text}; the verdict is to {found.verdict}.")
-    return Part(title, join([lines(found.report()), shown]), (finding,))
+    return part_of("Headroom", [lines(found.report()), shown], finding)
 
 
 # ---- What it takes to do it again ----
@@ -586,4 +572,4 @@ def again_part(subject: Subject) -> Part:
         tag("h3", "Settings of the learner"), table(["setting", "value"], settings),
         tag("h3", "Fingerprints (SHA-256)"), table(["what", "fingerprint"], prints),
     ]  # fmt: skip
-    return Part("To do it again", join(parts))
+    return part_of("To do it again", parts)

@@ -30,11 +30,11 @@ from sb3_yann.reporting.subject import (
     Html,
     Part,
     Subject,
-    join,
     lines,
     make_finding,
     number,
     paragraph,
+    part_of,
     picture,
     table,
     tag,
@@ -69,21 +69,19 @@ def plant_part(subject: Subject) -> Part:
     if problem.price.counts:
         prices = zip([*states, *inputs], [*problem.price.x, *problem.price.u], strict=True)
         facts.append(["prices in a sample", ", ".join(f"{k}: {number(p)}" for k, p in prices if p)])
-    content = join(
-        [
-            paragraph("All values are in the plant's units unless a line says otherwise."),
-            tag("h3", "Operating point"),
-            table(["quantity", "kind", "value"], point),
-            tag("h3", "The control problem"),
-            table(["setting", "value"], facts),
-            tag("h3", "Parameters of the law, and the box for which it is solved"),
-            table(["parameter", "lower", "upper"], box),
-            tag("h3", "The linear model"),
-            lines(model.report()),
-        ]
-    )
-    lacks = missing_observer(model)
-    return Part("Plant and problem", content, (Finding("note", lacks),) if lacks else ())
+    content = [
+        paragraph("All values are in the plant's units unless a line says otherwise."),
+        tag("h3", "Operating point"),
+        table(["quantity", "kind", "value"], point),
+        tag("h3", "The control problem"),
+        table(["setting", "value"], facts),
+        tag("h3", "Parameters of the law, and the box for which it is solved"),
+        table(["parameter", "lower", "upper"], box),
+        tag("h3", "The linear model"),
+        lines(model.report()),
+    ]
+    lacks = [Finding("note", each) for each in (missing_observer(model),) if each]
+    return part_of("Plant and problem", content, *lacks)
 
 
 def _matrix(M: Array) -> str:
@@ -134,12 +132,12 @@ def constraints_part(subject: Subject) -> Part:
         f"than {EXCESS_ROOM:g} half-widths, as for violations.",
         f"The terminal set has {len(last)} half-spaces." if len(last) else "No terminal set.",
     ]
-    findings = _bound_findings(problem, loops) if loops else ()
+    findings = _bound_findings(problem, loops) if loops else []
     if unseen := _unseen(subject):
-        which = ", ".join(unseen)
-        text = f"No sensor shows {which}: what counts are estimates, and the plant may be beyond "
-        findings = *findings, Finding("note", text + "the bounds where no estimate is.")
-    return Part("Constraints register", join([paragraph(*sentences), table(head, rows)]), findings)
+        text = f"No sensor shows {', '.join(unseen)}: what counts are estimates, and the plant may "
+        findings.append(Finding("note", f"{text}be beyond the bounds where no estimate is."))
+    content = paragraph(*sentences), table(head, rows)
+    return part_of("Constraints register", content, *findings)
 
 
 def _unseen(subject: Subject) -> list[str]:
@@ -157,7 +155,7 @@ def _unseen(subject: Subject) -> list[str]:
     return [name for name, shown in zip(names, seen, strict=False) if not shown]
 
 
-def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple[Finding, ...]:
+def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> list[Finding]:
     """Return whether the policy exceeds bounds of the problem by more than the MPC does."""
     mpc = loops[OF_MPC].excess
     policy = loops[OF_POLICY].excess
@@ -201,7 +199,7 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
         if words := names.in_words(policy.worst[worst], over[worst]):
             text += f" In episode {worst} {words} with the policy."
         found.append(make_finding(not costs_more, text))
-    return tuple(found)
+    return found
 
 
 def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, str, int, str, Any]]:
@@ -259,18 +257,14 @@ def law_part(subject: Subject) -> Part:
     )
     inside = "The law inside the policy, without what it has learnt, differs by at most "
     inside += f"{off:.1e} of half the range."
-    content = [*map(paragraph, (how, compared, inside)), _regions(subject)]
-    findings = (
-        make_finding(
-            error <= 1e-6 and doubtful == 0,
-            f"The law solves the MPC problem: {error:.1e} of half the input range off at {count} "
-            "points.",
-        ),
-        make_finding(  # the policy rounds to float32
-            off <= 1e-5, f"The policy holds that law: {off:.1e} of half the range off."
-        ),
+    solves = f"The law solves the MPC problem: {error:.1e} of half the input range off at {count} "
+    holds = f"The policy holds that law: {off:.1e} of half the range off."
+    return part_of(
+        "The law and how it was checked",
+        [*map(paragraph, (how, compared, inside)), _regions(subject)],
+        make_finding(error <= 1e-6 and doubtful == 0, f"{solves}points."),
+        make_finding(off <= 1e-5, holds),  # the policy rounds to float32
     )
-    return Part("The law and how it was checked", join(content), findings)
 
 
 def _regions(subject: Subject) -> Html:

@@ -146,9 +146,12 @@ class Part:
     findings: tuple[Finding, ...] = ()
 
 
-def left_out(title: str, note: str = "") -> Part:
-    """Return a part that is not shown; the summary may have a note on that."""
-    return Part(title, join([]), (Finding("note", note),) if note else ())
+def part_of(title: str, content: Iterable[Any], *findings: Finding) -> Part:
+    """Return a part of pieces one below the other."""
+    return Part(title, join(content), findings)
+
+
+NOT_SHOWN = part_of("", [])
 
 
 def is_rewarded(loops: Mapping[str, Trajectories]) -> bool:
