@@ -77,8 +77,7 @@ class LinearPrediction(nn.Module):
 
     def __init__(self, A: Array, B: Array) -> None:
         super().__init__()
-        self.register_buffer("A", th.as_tensor(A.T.copy()))
-        self.register_buffer("B", th.as_tensor(B.T.copy()))
+        register_constants(self, A=A.T, B=B.T)
 
     def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
         """Return the predicted next theta, (batch, n)."""

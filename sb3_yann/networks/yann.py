@@ -86,15 +86,12 @@ class LawLayer(nn.Module):
         if self.rated or not isinstance(self, YannLayer):
             register_constants(self, middle=middle, half_range=half_range)
         self.register_buffer("confines", th.zeros((2, law.n_theta), dtype=th.float64))
-        no_box = np.zeros(2 * law.n_theta)
-        fades = np.array([FADE_START, FADE_END])
-        scaling = np.concatenate([1 / half, middle, 1 / half_range, no_box, fades])
+        self.scaling = np.concatenate([1 / half, middle, 1 / half_range])
+        self.changes = change if self.rated else change[:0]
         none: Array = np.empty((0, law.n_theta + law.n_inputs + 2))
         self.rows = none if kept is None else _kept_in_actions(kept, middle, half_range)
         # Below zero the rows are left out.
         self.register_buffer("margin", th.tensor(0.0 if kept else -1.0, dtype=th.float64))
-        self.constants = (scaling, change if self.rated else change[:0], self.rows, np.inf)
-        self._keep_constants()
         at_origin = self._register_law(law)
         self.network = ZeroOutputNetwork(
             law.n_theta,
@@ -119,8 +116,8 @@ class LawLayer(nn.Module):
         raise NotImplementedError
 
     def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
-        """Return which network each row of theta (batch, n) goes through."""
-        raise NotImplementedError
+        """Return which network each row of theta (batch, n) goes through: here the only one."""
+        return np.zeros(len(theta), np.int64)
 
     def _correction(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return the law and what the networks put out, by torch's operations, both (batch, m)."""
@@ -239,7 +236,7 @@ class LawLayer(nn.Module):
         # for what the rate's own room may take from the law.
         left = 2e-6 if self.rated else 1e-6
         self.reach = None if max_correction is None else max(0.0, 2 * max_correction - left)
-        self.constants = (*self.constants[:3], np.inf if self.reach is None else self.reach)
+        self._keep_constants()
 
     def keep(self, margin: float | None) -> None:
         """Let inputs keep so far from the rows that they keep, in half-widths; None is off.
@@ -268,13 +265,13 @@ class LawLayer(nn.Module):
 
     def _keep_constants(self) -> None:
         confines = self.confines.cpu().numpy().ravel()
-        scaling, change, _, limit = self.constants
         # As data: a constant of another file stays what it was in code that has been compiled.
-        scaling = np.concatenate([scaling[: -len(confines) - 2], confines, [FADE_START, FADE_END]])
+        scaling = np.concatenate([self.scaling, confines, [FADE_START, FADE_END]])
         margin = float(self.margin)
         kept = self.rows.copy() if margin >= 0 else self.rows[:0]
         kept[:, -1] *= margin + FLOAT32_ROUNDING
-        self.constants = (scaling, change, kept, limit)
+        limit = np.inf if self.reach is None else self.reach
+        self.constants = (scaling, self.changes, kept, limit)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
         super()._load_from_state_dict(state_dict, prefix, *rest)
@@ -465,8 +462,7 @@ class SharedYannLayer(LawLayer):
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
-        tracing = th.jit.is_tracing() or th.compiler.is_compiling()  # type: ignore[attr-defined, no-untyped-call]
-        if tracing:
+        if th.jit.is_tracing() or th.compiler.is_compiling():  # type: ignore[attr-defined, no-untyped-call]
             raise RuntimeError(
                 "A law beside a shared network is evaluated outside of torch: it cannot be traced "
                 "or compiled by it. Trace a policy with networks='per_region'."
@@ -475,19 +471,11 @@ class SharedYannLayer(LawLayer):
         u: th.Tensor = _Law.apply(theta, self)  # type: ignore[no-untyped-call]
         return u.clamp(*self.reachable(theta)) if self.rated else u
 
-    def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
-        """Return zeros: all rows of theta (batch, n) go through the one network."""
-        return np.zeros(len(theta), np.int64)
-
     def inputs(self, theta: Array) -> Array:
         """Return the law's inputs (batch, m), NaN where theta (batch, n) is not finite."""
         finite = np.isfinite(theta).all(axis=1)
-        if finite.all():
-            u: Array = self.base_law(theta)
-            return u
-        u = np.full((len(theta), self.base_law.n_inputs), np.nan)
-        if finite.any():
-            u[finite] = self.base_law(theta[finite])
+        u: Array = np.full((len(theta), self.base_law.n_inputs), np.nan)
+        u[finite] = self.base_law(theta[finite])
         return u
 
     def _correction(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

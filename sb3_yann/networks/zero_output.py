@@ -22,15 +22,6 @@ FEW = 32
 """Stacks of up to this size are multiplied as a whole."""
 
 
-class _Layer(nn.Module):
-    """Holds the parameter of a layer, by its name."""
-
-    def __init__(self, **parameters: th.Tensor) -> None:
-        super().__init__()
-        for name, value in parameters.items():
-            self.register_parameter(name, nn.Parameter(value))
-
-
 class Rows:
     """Which layer of a stack each row of a batch goes through; None is for a stack of one.
 
@@ -133,8 +124,8 @@ class ZeroOutputNetwork(nn.Module):
         first, *rest = (th.empty(len(pinned), m, n + 1).uniform_(-0.01, 0.01) for m, n in sizes)
         for each in rest:
             each[..., -1] = 0  # Theorem 2: the biases of later layers start at zero
-        self.first = _Layer(nodes=th.stack([first, -first], 1))
-        self.rest = nn.ModuleList(_Layer(weight=each) for each in rest)
+        self.first = nn.ParameterDict({"nodes": th.stack([first, -first], 1)})
+        self.rest = nn.ModuleList(nn.ParameterDict({"weight": each}) for each in rest)
         self.register_buffer("pinned", pinned.float()[:, None])
         names_of_tanh = (th.tanh, nn.functional.tanh)
         is_tanh = isinstance(activation, nn.Tanh) or activation in names_of_tanh

@@ -281,10 +281,7 @@ def network_backward(
     by_1 = np.empty((batch, h1), np.float32)
     by_2 = np.zeros((batch, h2), np.float32)
     first = first_layers(nodes, used)
-    matrices1 = transposed(first, np.arange(len(used)))
-    zero1 = at_zero(matrices1, used, pinned)
-    matrices2 = transposed(second, used)
-    zero2 = at_zero(matrices2, used, pinned)
+    matrices1, matrices2, zero1, zero2 = prepared(used, nodes, second, pinned)
     for row in range(batch):
         s = slot[row]
         i = used[s]

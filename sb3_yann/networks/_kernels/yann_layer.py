@@ -305,11 +305,7 @@ def frozen_layer(
 ) -> Callable[[Array], Single]:
     """Return a layer of now as a function from theta (batch, n) to actions (batch, m)."""
     rest = (*constants, *map(to_numpy, weights), pinned)
-
-    def act(theta: Array) -> Single:
-        return _actions([*pack(_rows(theta, weights[0])), *rest])[0]
-
-    return act
+    return lambda theta: _actions([*pack(_rows(theta, weights[0])), *rest])[0]
 
 
 @compiled(
