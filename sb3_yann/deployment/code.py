@@ -64,11 +64,8 @@ def search_tolerances(data: ControllerArrays, precision: str) -> dict[str, float
     relative to 1 + their size, tie. The others are those of the law's own compiled search. In float
     they are coarser: a slack is known to some 1e-6.
     """
-    found: tuple[float, ...]
-    if precision == "float":
-        found = (1e-5, 2e-6, 1e-5, 1e-5)
-    else:
-        found = (*map(float, data["tolerances"]), 1e-9, 1e-9)
+    own = (*map(float, data["tolerances"]), 1e-9, 1e-9)
+    found = (1e-5, 2e-6, 1e-5, 1e-5) if precision == "float" else own
     return dict(zip(("tolerance", "tie", "surely_inside", "back"), found, strict=True))
 
 
@@ -143,31 +140,25 @@ class Cost:
         """Return the cost of a controller's arrays."""
         numbers, indices = controller_tables(data, "double")
         (_, m, n) = data["gains"].shape
-        q = len(data["b"])
         n_obs = data["obs_matrix"].shape[1]
         widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]
-        search = n + 2 * q * n + (q * n if data["neighbors"].size else 0)
-        products = sum(a * b for a, b in zip([n, *widths], widths, strict=False))
         hidden = sum(widths[:-1])
-        program = 0
+        products = n * n_obs + m * (n + 2)
+        products += n + (3 if data["neighbors"].size else 2) * len(data["b"]) * n  # the search
+        filters = "est_next", "est_C", "est_gain"
+        products += sum(data[name].size for name in filters if name in data)
+        if widths:
+            products += 2 * n + 2 * data["kept"].size
+            products += sum(a * b for a, b in zip([n, *widths], widths, strict=False))
         if "qp_gram" in data:
             rows = len(data["qp_d0"])
             most = int(data["qp_most"])
-            program = rows * n + steps_of(data) * most * (rows + 2 * most)
-        products += 2 * data["kept"].size
-        filtering = sum(
-            data[name].size for name in ("est_next", "est_C", "est_gain") if name in data
-        )
+            products += rows * n + steps_of(data) * most * (rows + 2 * most)
         return cls(
             numbers=sum(each.size for each in numbers.values()),
             indices=sum(each.size for each in indices.values()),
             index_bytes=index_bytes(indices),
-            multiplications=n * n_obs
-            + search
-            + program
-            + filtering
-            + m * (n + 2)
-            + (products + 2 * n) * bool(widths),
+            multiplications=products,
             activations=2 * hidden,
             locals=2 * n + 8 * m + hidden + 8 + 2 * n_obs,
         )
@@ -238,13 +229,13 @@ def ascii_text(lines: Iterable[str]) -> str:
 # ---- Points at which answers are known ----
 
 
-def sample_observations(controller: Controller, count: int, seed: int = 0) -> Array:
+def sample_observations(controller: Controller, count: int) -> Array:
     """Return observations (count, n_obs): the operating point, then some in and around the box.
 
     Every other one is nearer to the operating point, where the MPC of a wide box has a solution.
     """
     data = controller.data
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     low, high = data["box"]
     theta = (low + high) / 2 + generator.uniform(-0.65, 0.65, (count, len(low))) * (high - low)
     theta[::2] *= 2.0 ** -(np.arange(len(theta[::2])) % 8)[:, None]

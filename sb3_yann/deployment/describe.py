@@ -203,17 +203,14 @@ def describe(
     problem = policy if isinstance(policy, LinearMPC) else problem
     own = estimator if isinstance(estimator, StateEstimator) else None
     note = " ".join(filter(None, [_lacks(policy, problem, estimator), _unconfirmed(given)]))
-    if isinstance(policy, StartsAsMPC):
-        layer = policy.actor.mu
-        law, program = _with_regions(layer.base_law)
-        networks = _network_arrays(layer, law)
-        change = layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs))
-    else:
-        law, program = _with_regions(policy.law() if isinstance(policy, LinearMPC) else policy)
-        networks = _network_arrays(None, law)
-        change = np.empty((0, law.n_inputs))
-        if law.rate is not None:
-            change = law.rate / _input_range(law)[2]
+    layer = policy.actor.mu if isinstance(policy, StartsAsMPC) else None
+    base: Any = policy.law() if isinstance(policy, LinearMPC) else policy
+    law, program = _with_regions(base if layer is None else layer.base_law)
+    change: Array = np.empty((0, law.n_inputs))
+    if layer is not None and layer.rated:
+        change = layer.change.cpu().numpy()
+    elif layer is None and law.rate is not None:
+        change = law.rate / _input_range(law)[2]
 
     n = law.n_theta
     state_names: list[str] = []
@@ -254,7 +251,7 @@ def describe(
     return {
         **_law_arrays(law),
         **program,
-        **networks,
+        **_network_arrays(layer, law),
         **signals,
         **limits,
         "change": change,

@@ -99,6 +99,16 @@ class _Graph:
         """Return a value clipped to bounds that broadcast."""
         return self.op("Min", self.op("Max", value, low), high)
 
+    def column(self, row: str) -> str:
+        """Return a column (batch, 1) of a row (batch,)."""
+        return self.op("Unsqueeze", row, self.constant(np.array([1])))
+
+    def distance(self, theta: str, middle: Any, per_half: Any) -> str:
+        """Return how far a row of theta is from a middle, in half-widths, (batch, 1)."""
+        off = self.op("Abs", self.op("Sub", theta, self.constant(middle[None])))
+        off = self.op("Mul", off, self.constant(per_half[None]))
+        return self.op("ReduceMax", off, axes=[1], keepdims=1)
+
     def times(self, matrices: str, vectors: str) -> str:
         """Return matrices (batch, a, b) times vectors (batch, b): (batch, a)."""
         last = self.constant(np.array([2]))
@@ -177,10 +187,7 @@ def _locate(
     nearly = op("Sub", largest, op("Mul", room, constant(tolerances["tie"])))
     ties = graph.number(op("Not", op("Less", slack, nearly)))
     region = op("ArgMax", ties, axis=1, keepdims=0)
-    off = op("Abs", op("Sub", theta, constant(data["box_middle"][None])))
-    off = op(
-        "ReduceMax", op("Mul", off, constant(data["box_per_half"][None])), axes=[1], keepdims=1
-    )
+    off = graph.distance(theta, data["box_middle"], data["box_per_half"])
     least = op("Min", largest, op("Sub", constant(1.0), off))
     return region, op("Not", op("Less", least, constant(-tolerances["tolerance"])))
 
@@ -224,18 +231,14 @@ def _correction(graph: _Graph, data: ControllerArrays, theta: str, region: str) 
             at_zero = np.where(pinned[:, None], act(bias), 0.0)
             x = op("Sub", activated(x), of_row(at_zero))
     sound = op("Not", graph.any(graph.not_finite(x)))
-    counts = op("Unsqueeze", op("Gather", constant(number >= 0), region), constant(np.array([1])))
-    still = op("And", op("Unsqueeze", op("Gather", constant(pinned), used),
-                         constant(np.array([1]))), op("Not", moved))  # fmt: skip
+    counts = graph.column(op("Gather", constant(number >= 0), region))
+    still = op("And", graph.column(op("Gather", constant(pinned), used)), op("Not", moved))
     counts = op("And", op("And", counts, sound), op("Not", still))
     x = op("Where", counts, x, constant(0.0))
     if np.isfinite(data["reach"]):
         x = graph.between(x, constant(-data["reach"]), constant(data["reach"]))
-    middle, per_half = data["confines"]
     full, none = data["fades"]
-    beyond = op("Abs", op("Sub", theta, constant(middle[None])))
-    beyond = op("Mul", beyond, constant(per_half[None]))
-    beyond = op("ReduceMax", beyond, axes=[1], keepdims=1)
+    beyond = graph.distance(theta, *data["confines"])
     part = op("Div", op("Sub", constant(none), beyond), constant(none - full))
     return op("Mul", x, graph.between(part, constant(0.0), constant(1.0)))
 
