@@ -192,7 +192,11 @@ class Task:
         W = 2 * self.problem.stage_matrix
         slopes = np.concatenate([thetas, inputs], axis=-1) @ W + self.problem.stage_slope
         curved = np.broadcast_to(W, (*inputs.shape[:2], *W.shape))
-        prices = [self._mixed_penalty(thetas, inputs)] if len(self.problem.mixed.F) else []
+        prices = []
+        if len(self.problem.mixed.F):
+            over = mixed_beyond(self.problem.deviations, thetas, inputs, -INSIDE)
+            rows = self.problem.bounded["mixed"].rows / mixed_half(self.problem)[:, None]
+            prices.append(self._squares(over, rows))
         prices += [self.doubt.slopes(thetas, inputs)] if self.doubt is not None else []
         for slope, more in prices:
             slopes = slopes + slope
@@ -209,12 +213,6 @@ class Task:
         """Return gradient (..., n) and curvature (..., n, n) of what is beyond bounds."""
         scaled = self._bounds.C / self._bounds.half[:, None]
         return self._squares(self._bounds.beyond(thetas, -INSIDE), scaled)
-
-    def _mixed_penalty(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
-        """Return the same by theta and u (..., n_theta + m) of what is beyond MixedBounds."""
-        over = mixed_beyond(self.problem.deviations, thetas, inputs, -INSIDE)
-        scaled = self.problem.bounded["mixed"].rows / mixed_half(self.problem)[:, None]
-        return self._squares(over, scaled)
 
     def _squares(self, over: Array, rows: Array) -> tuple[Array, Array]:
         weight = 2 * self.weight

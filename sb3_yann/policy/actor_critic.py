@@ -6,7 +6,7 @@ Actions are in [-1, 1]. Stable-Baselines3 gives them units, in its `unscale_acti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from sb3_yann._validation import (
     check_number,
     check_options,
     check_positive,
+    check_type,
     warn,
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
@@ -74,11 +75,9 @@ class CriticOptions:
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, CRITICS)
-        if self.prediction_model is not None and not callable(self.prediction_model):
-            raise TypeError(
-                f"prediction_model = {self.prediction_model!r} must be a function of tensors "
-                "(theta, u) that returns the next theta, or None for the linear model."
-            )
+        wanted = "a function of tensors (theta, u) that returns the next theta, or None for the "
+        wanted += "linear model"
+        check_type("prediction_model", self.prediction_model, Callable | None, wanted)
         if self.prediction_model is not None and self.kind == "state_action":
             raise ValueError("prediction_model is for kind='afterstate', not for 'state_action'.")
         if self.value_scale is not None:

@@ -135,17 +135,17 @@ class Explores(StartsAsMPC):
     def says_that_it_explores(self) -> None:
         """Warn once where nothing says that the plant is a simulator, and no guard is at work."""
         algorithm = self._algorithm
-        if self.explored or algorithm is None or algorithm.policy is not self:
+        told = self.explored or self.simulator or self.guarded
+        if told or algorithm is None or algorithm.policy is not self:
             return
-        if not self.simulator and not self.guarded:
-            self.explored = True
-            name = type(algorithm).__name__
-            warn(
-                f"{name} explores: it draws its actions, {100 * self.initial_std:.3g} % of the "
-                "input range around the policy's at first, limits or not, and nothing confirms "
-                "what it learns. That belongs into a simulator, with an ImprovementGuard among "
-                "the callbacks. If this env is one: policy_kwargs={'simulator': True}.",
-            )
+        self.explored = True
+        warn(
+            f"{type(algorithm).__name__} explores: it draws its actions, "
+            f"{100 * self.initial_std:.3g} % of the input range around the policy's at first, "
+            "limits or not, and nothing confirms what it learns. That belongs into a simulator, "
+            "with an ImprovementGuard among the callbacks. If this env is one: "
+            "policy_kwargs={'simulator': True}.",
+        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         given = super()._get_constructor_parameters().items()

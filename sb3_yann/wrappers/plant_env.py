@@ -198,8 +198,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         observer: StateEstimator | None = None,
         substeps: int = 10,
     ) -> None:
-        if not callable(f):
-            raise TypeError(f"f = {f!r} must be a function (x, u) -> dx/dt.")
+        check_type("f", f, Callable, "a function (x, u) -> dx/dt")
         check_type("mpc", mpc, LinearMPC, "a LinearMPC")
         layout = mpc.layout
         x_ss = mpc.model.x_ss
