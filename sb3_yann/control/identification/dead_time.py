@@ -71,12 +71,14 @@ def _explained(regressors: Array, column: int, target: Array) -> float:
     return float(np.sum(explained / np.maximum(sizes[:-1] * sizes[-1], np.finfo(float).tiny)))
 
 
-def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]:
+def with_memory(episodes: Sequence[Episode], delays: Sequence[int]) -> list[Episode]:
     """Return the episodes with the last inputs, newest first, appended to the states.
 
     ``delays`` says how many of each input. Episodes shorter than the longest dead time fall out.
     """
     longest = max(delays)
+    if not longest:
+        return [*episodes]
     extended = []
     for episode in episodes:
         rows = len(episode) + 1 - longest

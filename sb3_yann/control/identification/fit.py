@@ -60,8 +60,15 @@ def fit_log(
     log = log.with_all_states()
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
     require_moving(log.episodes)
-    episodes, delays = _delayed([*log.episodes], delay)
-    n, m, d = episodes[0].sizes
+    _, m, d = log.sizes
+    delays = as_delays(delay, m)
+    if delays is None:
+        delays = found_delays([*log.episodes], m)
+    if not (episodes := with_memory(log.episodes, delays)):
+        raise ValueError(
+            f"delay = {delay!r}, but no episode has more than {max(delays)} steps: record longer."
+        )
+    n = episodes[0].sizes[0]
     if x_ss is not None and any(delays):
         if u_ss is None:
             raise ValueError(
@@ -129,10 +136,9 @@ def _require_excited(found: Regression, episodes: list[Episode], n: int, m: int)
     x, u, d = np.split(np.concatenate([each.regressors for each in episodes]), [n, n + m], axis=1)
     known = np.column_stack([np.ones(len(x)), x, d])
     share = np.mean(project_out(known, u) ** 2, axis=0) / np.maximum(np.var(u, axis=0), 1e-300)
-    own = slice(n, n + m)
     # Within three standard errors an effect may be none.
     unsure = np.abs(found.coefficients) < 3.0 * found.standard_errors
-    tied = within_rounding(known, u) & (share < TIED) & np.all(unsure[:, own], axis=0)
+    tied = within_rounding(known, u) & (share < TIED) & np.all(unsure, axis=0)[n : n + m]
     if tied.any():
         raise ValueError(
             f"u[{np.argmax(tied)}] is a function of the states, to within their rounding, and what "
@@ -174,24 +180,6 @@ def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
             x = found.predict(np.hstack([x, episode.driven[k : k + starts]]))
         guesses.append(x)
     return missed([each.states[steps:] for each in episodes], guesses, found.reached.size)[1]
-
-
-def _delayed(
-    episodes: list[Episode], delay: int | str | Sequence[int]
-) -> tuple[list[Episode], list[int]]:
-    """Return the episodes with past inputs as states, and the dead times."""
-    m = episodes[0].sizes[1]
-    delays = as_delays(delay, m)
-    if delays is None:
-        delays = found_delays(episodes, m)
-    if not any(delays):
-        return episodes, delays
-    extended = with_memory(episodes, delays)
-    if not extended:
-        raise ValueError(
-            f"delay = {delay!r}, but no episode has more than {max(delays)} steps: record longer."
-        )
-    return extended, delays
 
 
 REPEATED_SHARE = 0.05  # of all rows: so many repeated readings of one sensor are too many

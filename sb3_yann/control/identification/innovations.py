@@ -98,12 +98,9 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
     """Return how many lags, by Akaike's criterion, and the ARX model with them."""
     width = episodes[0].regressors.shape[1]
     q = episodes[0].states.shape[1]
-    steps = sum(map(len, episodes))
-
-    def rows(lags: int) -> int:
-        return sum(max(len(each) - lags + 1, 0) for each in episodes)
-
-    tried = [p for p in LAGS if rows(p) > max(3 * p * width + 10, steps / 2)] or [1]
+    sizes = np.array([*map(len, episodes)])
+    rows = {p: np.maximum(sizes - p + 1, 0).sum() for p in LAGS}
+    tried = [p for p in LAGS if rows[p] > max(3 * p * width + 10, sizes.sum() / 2)] or [1]
 
     def criterion(p: int) -> float:
         found = arx(episodes, p, tried[-1] - 1)
@@ -209,7 +206,7 @@ class Past:
         x = np.concatenate([each[:, :n] for each in self.states])
         y = np.concatenate([each.states[1:] for each in self.rows])
         q = y.shape[1]
-        driven = self.width - y.shape[1]
+        driven = self.width - q
         C = np.linalg.lstsq(x, y - self.arx.reached, rcond=None)[0].T
         moves = [
             Episode(state[:, :n], each.driven[1:, :driven], each.states[1:-1])
@@ -506,11 +503,8 @@ def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Arra
     cross = K @ noise
     for k, step in enumerate(moved):
         left = outputs[k] - model.y_0 - C @ x[k]
-        if model.sparse:
+        if model.sparse or (P is None and whole[k]):
             x[k + 1] = A @ x[k] + step + K @ np.where(there[k], left, 0.0)
-            continue
-        if P is None and whole[k]:
-            x[k + 1] = A @ x[k] + step + K @ left
             continue
         P = np.zeros_like(A) if P is None else P
         seen = there[k]

@@ -127,10 +127,7 @@ RIDGES = 10.0 ** np.arange(-9, 0)  # ridges that are tried, relative to the numb
 
 
 def regularized(
-    found: Regression,
-    fitted: list[Episode],
-    tested: list[Episode],
-    origin: Array | None,
+    found: Regression, fitted: list[Episode], tested: list[Episode], origin: Array | None
 ) -> tuple[Regression, float, list[str]]:
     """Return the fit, its ridge and notes; a log that is not weak has none.
 
@@ -225,7 +222,7 @@ def _root(covariance: Array) -> Array:
     return np.asarray((scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T)
 
 
-def pole_note(values: Array, errors: Array, noise: str = "process noise") -> str:
+def pole_note(values: Array, errors: Array, noise: str) -> str:
     """Return the 95 % intervals of poles in words, one of each complex pair."""
     words = []
     open_ends = 0
@@ -237,13 +234,9 @@ def pole_note(values: Array, errors: Array, noise: str = "process noise") -> str
         known = f"{value.real:.4g}{imaginary} within {width:.2g}"
         words.append(known if width < WIDE else f"{value.real:.4g}{imaginary}, hardly known")
         open_ends += bool(abs(value) < 1 <= abs(value) + width)
-    text = f"Poles with 95 % confidence, under {noise}: {'; '.join(words)}."
-    if open_ends:
-        text += (
-            f" {open_ends} that decay in the model may be unstable in the plant, as far as the log "
-            "shows."
-        )
-    return text
+    unsure = f" {open_ends} that decay in the model may be unstable in the plant, as far as the log"
+    unsure = f"{unsure} shows." * bool(open_ends)
+    return f"Poles with 95 % confidence, under {noise}: {'; '.join(words)}.{unsure}"
 
 
 EXTRAPOLATED = 5.0  # spreads from the mean of the data beyond which a model is extrapolated

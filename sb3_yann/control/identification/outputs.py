@@ -26,11 +26,7 @@ from sb3_yann.control.identification.innovations import (
     with_lags,
 )
 from sb3_yann.control.identification.least_squares import NOT_EXCITED
-from sb3_yann.control.identification.residuals import (
-    TIED,
-    project_out,
-    within_rounding,
-)
+from sb3_yann.control.identification.residuals import TIED, project_out, within_rounding
 from sb3_yann.log import Episode, split_episodes
 
 RUN_AHEAD = 20  # samples of the free runs over held-out data
@@ -99,12 +95,13 @@ def delayed(
     return [Search(read, tested, lags, tries) for lags in dict.fromkeys((trials[0], trials[best]))]
 
 
-def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, float]]:
+def feedback(episodes: Sequence[Episode]) -> list[tuple[int, float]]:
     """Return the inputs that follow earlier outputs, and what share of them does not.
 
     ValueError for an input that is a function of earlier outputs and inputs alone, all as rounded.
     """
     no_move = 1e-12
+    lags = 4  # earlier samples of which an input may be a function
     q, m, d = episodes[0].sizes
     width = q + m + d
     rows = [each.regressors for each in with_lags(episodes, lags + 1, lags)]
@@ -119,8 +116,7 @@ def feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, floa
     own = np.column_stack([np.ones(len(now)), past[:, 1:, q : q + m].reshape(len(now), -1)])
     known = np.hstack([own, past[..., :q].reshape(len(now), -1)])
     alone = np.mean(project_out(own, now) ** 2, axis=0)
-    rest = project_out(known, now)
-    left = np.mean(rest**2, axis=0) / np.maximum(alone, no_move)
+    left = np.mean(project_out(known, now) ** 2, axis=0) / np.maximum(alone, no_move)
     moves = alone > no_move  # of scaled inputs
     tied = moves & ((left < no_move) | (within_rounding(known, now) & (left < TIED)))
     if tied.any():

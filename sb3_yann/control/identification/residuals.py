@@ -35,10 +35,8 @@ def features(regressors: Array) -> Array:
     spread = np.sqrt(np.mean(regressors**2, axis=0))
     z = regressors / np.where(spread > 0, spread, 1.0)
     room = k // 4 - p - 1  # steps for each feature, at least: with fewer the features fit anything
-    kept = 0
     # 12: main components, at most: a long log with many states must not take minutes
-    while kept < min(p, 12) and (kept + 1) * (kept + 4) / 2 <= room:
-        kept += 1
+    kept = sum((i + 1) * (i + 4) / 2 <= room for i in range(min(p, 12)))
     if not kept:
         return np.zeros((k, 0))
     left, sizes, _ = np.linalg.svd(z, full_matrices=False)
@@ -61,7 +59,7 @@ def curvature_test(found: Regression, episodes: list[Episode]) -> tuple[Array, A
     before = project_out(known, residuals)
     after = project_out(np.column_stack([known, added]), residuals)
     q = added.shape[1]
-    free = len(now) - known.shape[1] - added.shape[1]
+    free = len(now) - known.shape[1] - q
     size = np.sum(before**2, axis=0)
     rest = np.sum(after**2, axis=0)
     real = size > 1e-20 * np.sum(reached**2, axis=0)
@@ -86,9 +84,10 @@ def within_rounding(known: Array, now: Array) -> NDArray[np.bool_]:
     """
     law = np.linalg.lstsq(known, now, rcond=None)[0]
     rest = now - known @ law
-    steps = (np.diff(np.unique(each)) for each in np.hstack([now, known]).T)
-    least = np.array([min(each, default=0.0) for each in steps])
-    fine, coarse = np.split(least, [now.shape[1]])
+    fine, coarse = (
+        np.array([min(np.diff(np.unique(each)), default=0.0) for each in of.T])
+        for of in (now, known)
+    )
     grain: Array = np.sqrt((fine**2 + coarse**2 @ law**2) / 12)
     small = np.all(np.abs(rest) < 6 * grain, axis=0) & (np.std(rest, axis=0) < 1.5 * grain)
     return np.asarray(small)
@@ -168,10 +167,18 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     # Below it, all is rounding.
     floor = 1e-9 * np.mean(target_left**2, axis=0) + 1e-20 * np.mean(target**2, axis=0)
     floor += np.finfo(float).tiny
-    parts = np.array_split(np.arange(steps), FOLDS)
 
     def left(*groups: Array) -> Array:
-        return np.asarray(_held_out(np.column_stack([plain, *groups]), target_left, parts) + floor)
+        """Return mean squared errors (n,) of a least-squares fit, each part left out once."""
+        basis = np.column_stack([plain, *groups])
+        scale = np.linalg.norm(basis, axis=0)
+        basis = basis / np.where(scale > 0, scale, 1.0)
+        squares = np.zeros(n)
+        for part in np.array_split(np.arange(steps), FOLDS):
+            fitted = np.delete(basis, part, axis=0), np.delete(target_left, part, axis=0)
+            coefficients = np.linalg.lstsq(*fitted, rcond=1e-11)[0]
+            squares += np.sum((target_left[part] - basis[part] @ coefficients) ** 2, axis=0)
+        return np.asarray(squares / steps + floor)
 
     squares = features(now - center)
     lagged = [
@@ -184,18 +191,6 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     on_their_way = [past[lag][:, n + j] for j, delay in enumerate(delays) for lag in range(delay)]
     late = left(squares, *on_their_way)
     return Leftover(left(), left(squares), each_order[best], left(squares, lagged[best]), late)
-
-
-def _held_out(basis: Array, values: Array, parts: list[NDArray[np.int64]]) -> Array:
-    """Return mean squared errors (n,) of a least-squares fit, each part left out once."""
-    scale = np.linalg.norm(basis, axis=0)
-    basis = basis / np.where(scale > 0, scale, 1.0)
-    squares = np.zeros(values.shape[1])
-    for part in parts:
-        fitted = np.delete(basis, part, axis=0), np.delete(values, part, axis=0)
-        coefficients = np.linalg.lstsq(*fitted, rcond=1e-11)[0]
-        squares += np.sum((values[part] - basis[part] @ coefficients) ** 2, axis=0)
-    return np.asarray(squares / len(values))
 
 
 LONG_PREDICTION = 10  # steps of the longer prediction whose fit is stated

@@ -15,8 +15,22 @@ from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.log import Arrays, Log
 
 
+class OfLog(ReadOnlyArrays):
+    """What was fitted to a log: a ``model``, and how well it fits, which may be NaN."""
+
+    model: LinearModel
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def report(self) -> str:
+        """Return an account in words, that of the model: poles, controllability, fit and notes."""
+        return self.model.report()
+
+    __str__ = report
+
+
 @dataclass(frozen=True, eq=False)
-class Identified(ReadOnlyArrays):
+class Identified(OfLog):
     """A model fitted to data by :func:`identify`, and its uncertainty.
 
     Attributes
@@ -61,15 +75,6 @@ class Identified(ReadOnlyArrays):
     ten_step_fit: Array
     excitation: float
     delays: tuple[int, ...]
-    # fits may be NaN
-    __eq__ = object.__eq__
-    __hash__ = object.__hash__
-
-    def report(self) -> str:
-        """Return an account in words, that of the model."""
-        return self.model.report()
-
-    __str__ = report
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
         """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E".

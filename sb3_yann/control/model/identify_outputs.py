@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_range, warn
+from sb3_yann._validation import Array, check_array, check_int, check_range, warn
 from sb3_yann.control.gains import CURVED, Gains
 from sb3_yann.control.identification.dead_time import (
     as_delays,
@@ -38,13 +38,14 @@ from sb3_yann.control.identification.outputs import (
 )
 from sb3_yann.control.identification.residuals import curvature_test, listed, listed_errors
 from sb3_yann.control.linear_system import names
+from sb3_yann.control.model.identify import OfLog
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.observer import StateEstimator
 from sb3_yann.log import Arrays, Episode, Log
 
 
 @dataclass(frozen=True, eq=False)
-class IdentifiedOutputs(ReadOnlyArrays):
+class IdentifiedOutputs(OfLog):
     """A model in innovation form, fitted to outputs by :func:`identify_outputs`.
 
     In deviations from the operating point, ``x[k+1] = A x[k] + B u[k] + E d[k] + K e[k]`` and
@@ -94,15 +95,6 @@ class IdentifiedOutputs(ReadOnlyArrays):
     start: tuple[Array, Array]
     drift: Array
     every: tuple[int, ...] = ()
-    # fits may be NaN
-    __eq__ = object.__eq__
-    __hash__ = object.__hash__
-
-    def report(self) -> str:
-        """Return an account in words: poles, controllability, sampling, fit and notes."""
-        return self.model.report()
-
-    __str__ = report
 
     def predict(
         self,
@@ -138,13 +130,11 @@ class IdentifiedOutputs(ReadOnlyArrays):
             raise ValueError(f"ahead = {ahead}, but the record has {len(u)} steps.")
         driven = np.hstack([model.B, model.E])
         rest = model.x_ss - model.A @ model.x_ss - driven @ np.append(model.u_ss, model.d_ss)
-        C = model.shown
-        none = np.zeros(len(C))
+        c = rest + self.drift
+        none = np.zeros(len(self.noise))
         sparse = any(each > 1 for each in self.every)
-        whole = Innovations(
-            model.A, driven, self.gain, C, rest + self.drift, none, self.noise, sparse
-        )
-        return predicted(whole, Episode(y, u, d), self.start, ahead)
+        parts = model.A, driven, self.gain, model.shown, c, none, self.noise
+        return predicted(Innovations(*parts, sparse), Episode(y, u, d), self.start, ahead)
 
     def estimator(self) -> StateEstimator:
         """Return the Kalman filter of this model, in deviations, for `wrappers.EstimateState`."""
@@ -267,9 +257,12 @@ def identify_outputs(
     drift = step.predict(np.concatenate([system.x_ss, system.u_ss, system.d_ss])[None])[0]
     A, B, E, C, K = _with_memory(model, m, found.delays)
     errors = np.zeros((4, *B.shape))
+    own = names((n,))
     if np.array_equal(model.C, np.eye(q, n)):  # the first states are the outputs
         errors[:, :q] = gain_errors[..., :m] * scale[:q, None] / scale[q : q + m]
-    state_names = _state_names(log, model, found.delays)
+        own[:q] = log.state_names or own[:q]
+    state_names = [*own, *memory_labels(found.delays, log.input_names or names((0, m)))]
+    state_names *= bool(log.state_names or any(found.delays))
     told = _notes(log, found, search.past, plain, model, follows, (values, doubts))
     named = *state_names, *log.input_names, *log.disturbance_names
     whole = LinearModel(
@@ -289,9 +282,8 @@ def identify_outputs(
         C=C,
         time_unit=log.time_unit,
     )
-    late = np.repeat(np.arange(m), found.delays)
-    mean = np.append(start[0], plain.center[q : q + m][late])
-    memory = np.diag(plain.spread[q : q + m][late] ** 2)
+    late = q + np.repeat(np.arange(m), found.delays)
+    memory = np.diag(plain.spread[late] ** 2)
     return IdentifiedOutputs(
         model=whole,
         gain=K,
@@ -301,7 +293,7 @@ def identify_outputs(
         one_step_fit=found.fits[0],
         long_fit=found.fits[1],
         excitation=plain.excitation,
-        start=(mean, linalg.block_diag(start[1], memory)),
+        start=(np.append(start[0], plain.center[late]), linalg.block_diag(start[1], memory)),
         every=log.every,
         drift=np.append(drift - system.x_ss, np.zeros(len(late))),
     )
@@ -331,10 +323,8 @@ def _in_plant_units(
     # 1e3: condition number of C up to which outputs serve as states
     if n >= q and sizes[-1] * 1e3 > sizes[0]:
         T = np.vstack([C, linalg.null_space(model.C).T])
-    back = np.linalg.inv(T)
-    C = C @ back
-    if not np.array_equal(T, np.eye(n)):
         C = np.eye(q, n)
+    back = np.linalg.inv(T)
     shift = np.linalg.lstsq(C, rest, rcond=None)[0]
     A = T @ model.A @ back
     B = T @ model.B / driven
@@ -362,27 +352,14 @@ def _with_memory(
     """Return A, B, E, C and K with the inputs on their way as the last states."""
     n = model.order
     late = sum(delays)
-    q = len(model.C)
     A: Array = linalg.block_diag(model.A, np.zeros((late, late)))
-    B: Array = np.zeros((n + late, m))
+    B, E = np.split(np.pad(model.B, [(0, late), (0, 0)]), [m], axis=1)
     waits = np.array(delays) > 0
     A[:n, (n - 1 + np.cumsum(delays))[waits]] = model.B[:, :m][:, waits]
-    B[:n, ~waits] = model.B[:, :m][:, ~waits]
+    B[:, waits] = 0.0
     A, B = exact_memory(A, B, delays, n)
-    E = np.vstack([model.B[:, m:], np.zeros((late, model.B.shape[1] - m))])
-    C = np.hstack([model.C, np.zeros((q, late))])
-    return A, B, E, C, np.vstack([model.K, np.zeros((late, q))])
-
-
-def _state_names(log: Log, model: Innovations, delays: Sequence[int]) -> Sequence[str]:
-    """Return names of the states where outputs have some, or inputs are on their way."""
-    q, m, _ = log.sizes
-    if not log.state_names and not any(delays):
-        return ()
-    own = names((model.order,))
-    if log.state_names and np.array_equal(model.C, np.eye(q, model.order)):
-        own[:q] = log.state_names
-    return [*own, *memory_labels(delays, log.input_names or names((0, m)))]
+    C = np.pad(model.C, [(0, 0), (0, late)])
+    return A, B, E, C, np.pad(model.K, [(0, late), (0, 0)])
 
 
 def _notes(

@@ -206,10 +206,9 @@ def _gains(model: LinearSystem) -> list[str]:
             gains.beside, NORMAL * gains.beside_errors, np.zeros_like(gains.degrees), clearer
         )
     if np.any(width):
-        unsure = np.argwhere((np.abs(values) <= width) & (width > 0))
         none = ", ".join(
             f"{inputs[j]} on {states[i]}{', its rate' * bool(gains.degrees[i, j])}"
-            for i, j in unsure
+            for i, j in np.argwhere((np.abs(values) <= width) & (width > 0))
         )
         noise = "process noise" if model.C is None else "process and sensor noise"
         text = f" Not distinguishable from zero: {none}." if none else ""
