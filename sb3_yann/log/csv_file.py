@@ -75,11 +75,8 @@ class CsvFile:
         if not len(table):
             raise ValueError(f"{self.path} has no rows below its header.")
         for name, column in zip(names, table.T, strict=True):
-            words = Counter(
-                text for row in self.rows if _is_word(text := (row[name] or "").strip())
-            )
-            for blank in ("", "nan", "NaN"):
-                words.pop(blank, None)
+            cells = ((row[name] or "").strip() for row in self.rows)
+            words = Counter(x for x in cells if _is_word(x) and x not in ("", "nan", "NaN"))
             shown = ", ".join(f"{word!r} in {count:,} rows" for word, count in words.most_common(3))
             if words and not np.isfinite(column).any():
                 raise ValueError(f"{self.path}: {name} is {shown}, and never a number.")

@@ -62,14 +62,13 @@ class Log:
     def __repr__(self) -> str:
         """Return how much there is of what."""
         names = self.state_names, self.input_names, self.disturbance_names
+        given = zip(self.sizes, ("state", "input", "disturbance"), names, strict=True)
         columns = [
-            f"{size} {what}{'s' * (size > 1)}{' (' * bool(of)}{', '.join(of)}{')' * bool(of)}"
-            for size, what, of in zip(
-                self.sizes, ("state", "input", "disturbance"), names, strict=True
-            )
+            f"{size} {what}{'s' * (size > 1)}" + f" ({', '.join(of)})" * bool(of)
+            for size, what, of in given
             if size
         ]
-        steps = sum(len(each) for each in self.episodes)
+        steps = sum(map(len, self.episodes))
         dt = f"{self.dt:g} {self.time_unit}".rstrip()
         lost = f"; {self.lost_steps} steps at gaps left out" if self.lost_steps else ""
         return (
@@ -96,8 +95,7 @@ class Log:
     def in_names(self, text: str) -> str:
         """Return a text with the log's names: see :func:`in_names`."""
         shown = self.state_names
-        own = {"u": self.input_names, "d": self.disturbance_names}
-        return in_names(text, x=shown, y=shown, **own)
+        return in_names(text, x=shown, y=shown, u=self.input_names, d=self.disturbance_names)
 
     @property
     def every(self) -> tuple[int, ...]:
@@ -115,12 +113,8 @@ class Log:
     def cut(self, steps: int) -> Log:
         """Return the log in pieces of at most so many steps: a long record as many episodes."""
         check_int("steps", steps, 2)
-        parts = [
-            each.part(first, min(first + steps, len(each)))
-            for each in self.episodes
-            for first in range(0, len(each), steps)
-        ]
-        return replace(self, episodes=tuple(parts))
+        starts = [(each, k) for each in self.episodes for k in range(0, len(each), steps)]
+        return replace(self, episodes=tuple(each.part(k, k + steps) for each, k in starts))
 
     def with_all_states(self) -> Log:
         """Return the log cut where a state is not read.
@@ -209,10 +203,8 @@ class Log:
         episodes = _cut(records, _read_now_and_then(records), on_time)
         kept = sum(map(len, episodes))
         if not kept:
-            which = f"; never read: {', '.join(empty)}" if empty else ""
-            raise ValueError(
-                f"The log has no two samples in a row with all that is to be read{which}."
-            )
+            words = "The log has no two samples in a row with all that is to be read"
+            raise ValueError(f"{words}; never read: {', '.join(empty)}." if empty else f"{words}.")
         return cls(tuple(episodes), dt, lost_steps=sum(map(len, records)) - kept, **names)
 
     @classmethod
