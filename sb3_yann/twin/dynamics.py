@@ -33,10 +33,10 @@ class Residual:
     def polynomial(cls, L: Array, b: Array | None = None, Q: Array | None = None) -> Residual:
         """Return ``z L + b + z' Q z`` for L (k, n), b (n,) and a symmetric Q (k, k, n)."""
         k, n = L.shape
-        hidden = np.zeros((k, 0)), np.zeros((1, 0)), np.zeros((0, 0)), np.zeros((1, 0))
+        hidden = [np.zeros(size) for size in ((k, 0), (1, 0), (0, 0), (1, 0), (0, n))]
         constant = np.zeros(n) if b is None else b
         quadratic = np.zeros((k, k, n)) if Q is None else Q
-        return cls([*hidden, np.zeros((0, n)), constant[None], L, quadratic.reshape(k, k * n)])
+        return cls([*hidden, constant[None], L, quadratic.reshape(k, k * n)])
 
     @classmethod
     def of_basis(cls, weights: Array, k: int, constant: bool) -> Residual:
@@ -169,11 +169,10 @@ def _turns(episodes: Sequence[Array]) -> Array | None:
 def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
     """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
     law = problem.law()
-    m = problem.model.n_inputs
 
     def act(rows: Array) -> Array:
         finite = np.isfinite(rows).all(axis=1)
-        u = np.full((len(rows), m), np.nan)
+        u = np.full((len(rows), problem.model.n_inputs), np.nan)
         u[finite] = law(rows[finite])
         return u
 

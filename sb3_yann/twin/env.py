@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -132,8 +132,7 @@ class Starts:
         n = len(self.low)
         k = len(self.first)
         away = np.abs(thetas[..., :n] - (self.high + self.low) / 2)
-        half = np.ptp(self.first[:, :n], axis=0) / 2
-        rho = (away / np.maximum(half, 1e-300)).max(axis=-1)
+        rho = (away / np.maximum(np.ptp(self.first[:, :n], axis=0) / 2, 1e-300)).max(axis=-1)
         return np.asarray(2 / (k + 1) * ((1 + np.maximum(rho, 1.0)) / 2) ** (1.0 - k))
 
 
@@ -249,7 +248,7 @@ class TwinEnv(gym.Env[Single, Single]):
         members = self.dynamics.members
         drawn = int(self.np_random.integers(len(members)))
         acting = drawn if seed is None else seed % len(members)
-        self._acting = Dynamics(problem, self.dynamics.coordinates, (members[acting],))
+        self._acting = replace(self.dynamics, members=(members[acting],))
         self._episode = self.model.episodes[int(self.np_random.integers(len(self.model.episodes)))]
         row = self.dynamics.row
         first = self._episode.thetas[0].copy()

@@ -81,8 +81,7 @@ class _Replays:
             np.repeat(each[:, None], self.members, axis=1) for each in (self.rows[:-1], self.inputs)
         )
         with np.errstate(all="ignore"):
-            steps = map(self.dynamics.step, rows, inputs)
-            predicted = np.stack([*steps])
+            predicted = np.stack([*map(self.dynamics.step, rows, inputs)])
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
         self.weights = None
@@ -181,8 +180,7 @@ class _Replays:
             z = basis[:, k]
             e = self.errors[:, k]
             weights.append(_ridge(z[fit], e[fit]))
-            short = _ridge(z[fit][:, :plain], e[fit])
-            rests = e - z @ weights[-1], e - z[..., :plain] @ short
+            rests = e - z @ weights[-1], e - z[..., :plain] @ _ridge(z[fit][:, :plain], e[fit])
             left += [np.sum((each[test] / self.units) ** 2) for each in rests]
         # 0.02: share of the errors of one step that it must explain on held-out episodes
         self.explains = bool(left[0] < (1 - 0.02) * left[1])
@@ -299,9 +297,8 @@ def _changed(
     count = changes.shape[1]
     # Most of a gain or a loss may lie in few starts: weights at random (Rubin, Ann. Stat. 9,
     # 1981), as far out as brings normal changes to what is likely of them.
-    rng = np.random.default_rng(0)
-    # 10_000: of the weights of episodes or starts: fifty lie beyond the farthest end, at .5 %
-    weights = rng.dirichlet(np.full(count, independent / count), 10_000)
+    # 10_000: fifty of the weights lie beyond the farthest end, at .5 %
+    weights = np.random.default_rng(0).dirichlet(np.full(count, independent / count), 10_000)
     cost = np.maximum(weights @ size.mean(axis=0), 1e-300)
     drawn = weights @ changes.mean(axis=0) / cost - about
     out = stats.norm.cdf(likely[0] * np.sqrt((1 + 1 / independent) / (1 - 1 / count)))

@@ -272,8 +272,6 @@ class PlantTwin(LearntModel):
     def env(self) -> TwinEnv:
         """Return a Gymnasium env with the twin's dynamics and the plant's spaces.
 
-        The seed of an episode decides which member acts: seed modulo members.
-
         Raises
         ------
         UntrustedTwinError

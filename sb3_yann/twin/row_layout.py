@@ -62,8 +62,7 @@ class RowLayout:
         told = self.hidden or (isinstance(found, DisturbanceObserver) and found.C.shape == (n, n))
         matrices = [found.gain[:n]] if self.hidden else [found.gain[:n], found.C]
         # 1e10: condition number from which on a matrix is not inverted
-        determined = told and max(map(np.linalg.cond, matrices)) < 1e10
-        return found if determined else None
+        return found if told and max(map(np.linalg.cond, matrices)) < 1e10 else None
 
     @property
     def is_estimate(self) -> bool:

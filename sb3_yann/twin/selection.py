@@ -71,8 +71,7 @@ def fit_family(coordinates: Coordinates, log: Sequence[Episode], seed: int) -> l
     numbers (P. Bojanowski et al., *Optimizing the latent space of generative networks*, ICML 2018).
     """
     names = [e.seed if e.seed is not None else -1 - i for i, e in enumerate(log)]
-    number = np.unique(names, return_inverse=True)[1]
-    of_row = np.repeat(number, [*map(len, log)])
+    of_row = np.repeat(np.unique(names, return_inverse=True)[1], [*map(len, log)])
     pairs = [_pair(coordinates, log)]
     generator = th.Generator().manual_seed(seed)
     least = FLOAT32_ROUNDING * coordinates.units
@@ -267,8 +266,7 @@ class _Networks:
 def _network(weights: Sequence[th.Tensor], z: th.Tensor) -> th.Tensor:
     """Return what networks of standardized z (..., batch, k) are, (..., batch, n)."""
     W1, b1, W2, b2, W3, b3, L = weights
-    first = th.tanh(z @ W1 + b1)
-    return th.tanh(first @ W2 + b2) @ W3 + b3 + z @ L
+    return th.tanh(th.tanh(z @ W1 + b1) @ W2 + b2) @ W3 + b3 + z @ L
 
 
 def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
@@ -345,7 +343,6 @@ def ridge(
     z, y = _pair(coordinates, episodes)
     problem = coordinates.row.problem
     (count, k) = z.shape
-    n = y.shape[1]
     constant = bool(problem.layout.has_constants) or any(each.drifts for each in settings)
     F = basis(z, constant, max(each.degree for each in settings))
     gram = F.T @ F
@@ -355,7 +352,7 @@ def ridge(
         weight = shrinkage_of(each, problem, k)
         size = len(weight)
         matrix = linalg.cho_factor(gram[:size, :size] + count * np.diag(weight))
-        about = np.zeros((size, n))
+        about = np.zeros((size, y.shape[1]))
         if each.gain is not None:
             j, times = each.gain
             at = k - problem.model.n_inputs + j
@@ -375,12 +372,10 @@ def basis(z: Array, constant: bool, degree: int) -> Array:
 def shrinkage_of(setting: Setting, problem: LinearMPC, k: int) -> Array:
     """Return the weight (f,) of each squared coefficient of a basis of k features."""
     inputs = np.arange(k) >= k - problem.model.n_inputs
-    products = inputs[np.triu_indices(k)[1]] if setting.degree > 1 else inputs[:0]
-    first, second = (
-        setting.shrinkage * np.where(of, setting.factor, 1.0) for of in (inputs, products)
-    )
+    weight = setting.shrinkage * np.where(inputs, setting.factor, 1.0)
+    products = weight[np.triu_indices(k)[1]] if setting.degree > 1 else weight[:0]
     constant = [1e-9] * int(problem.layout.has_constants or setting.drifts)
-    return np.concatenate([first, constant, second]) + 1e-12
+    return np.concatenate([weight, constant, products]) + 1e-12
 
 
 def candidates(
@@ -430,8 +425,7 @@ class FreeRuns:
         scores = FreeRuns(self.horizons, self.by_episode[first:, known]).scores
         best = int(np.argmin(scores.mean(axis=1)))
         behind = scores - scores[best]
-        error = behind.std(axis=1, ddof=1) / np.sqrt(behind.shape[1])
-        near = behind.mean(axis=1) <= error
+        near = behind.mean(axis=1) <= behind.std(axis=1, ddof=1) / np.sqrt(behind.shape[1])
         near[best] = True
         return first + int(np.argmax(near))
 
@@ -480,13 +474,13 @@ def judges(
     # Around such a gain a log is fitted with little shrinkage, but of its inputs.
     others = [Setting(degree, 1e-3, 1e3, gain) for gain in gains]
     fits = [ridge(coordinates, each, others) for each in without_each_fold(parts)]
-    rivals = [Candidate("", tuple(fit[i] for fit in fits)) for i in range(len(others))]
-    worse = surely_worse(held_out(coordinates, parts, rivals).scores - scores)
-    found = [Judge(Dynamics(problem, coordinates, chosen.by_fold))]
-    for rival, (j, times), wrong in zip(rivals, gains, worse, strict=True):
-        says = f"a gain of {names[j]} {times:g} times the model's, which the log allows"
-        found.append(Judge(Dynamics(problem, coordinates, rival.by_fold), says, bool(wrong)))
-    return tuple(found)
+    rivals = [
+        Candidate(f"a gain of {names[j]} {times:g} times the model's, which the log allows", fitted)
+        for (j, times), fitted in zip(gains, zip(*fits, strict=True), strict=True)
+    ]
+    worse = surely_worse(held_out(coordinates, parts, rivals).scores - scores).tolist()
+    every = zip([replace(chosen, name=""), *rivals], [False, *worse], strict=True)
+    return tuple(Judge(Dynamics(problem, coordinates, e.by_fold), e.name, bad) for e, bad in every)
 
 
 def reidentified(

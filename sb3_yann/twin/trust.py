@@ -79,9 +79,8 @@ class Trust:
 def relative_error(predicted: Array, actual: Array) -> float:
     """Return the root mean square error relative to the mean; inf where there is nothing."""
     if not len(actual):
-        return float("inf")
-    scale = max(float(np.abs(actual).mean()), 1e-300)
-    return float(np.sqrt(np.mean((predicted - actual) ** 2)) / scale)
+        return np.inf
+    return float(np.sqrt(np.mean((predicted - actual) ** 2)) / max(np.abs(actual).mean(), 1e-300))
 
 
 def costs_of(problem: LinearMPC, episode: Episode) -> float:
@@ -183,22 +182,19 @@ def evidence(
     problem = dynamics.problem
     coordinates = dynamics.coordinates
     states = [each.thetas[:, coordinates.row.state] for each in log]
-    standing = []
-    for h in runs.horizons:
-        moves = [(x[h:] - x[:-h]) / coordinates.units for x in states]
-        standing.append(np.sqrt(np.mean(np.concatenate(moves) ** 2)))
+    moves = [np.concatenate([x[h:] - x[:-h] for x in states]) for h in runs.horizons]
+    still = np.array([np.sqrt(np.mean((each / coordinates.units) ** 2)) for each in moves])
     logged = Logged(coordinates, log, units_confirmed)
     inputs = logged.excitation, np.std(logged.inputs, axis=0) / problem.u_half
     theta = np.concatenate([each.thetas[:, : problem.n_theta] for each in log])
     room = FLOAT32_ROUNDING * problem.theta_half
-    low = problem.deviations.theta_min - room
-    high = problem.deviations.theta_max + room
-    shares = np.mean((theta < low) | (theta > high), axis=0) * (not logged.made_by_law.all())
+    own = problem.deviations
+    outside = (theta < own.theta_min - room) | (theta > own.theta_max + room)
+    shares = outside.mean(axis=0) * (not logged.made_by_law.all())
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names, input_names = labels_of(problem.model)
     independent = sum(len(each[::2]) for each in records(problem, log))
     more = partial(more_of, problem, log)
-    still = np.array(standing)
     problems, advice = judge(runs, still, costs, inputs, independent, beyond, input_names, more)
     if problem.layout.n_previous:
         held = np.concatenate([each.thetas[1:, problem.layout.previous] for each in log])
