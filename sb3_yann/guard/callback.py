@@ -31,13 +31,7 @@ from sb3_yann.guard.start import (
     warn_of_place,
     warn_of_rare_trials,
 )
-from sb3_yann.guard.state import (
-    Decision,
-    GuardState,
-    Record,
-    restore_accepted,
-    summary_of,
-)
+from sb3_yann.guard.state import Decision, GuardState, Record, restore_accepted, summary_of
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import require_same_statistics
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
@@ -202,11 +196,7 @@ class ImprovementGuard(BaseCallback):
         check_int("n_eval_episodes", n_eval_episodes)
         check_int("n_new_starts", n_new_starts, 0)
         n_final = 10 * n_new_starts if n_final_starts is None else n_final_starts
-        check_int("n_final_starts", n_final, 0)
         check_int("seed", seed, 0)
-        check_int("eval_freq", eval_freq)
-        check_int("patience", patience)
-        check_bool("keep_if_worse", keep_if_worse)
         self.env = env
         self.step_size = check_options("step_size", step_size, StepSize)
         self.log_path = None if log_path is None else Path(log_path)
@@ -215,10 +205,10 @@ class ImprovementGuard(BaseCallback):
             env=name_of(env),
             seeds=range(seed, seed + n_eval_episodes),
             n_new_starts=n_new_starts,
-            n_final_starts=n_final,
-            eval_freq=eval_freq,
-            patience=patience,
-            keep_if_worse=keep_if_worse,
+            n_final_starts=check_int("n_final_starts", n_final, 0),
+            eval_freq=check_int("eval_freq", eval_freq),
+            patience=check_int("patience", patience),
+            keep_if_worse=check_bool("keep_if_worse", keep_if_worse),
             rule=check_options("rule", rule, AcceptanceRule),
         )
 
@@ -298,9 +288,8 @@ class ImprovementGuard(BaseCallback):
         if not goes_on:
             player.max_input_step = None
             evidence, leading, refusals = first_evidence(player, settings, known)
-            state = GuardState(
-                settings.of_evidence, evidence, player.max_input_step, offset=player.offset
-            )
+            state = GuardState(settings.of_evidence, evidence, player.max_input_step)
+            state.offset = player.offset
             if known is not None:  # other starts or another plant: what was decided stays
                 state.decisions = [*known.decisions]
                 state.episodes = known.episodes
@@ -391,12 +380,11 @@ class ImprovementGuard(BaseCallback):
         shown = {name: getattr(decision, name) for name in names}
         for who, change in zip(("candidate", "accepted"), decision.changes, strict=True):
             shown[f"{who}_change_percent"] = 100 * change
+        shown["rejected"] = sum(each.verdict == "rejected" for each in state.decisions)
+        shown["accepted"] = len(state.decisions) - shown["rejected"]
         for name, value in shown.items():
             if math.isfinite(value):  # that of a candidate that could not be played is not
                 logger.record(f"guard/{name}", value)
-        rejected = sum(each.verdict == "rejected" for each in state.decisions)
-        logger.record("guard/rejected", rejected)
-        logger.record("guard/accepted", len(state.decisions) - rejected)
         logger.dump(self.model.num_timesteps)  # as EvalCallback does, or the next would replace it
         if self.verbose:
             print(decision)

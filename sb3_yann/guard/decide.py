@@ -435,11 +435,10 @@ def _what_acts(evidence: Evidence, tried: ActorCheckpoint) -> str:
 class Player:
     """Plays checkpoints in the guard's simulator; the policy stays as it is.
 
-    Inputs may move by ``max_input_step`` (m,) from one sample to the next. To the cost of
-    an episode ``offset`` is added, what that of the reward takes from one of the MPC's. Whether its
-    env
-    ``pays_cost`` of the problem, as the policy scales it, is known once the MPC has played. Once
-    Ctrl-C has restored the accepted policy, it is ``interrupted``, and restores nothing else.
+    Inputs may move by ``max_input_step`` (m,) from one sample to the next. To the cost of an
+    episode ``offset`` is added, what that of the reward takes from one of the MPC's. Whether its
+    env ``pays_cost`` of the problem, as the policy scales it, is known once the MPC has played.
+    Once Ctrl-C has restored the accepted policy, it is ``interrupted``, and restores nothing else.
     ``steps`` are those of the simulator that all episodes took.
     """
 

@@ -35,12 +35,11 @@ def first_evidence(
     Return the evidence, the checkpoint to go on from, and decisions on what is refused. The hard
     starts of an earlier run stay.
     """
-    present = ActorCheckpoint.of(player.policy)
-    candidates = [present]
+    candidates = [ActorCheckpoint.of(player.policy)]
     hard = list[int]()
     next_seed = settings.seeds.stop
     if known is not None:
-        candidates = [known.accepted, present]
+        candidates.insert(0, known.accepted)
         next_seed = max(known.evidence.next_seed, next_seed)
         hard = sorted({*known.evidence.starts.seeds} - {*known.settings["seeds"], *settings.seeds})
     seeds = (*hard, *settings.seeds)
@@ -99,8 +98,7 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
         space: Any = player.policy.action_space
         rounding = COST_ROUNDING * (space.high - space.low)
         player.max_input_step = np.asarray(settings.rule.max_input_step * most + rounding)
-    offset = player.policy.critic_options.reward_offset
-    player.offset = offset * float(np.median(mpc.lengths))
+    player.offset = player.policy.critic_options.reward_offset * float(np.median(mpc.lengths))
     return player.scores(mpc)
 
 
@@ -145,8 +143,8 @@ def still_holds(evidence: Evidence, player: Player) -> bool:
     starts = evidence.starts
     some = np.unique(np.linspace(0, len(evidence.scores.costs) - 1, 5).astype(int))
     expected = evidence.scores.at(some)
+    seeds = [starts.seeds[i] for i in some]
     try:
-        seeds = [starts.seeds[i] for i in some]
         again = player.scores(player.episodes(evidence.accepted, seeds))
     except Unplayable:
         return False

@@ -73,10 +73,9 @@ class Evidence:
         if len(known) < len(self.starts.mpc.costs[usual]):
             known = self.starts.mpc.costs[usual] if self.reference is None else self.reference
         own = known[: len(costs)]
-        size = np.abs(own).sum()
-        if len(costs) == len(known) or not size:
-            return float(costs.mean()), len(costs)
-        mean = known.mean() + (costs - own).sum() / size * np.abs(known).mean()
+        mean = costs.mean()
+        if len(costs) < len(known) and (size := np.abs(own).sum()):
+            mean = known.mean() + (costs - own).sum() / size * np.abs(known).mean()
         return float(mean), len(costs)
 
     def known_up_to(self, count: int, play: Play) -> Evidence:
@@ -171,11 +170,9 @@ class Decision:
 
     def __str__(self) -> str:
         """Return a line for a reader."""
-        reason = f" ({self.reason})" if self.reason else ""
-        names = ("candidate", "accepted policy", "MPC")
-        costs = zip(names, self.costs_in_words(), strict=True)
-        shown = ", ".join(f"{who} {cost}" for who, cost in costs)
-        return f"Episode {self.episode}: {self.verdict}{reason}; means of all starts: {shown}"
+        reason = f" ({self.reason})" * bool(self.reason)
+        costs = "candidate {}, accepted policy {}, MPC {}".format(*self.costs_in_words())
+        return f"Episode {self.episode}: {self.verdict}{reason}; means of all starts: {costs}"
 
     @property
     def changes(self) -> tuple[float, float]:
