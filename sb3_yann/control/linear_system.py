@@ -112,10 +112,10 @@ def _why_not_sampled(A: Array, dt: float) -> str:
             f"Sampled every dt = {dt:g}, the continuous model has entries that are too large for "
             "numbers. Give its states, inputs and disturbances other units."
         )
-    shown = pole if pole.imag else pole.real
+    pole = np.real_if_close(pole)
     return (
         f"The continuous model {'grows' if pole.real > 0 else 'decays'} too far within dt = {dt:g} "
-        f"to be sampled: its pole {shown:g} times dt is {shown * dt:g}. Look at the unit of time, "
+        f"to be sampled: its pole {pole:g} times dt is {pole * dt:g}. Look at the unit of time, "
         f"sample about every {1 / abs(pole):.2g}, or leave the mode out of the model."
     )
 

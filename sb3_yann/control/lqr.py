@@ -91,9 +91,8 @@ def spectral_radius(matrix: Array) -> float:
 def long_horizon(A: Array, horizon: int) -> str:
     """Return in words what loses digits: a horizon and the fastest pole."""
     poles = np.linalg.eigvals(A)
-    pole = poles[np.argmax(np.abs(poles))]
-    shown = pole if pole.imag else pole.real
-    return f"With horizon = {horizon} and the pole {shown:.6g} of the model"
+    pole = np.real_if_close(poles[np.argmax(np.abs(poles))])
+    return f"With horizon = {horizon} and the pole {pole:.6g} of the model"
 
 
 def unreached(A: Array, B: Array) -> complex | None:
@@ -117,9 +116,9 @@ def _why_no_solution(A: Array, B: Array) -> str:
         )
     pole = unreached(A, B)
     if pole is not None:
-        shown = pole if pole.imag else pole.real
         return (
-            f"The model has an unstable mode that no input reaches: eigenvalue {shown:.6g} of "
+            "The model has an unstable mode that no input reaches: eigenvalue "
+            f"{np.real_if_close(pole):.6g} of "
             "sqrt(gamma) A. Remove the mode from the model, add an input, lower gamma, or take "
             "another steady state: model.report() names those that were found."
         )

@@ -94,7 +94,7 @@ def _best(
     low = known - floats[1] * (1 + abs(known))
     tied = False
     for i in range(whole[2]):
-        smallest = np.inf
+        smallest = np.inf  # `_slack` written out: as a call it takes a third longer
         for k in range(whole[HEADER + i], whole[HEADER + i + 1]):
             row = ROWS + k * (n + 1)
             slack = floats[row + n]

@@ -66,8 +66,7 @@ def _solve_lower(factor: Array, size: int, solution: Array) -> None:
 @compiled()
 def _slacks(d: Array, gram: Array, active: Integers, lam: Array, size: int, slack: Array) -> None:
     """Write the slacks; those of the active set are 0."""
-    for j in range(len(d)):
-        slack[j] = d[j]
+    slack[:] = d
     for i in range(size):
         row = active[i]
         for j in range(len(d)):
@@ -116,8 +115,7 @@ def _add(
         rest = 1.0 + extra[entering]
         for i in range(size):
             rest -= step[i] * step[i]
-        for i in range(size):
-            column[i] = step[i]
+        column[:size] = step[:size]
         _solve_upper(factor, size, step)
         most = np.inf
         leaving = -1
@@ -135,8 +133,7 @@ def _add(
             lam[i] = max(lam[i] - length * step[i], 0.0)
         own += length
         if full <= most:
-            for i in range(size):
-                factor[size, i] = column[i]
+            factor[size, :size] = column[:size]
             factor[size, size] = np.sqrt(rest)
             active[size] = entering
             lam[size] = own
@@ -237,14 +234,12 @@ def solve_batch(
     d = np.empty(rows)
     slack = np.empty(rows)
     for at in range(len(theta)):
-        for j in range(rows):
-            d[j] = d0[j]
+        d[:] = d0
         for i in range(theta.shape[1]):
             own = theta[at, i]
             for j in range(rows):
                 d[j] += own * D[i, j]
-        for j in range(rows):
-            slack[j] = d[j]
+        slack[:] = d
         least = np.abs(d).max() if soft else 0.0
         size = 0
         status[at] = UNCERTIFIED

@@ -23,6 +23,15 @@ SLACK_ROUNDING = 1e-14
 
 
 @compiled()
+def _dot(one: Array, other: Array) -> float:
+    """Return the product of two short vectors, for which calling a library takes longer."""
+    total = 0.0
+    for j in range(len(one)):
+        total += one[j] * other[j]
+    return total
+
+
+@compiled()
 def _hold(A: Array, W: Integers, first: int, k: int, Q: Array, R: Array) -> None:
     """Orthonormalize rows W[first:k] of A into Q, twice against rounding: A[W]' = Q'R."""
     n = A.shape[1]
@@ -33,27 +42,13 @@ def _hold(A: Array, W: Integers, first: int, k: int, Q: Array, R: Array) -> None
             R[i, j] = 0.0
         for _ in range(2):
             for i in range(j):
-                part = 0.0
-                for each in range(n):
-                    part += Q[i, each] * Q[j, each]
+                part = _dot(Q[i], Q[j])
                 R[i, j] += part
                 for each in range(n):
                     Q[j, each] -= part * Q[i, each]
-        length = 0.0
-        for each in range(n):
-            length += Q[j, each] ** 2
-        R[j, j] = np.sqrt(length)
+        R[j, j] = np.sqrt(_dot(Q[j], Q[j]))
         for each in range(n):
             Q[j, each] /= R[j, j]
-
-
-@compiled()
-def _dot(one: Array, other: Array) -> float:
-    """Return the product of two short vectors, for which calling a library takes longer."""
-    total = 0.0
-    for j in range(len(one)):
-        total += one[j] * other[j]
-    return total
 
 
 @compiled()
@@ -80,16 +75,11 @@ def _blocking(A: Array, slack: Array, d: Array, length: float, free: Integers) -
 
     A row along which d runs, to 1e-11 of its length, is not on the way.
     """
-    m, n = A.shape
     best = -1
     nearest = np.inf
     steepest = 0.0
-    for i in range(m):
-        if free[i] == 0:
-            continue
-        speed = 0.0
-        for j in range(n):
-            speed += A[i, j] * d[j]
+    for i in range(len(A)):
+        speed = _dot(A[i], d) if free[i] else 0.0
         if speed > 1e-11 * length:
             step = max(slack[i], 0.0) / speed
             if step < nearest * (1 - 1e-14) or (step <= nearest and speed > steepest):

@@ -16,10 +16,10 @@ def _solve(H: Array, held: Mask, right: Array) -> None:
     """
     m = len(H)
     A = H.copy()
-    for i in range(m):
-        for j in range(m):
-            if held[i] or held[j]:
-                A[i, j] = 1.0 if i == j else 0.0
+    for i in np.flatnonzero(held):
+        A[i] = 0.0
+        A[:, i] = 0.0
+        A[i, i] = 1.0
     for i in range(m):
         for j in range(i + 1, m):
             factor = A[j, i] / A[i, i]
