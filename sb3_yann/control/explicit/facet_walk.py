@@ -59,21 +59,9 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     return search.regions()
 
 
-@dataclass(frozen=True, eq=False)
-class CandidateRegion:
-    """A critical region with what lies across its facets.
-
-    There ``A theta <= b`` and ``U = law [theta; 1]``, with law (v, n + 1), and ``inside`` (n,) is a
-    point well inside. ``across`` are the active sets that share each facet if nothing degenerates,
-    an empty tuple where several constraints do, and None where nothing feasible lies beyond.
-    """
-
-    active: int
-    law: Array
-    A: Array
-    b: Array
-    inside: Array
-    across: list[tuple[int, ...] | None]
+Beyond = list[tuple[int, ...] | None]
+"""The active sets that share each facet of a region if nothing degenerates, an empty tuple where
+several constraints do, and None where nothing feasible lies beyond."""
 
 
 class _Walk:
@@ -82,25 +70,20 @@ class _Walk:
     def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
         self.timer = timer
         self.conditions = Conditions(program, timer)
-        self.found: dict[int, CandidateRegion] = {}
+        self.found: dict[int, Region] = {}
+        self.beyond: dict[int, Beyond] = {}
         self.visited: set[int] = set()
         self.random = np.random.default_rng(0)
 
     def regions(self) -> list[Region]:
-        kept = self.conditions.kept
-        rows = {each: tuple(kept[[*members_of(each)]].tolist()) for each in self.found}
+        """Return the regions, with the regions across their facets that were found too."""
+
+        def first(candidates: tuple[int, ...] | None) -> tuple[int, ...] | None:
+            known = (self.found[each] for each in candidates or () if each in self.found)
+            return next((one.active_set for one in known), None)
+
         return [
-            Region(
-                active_set=rows[active],
-                law=one.law,
-                A=one.A,
-                b=one.b,
-                inside=one.inside,
-                across=tuple(
-                    next((rows[other] for other in each or () if other in rows), None)
-                    for each in one.across
-                ),
-            )
+            replace(one, across=tuple(map(first, self.beyond[active])))
             for active, one in self.found.items()
         ]
 
@@ -121,24 +104,26 @@ class _Walk:
     def explore(self, wave: Iterable[int]) -> None:
         """Add all regions that are connected with those of some active sets."""
         ahead = sorted(set(wave) - self.visited)
-        facets: list[tuple[CandidateRegion, int]] = []
+        facets: list[tuple[int, int]] = []
         while ahead:
             self.visited.update(ahead)
             following: set[int] = set()
-            for one in self.conditions.regions(ahead):
+            for active, one, beyond in self.conditions.regions(ahead):
                 self.timer.count()
-                self.found[one.active] = one
-                facets += [(one, k) for k, each in enumerate(one.across) if each is not None]
-                following.update(*filter(None, one.across))
+                self.found[active] = one
+                self.beyond[active] = beyond
+                facets += [(active, k) for k, each in enumerate(beyond) if each is not None]
+                following.update(*filter(None, beyond))
             ahead = sorted(following - self.visited)
             if not ahead:  # the facets across which these sets have no region
                 left = [(pair, self._across(*pair)) for pair in facets]
                 ahead = sorted({active for _, active in left if active is not None})
                 facets = [pair for pair, active in left if active is not None]
 
-    def _across(self, one: CandidateRegion, row: int) -> int | None:
+    def _across(self, own: int, row: int) -> int | None:
         """Return the active set across a facet, None if it is known, or none is feasible there."""
-        across = one.across[row] or ()
+        one = self.found[own]
+        across = self.beyond[own][row] or ()
         known = any(active in self.found for active in across)
         if known and self.conditions.degenerate.isdisjoint(across):
             return None
@@ -258,8 +243,8 @@ class Conditions:
         multipliers = multipliers / self.units  # of rows of about unit length
         return as_bits(np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max())))
 
-    def regions(self, wave: list[int]) -> Iterator[CandidateRegion]:
-        """Yield the regions with an interior among those of some active sets."""
+    def regions(self, wave: list[int]) -> Iterator[tuple[int, Region, Beyond]]:
+        """Yield those of some active sets that have a region with an interior, and that region."""
         rows, v = self.N.shape
         width = v + self.outer_A.shape[1] + 1
         sizes = (active.bit_count() for active in wave)
@@ -268,7 +253,7 @@ class Conditions:
                 self.timer.tick(len(members) * effort_of_conditions(rows, v, size))
                 yield from self._regions([wave[i] for i in members], size)
 
-    def _regions(self, members: list[int], size: int) -> Iterator[CandidateRegion]:
+    def _regions(self, members: list[int], size: int) -> Iterator[tuple[int, Region, Beyond]]:
         factors, independent = self._factored(members, size)
         actives = [members[i] for i in np.flatnonzero(independent)]
         self.degenerate.update(members[i] for i in np.flatnonzero(~independent))
@@ -315,7 +300,12 @@ class Conditions:
                 pairs = zip(twins, shared, strict=True)
                 across = [each[0] if len(each) == 1 else both for each, both in pairs]
                 facets = facets[keep]
-            yield CandidateRegion(actives[i], laws[i], outer[facets], ends[facets], inside, across)
+            active_set = tuple(self.kept[index[i]].tolist())
+            yield (
+                actives[i],
+                Region(active_set, laws[i], outer[facets], ends[facets], inside),
+                across,
+            )
 
     def _factored(self, members: list[int], size: int) -> tuple[_Factors, NDArray[np.bool_]]:
         """Return the QR factors of active sets of independent constraints, and which are that."""
@@ -345,9 +335,7 @@ class Conditions:
         noise[each, index] = np.linalg.norm(factors.inverse, axis=2) * width
         return self.back @ (factors.Q @ W - self.Y), rows, noise
 
-    def _across(
-        self, active: int, added: NDArray[np.intp], factors: _Factors, i: int
-    ) -> list[tuple[int, ...] | None]:
+    def _across(self, active: int, added: NDArray[np.intp], factors: _Factors, i: int) -> Beyond:
         """Return the active sets beyond constraints, None where nothing feasible lies there.
 
         Of those that a constraint is made up of, one with a positive factor leaves.
@@ -355,7 +343,7 @@ class Conditions:
         index = factors.index[i]
         made_of = factors.NQ[i, added] @ factors.inverse[i].T * self.length[index]
         leaves = made_of > DEPENDENT * self.length[added, None]
-        found: list[tuple[int, ...] | None] = []
+        found: Beyond = []
         for k, leave in zip(added.tolist(), leaves, strict=True):
             flipped = active ^ (1 << k)
             exchanged = tuple(flipped ^ (1 << j) for j in index[leave].tolist())
