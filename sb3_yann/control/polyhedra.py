@@ -35,46 +35,34 @@ class Region:
         return largest_ball(self.A, self.b)
 
 
-def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
+def largest_ball(A: Array, b: Array, facet: int = -1) -> tuple[Array, float]:
     """Return center and radius (negative: none) of a bounded polyhedron or facet's largest ball."""
     from sb3_yann.control._kernels import polyhedra as kernels
 
     found: Array = np.empty(A.shape[1] + 1)
-    which = -1 if facet is None else facet
     no_facets = np.empty(0, dtype=np.int64)
-    done = kernels.bounded_region(*_contiguous(A, b), which, np.inf, found, no_facets)
+    done = kernels.bounded_region(*_contiguous(A, b), facet, np.inf, found, no_facets)
     if done != kernels.OPTIMAL:
-        rows = np.column_stack([A, np.ones(len(b))])
-        if facet is not None:
-            rows[facet, -1] = 0.0
+        rows = np.column_stack([A, np.arange(len(b)) != facet])
         found = _solve_lp(np.append(np.zeros(A.shape[1]), 1.0), rows, b, facet)
     return found[:-1], float(found[-1])
 
 
-def farthest_point(
-    A: Array, b: Array, direction: Array, inside: Array, seconds: float | None = None
+def farthest_points(
+    A: Array, b: Array, inside: Array, directions: Array, seconds: float | None = None
 ) -> Array:
-    """Return the point (n,) of a bounded polyhedron that is farthest in one direction.
-
-    ``inside`` (n,) is a point of it. Of a large polyhedron HiGHS is asked, which gives up after so
-    many seconds, and returns any point.
-    """
-    if seconds is not None or np.any(A @ inside > b):
-        return _solve_lp(direction, A, b, None, seconds)
-    return np.asarray(farthest_points(A, b, inside, direction[None])[0])
-
-
-def farthest_points(A: Array, b: Array, inside: Array, directions: Array) -> Array:
     """Return the points (k, n) of a bounded polyhedron that are farthest in directions (k, n).
 
-    ``inside`` (n,) is a point of it.
+    ``inside`` (n,) is a point of it. Of a large polyhedron HiGHS is asked, which gives up after so
+    many seconds for each, and returns any point.
     """
     from sb3_yann.control._kernels import polyhedra as kernels
 
     found = np.empty_like(directions)
-    directions = np.ascontiguousarray(directions)
-    if kernels.support(*_contiguous(A, b), inside, directions, found) != kernels.OPTIMAL:
-        found = np.array([_solve_lp(each, A, b, None) for each in directions])
+    rows = _contiguous(A, b)
+    along = np.ascontiguousarray(directions)
+    if seconds is not None or kernels.support(*rows, inside, along, found) != kernels.OPTIMAL:
+        found = np.array([_solve_lp(each, A, b, seconds=seconds) for each in along])
     return found
 
 
@@ -100,7 +88,7 @@ def bounded_region(
         # Without a facet the polyhedron would be larger.
         relaxed = slack.copy()
         relaxed[k] += radius
-        if A[k] @ _solve_lp(A[k], A, relaxed, None) > slack[k] + max(1e-6 * radius, 1e-13):
+        if A[k] @ _solve_lp(A[k], A, relaxed) > slack[k] + max(1e-6 * radius, 1e-13):
             bounding.append(k)
     return inside, radius, np.array(bounding, dtype=np.intp), True
 
@@ -124,7 +112,7 @@ def _contiguous(A: Array, b: Array) -> tuple[Array, Array]:
 
 
 def _solve_lp(
-    cost: Array, A: Array, b: Array, equal: int | None, seconds: float | None = None
+    cost: Array, A: Array, b: Array, equal: int = -1, seconds: float | None = None
 ) -> Array:
     """Return the largest ``cost x`` by HiGHS, for large programs and where our own search fails."""
     tied = np.arange(len(b)) == equal

@@ -28,7 +28,7 @@ from sb3_yann.control.polyhedra import (
     Region,
     bounded_region,
     equal_rows,
-    farthest_point,
+    farthest_points,
     largest_ball,
 )
 
@@ -212,9 +212,9 @@ class Conditions:
             self.timer.tick(effort)
             # Only HiGHS can be interrupted where a single program takes long.
             seconds = self.timer.left() if effort > 0.1 else None
-            found = farthest_point(rows[kept], limits[kept], direction, inside, seconds)
+            found = farthest_points(rows[kept], limits[kept], inside, direction[None], seconds)
             self.timer.tick()
-            return found
+            return np.asarray(found[0])
 
         self.middle = inside[v:]
         alive = np.ones(len(b), dtype=bool)
