@@ -216,8 +216,7 @@ def explained(gain: Array, rewards: Array, known: Mask) -> float:
     size = np.sqrt(np.sum(x**2) * np.sum(y**2))
     if np.abs(x).max() <= 1e-9 * np.abs(gain[known]).max():
         return 1.0
-    correlation = float(x @ y / size) if size > 0 else 0.0
-    return max(correlation, 0.0) ** 2
+    return max(float(x @ y / size), 0.0) ** 2 if size > 0 else 0.0
 
 
 Map = Callable[[Array], Array]  # from an observation to theta

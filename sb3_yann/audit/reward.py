@@ -313,6 +313,5 @@ class CostAudit(BaseCallback):
         try:
             require_frozen(normalize)
         except ValueError as error:
-            what = "reward" if normalize.norm_reward else "observation"
-            return f"normalized {what}", str(error)
+            return f"normalized {'reward' if normalize.norm_reward else 'observation'}", str(error)
         return "", ""

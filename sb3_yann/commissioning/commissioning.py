@@ -167,17 +167,20 @@ class Commissioning:
             size = float(np.max(np.abs(part[np.isfinite(part)]), initial=0.0)) or 1.0
             numbers[f"{i} in {size:.6e}"] = np.round(part / size, 7) + 0.0
         names = "batch", "excite", "shadow", "rounds", "updates", "seed"
-        begin = {
-            **{name: getattr(self, name) for name in names},
-            "max_correction": self.smallest,
-            "learner": f"{type(model).__name__} {self.policy.actor.net_arch}",
-            "problem": digest_of(numbers)[:16],
-            "largest": self.largest,
-        }
+        begin = {name: getattr(self, name) for name in names}
+        begin["max_correction"] = self.smallest
+        begin["learner"] = f"{type(model).__name__} {self.policy.actor.net_arch}"
+        begin["problem"] = digest_of(numbers)[:16]
+        begin["largest"] = self.largest
         self.journal = Journal(record, begin, CommissioningState(self._first_bound))
         if self.journal.batches:
-            with shown(self.progress_bar):
-                self._restore(self.journal.state)
+            state = self.journal.state
+            self._kept, self._acting = (self._loaded(each) for each in (state.kept, state.acting))
+            self.candidate = None if state.tried else self.candidate
+            self._show()
+            if state.twin is not None:
+                with shown(self.progress_bar):
+                    self._watch(self._fit(state.twin, state.twin_seed))
 
     @property
     def batches(self) -> list[Batch]:
@@ -235,7 +238,13 @@ class Commissioning:
                 verdict = f"The policy of {state.policy} surely costs less than the MPC, and acts."
             elif self.kept != "MPC":
                 verdict += f" That of {self.kept} surely costs less than the MPC, and is kept."
-            rows = rows_of_pairs(journal, self.policy.problem)
+            rows = {"change": "no pair of the policy on trial has been played yet"}
+            if journal.pairs:
+                problem = self.policy.problem
+                pays_own = pays_its_own(problem, journal.episodes)
+                both = (_costs(problem, e, pays_own) for e in zip(*journal.pairs, strict=True))
+                level = level_of_look(RULE.significance, len(journal.trial))  # over all looks
+                rows = paired_rows(*both, level=level, in_turns=True)
             verdict += " Costs above are means of each one's own episodes; only pairs compare them."
         played = journal.episodes
         ours = [each for each, by in zip(played, journal.by_policy, strict=True) if by]
@@ -353,10 +362,11 @@ class Commissioning:
             state = replace(state, kept=state.acting)
             text = f"{costs.difference.pairs} pairs show that it costs less. "
         verdict: Verdict = "stays" if state.is_kept else "the MPC acts"
-        if twin is None or not twin.trusted:
-            why = f"There are {len(self.journal.log)} episodes to learn from."
-            if twin is not None:
-                why = " ".join(["The twin is not trusted.", *twin.trust.problems])
+        if twin is None:
+            text += f"There are {len(self.journal.log)} episodes to learn from."
+            return state, verdict, text
+        if not twin.trusted:
+            why = " ".join(["The twin is not trusted.", *twin.trust.problems])
             return state, verdict, f"{text}{why}"
         state = replace(state, tried=True)
         wider = state
@@ -392,15 +402,6 @@ class Commissioning:
         units = self.policy.problem.units
         log = [(units.to_plant(e.thetas), units.input_to_plant(e.actions)) for e in episodes]
         return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
-
-    def _restore(self, state: CommissioningState) -> None:
-        """Restore the accepted policies, the twin and its watchdog as a record left them."""
-        self._kept, self._acting = (self._loaded(each) for each in (state.kept, state.acting))
-        if state.tried:
-            self.candidate = None
-        self._show()
-        if state.twin is not None:
-            self._watch(self._fit(state.twin, state.twin_seed))
 
     def _loaded(self, accepted: Accepted) -> Whole:
         if accepted.model is None:
@@ -460,8 +461,7 @@ def compare(
     both = [*zip(*journal.pairs, strict=True)]
     more = np.subtract(*(_costs(problem, each, pays_own) for each in both))
     if now is not None and not pays_own:
-        starts = np.subtract(*(predicted_costs(now, each, plant.mpc) for each in both))
-        varied = more - starts
+        varied = more - np.subtract(*(predicted_costs(now, each, plant.mpc) for each in both))
         more = varied if np.isfinite(varied).all() and varied.std() < more.std() else more
     return found._replace(difference=Difference.of(more, in_turns=True))
 
@@ -505,16 +505,6 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     hopeless = costs.difference.is_hopeless(RULE.least_gain * abs(costs.mpc))
     enough = costs.difference.pairs >= 10  # so many that show no gain end a trial
     return f"{costs.difference.pairs} pairs show no gain" if enough and hopeless else ""
-
-
-def rows_of_pairs(journal: Journal, problem: LinearMPC) -> dict[str, str]:
-    """Return what the pairs of the policy on trial cost, in words; the interval has all looks."""
-    if not journal.pairs:
-        return {"change": "no pair of the policy on trial has been played yet"}
-    pays_own = pays_its_own(problem, journal.episodes)
-    ours, its = (_costs(problem, each, pays_own) for each in zip(*journal.pairs, strict=True))
-    level = level_of_look(RULE.significance, len(journal.trial))
-    return paired_rows(ours, its, level=level, in_turns=True)
 
 
 def is_kept(costs: Costs) -> bool:

@@ -125,14 +125,6 @@ def _named(kind: type, event: Event) -> Event:
     return {name: math.nan if each is None else each for name, each in named.items()}
 
 
-def _as_episode(event: Event) -> PlantEpisode:
-    named = _named(PlantEpisode, event)
-    for name in ("thetas", "actions"):
-        named[name] = np.array(named[name], float)
-    named["alarm"] = None if event["alarm"] is None else Alarm(**event["alarm"])
-    return PlantEpisode(**named)
-
-
 Verdict = Literal["accepted", "stays", "the MPC acts", "begins anew"]
 NOT_DYNAMICS = ("not a number", "violation")  # alarms that say nothing of how the plant moves
 
@@ -349,7 +341,10 @@ class Journal:
         elif event["event"] == "episode":
             if event["number"] != len(self.episodes):
                 raise ValueError("the episode before it is missing")
-            self.episodes.append(_as_episode(event))
+            named = _named(PlantEpisode, event)
+            named |= {name: np.array(named[name], float) for name in ("thetas", "actions")}
+            named["alarm"] = None if event["alarm"] is None else Alarm(**event["alarm"])
+            self.episodes.append(PlantEpisode(**named))
             self.by_policy.append(event["acts"] != "MPC")
             self._open = ""
         else:

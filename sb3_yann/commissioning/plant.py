@@ -152,8 +152,7 @@ class Plant:
                 if not np.isfinite(read).all():
                     alarm = Alarm("not a number", f"It reads {self._not_finite(read)}.")
                 elif excess > limit:
-                    names = BoundNames.of(self.problem)
-                    why = names.in_words(float(beyond.worst), float(excess))
+                    why = BoundNames.of(self.problem).in_words(float(beyond.worst), float(excess))
                     alarm = Alarm("violation", f"On the plant {why}.")
                 elif forbidden:
                     why = "The plant reports a violation, or ends the episode."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +52,7 @@ class Bands:
         units = self.unseen.coordinates.units
         left = []
         for i, each in enumerate(log):
-            fit = self.unseen.members[i % FOLDS]
-            one = Dynamics(self.unseen.problem, self.unseen.coordinates, (fit,))
+            one = replace(self.unseen, members=(self.unseen.members[i % FOLDS],))
             after = one.step(each.thetas[None, :-1], each.actions[None])[0]
             left.append((each.thetas[1:] - after)[:, row.state])
         squares = np.sum([np.sum(each**2, axis=0) for each in left], axis=0)
@@ -167,7 +166,7 @@ class Watchdog:
         first = check_array("theta", theta, (dynamics.problem.n_theta,))
         n = dynamics.problem.model.n_states
         self.alarm = None
-        self._first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
+        self._first = replace(dynamics, members=dynamics.members[:1])
         self._row = dynamics.row.begin(first)
         self._charts: Array = np.zeros((2, len(CHART_GAINS), n))
         self._steps = 0
@@ -185,10 +184,8 @@ class Watchdog:
         if self.alarm is None:
             theta, u, after = (np.array(each, np.float64) for each in (theta, u, after))
             with np.errstate(all="ignore"):
-                found = self._seen(theta, u, after)
-            if found is not None:
-                kind, text = found
-                self.alarm = Alarm(kind, f"Step {self._steps}: {text}.")
+                if (found := self._seen(theta, u, after)) is not None:
+                    self.alarm = Alarm(found[0], f"Step {self._steps}: {found[1]}.")
         return self.alarm
 
     def _seen(self, theta: Array, u: Array, after: Array) -> tuple[str, str] | None:
@@ -225,10 +222,8 @@ class Watchdog:
         problem = self.dynamics.problem
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             name = problem.model.state_names[i] if problem.model.state_names else f"reading {i}"
-            text = (
-                f"{name} has been {problem.units.to_plant(reading)[i]:.6g} for {stands[i]} samples"
-            )
-            return "frozen sensor", f"{text}; the twin moves or the sensor is noisy"
+            text = f"{name} has been {problem.units.to_plant(reading)[i]:.6g} for {stands[i]}"
+            return "frozen sensor", f"{text} samples; the twin moves or the sensor is noisy"
         return None
 
     def _beyond(self) -> tuple[str, str] | None:
