@@ -1,4 +1,4 @@
-"""What is waited for, on stderr: nothing for three seconds, then a bar; in a file a few lines."""
+"""What is printed; what is waited for, on stderr: after three seconds a bar, in a file lines."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TextIO
 
 from tqdm import tqdm  # type: ignore[import-untyped]
 
@@ -21,6 +21,18 @@ FILE_INTERVAL = 30.0  # seconds without a line after which a bar leaves one in a
 
 _silent = ContextVar("silent", default="TQDM_DISABLE" in os.environ)
 _parts = ContextVar("parts", default=False)
+
+
+def say(text: object, file: TextIO | None = None) -> None:
+    """Print on stdout, or in a file: all of this package's lines. None of them ends a training.
+
+    Characters that the file's encoding lacks are escaped.
+    """
+    file = file or sys.stdout
+    encoding = getattr(file, "encoding", None) or "utf-8"
+    line = str(text).encode(encoding, "backslashreplace").decode(encoding)
+    with suppress(OSError, ValueError):  # a pipe whose reader has gone, a file that is closed
+        print(line, file=file)
 
 
 def is_watched() -> bool:
@@ -77,7 +89,7 @@ class _Lines:
         if text.strip() and (self.first or now >= _Lines.latest + self.interval):
             _Lines.latest = now
             self.first = False
-            print(text.strip(), file=sys.stderr)
+            say(text.strip(), sys.stderr)
 
     def flush(self) -> None:
         """Make it seen."""

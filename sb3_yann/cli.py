@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_yann import __version__
+from sb3_yann._progress import say
 from sb3_yann._validation import check_int, message_of
 
 
@@ -27,14 +28,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options.run(options)
     except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
+        say("Interrupted.", sys.stderr)
         return 130
     except Exception as error:
         if options.traceback:
             raise
         kind = "" if isinstance(error, OSError | TypeError | ValueError) else type(error).__name__
         message = f"{kind}{': ' * bool(kind)}{message_of(error)}"
-        print(f"sb3-yann {options.command}: {message}", file=sys.stderr)
+        say(f"sb3-yann {options.command}: {message}", sys.stderr)
         return 1
     return 0
 
@@ -124,10 +125,10 @@ def _solve(options: Namespace) -> None:
             raise FileNotFoundError(f"There is no folder {path.parent}: make it first.")
     problem = _problem(options.problem)
     law = problem.explicit(time_limit=options.time_limit, region_limit=options.region_limit)
-    print(problem.report())
+    say(problem.report())
     if options.save:
         law.save(options.save)
-        print(f"Written: {options.save}")
+        say(f"Written: {options.save}")
 
 
 def _evaluate(options: Namespace) -> None:
@@ -140,7 +141,7 @@ def _evaluate(options: Namespace) -> None:
     model.policy.limit_correction(0.0)  # what is left is the MPC
     mpc = evaluation.evaluate(model, options.env, seeds)
     title = f"{options.episodes} episodes from seed {options.seed}: the MPC, and {options.model}"
-    print(evaluation.comparison_table(title, mpc, policy))
+    say(evaluation.comparison_table(title, mpc, policy))
 
 
 def _plot(options: Namespace) -> None:
@@ -148,14 +149,14 @@ def _plot(options: Namespace) -> None:
 
     figure = new_figure()
     _law(options.law).plot(figure.subplots(), entries=tuple(options.axes))
-    print(f"Written: {save_figure(figure, options.picture, dpi=150)}")
+    say(f"Written: {save_figure(figure, options.picture, dpi=150)}")
 
 
 def _report(options: Namespace) -> None:
     from sb3_yann import report as write
 
     seeds = _seeds(options.episodes)
-    print(f"Written: {write(_model(options.model), options.page, env=options.env, seeds=seeds)}")
+    say(f"Written: {write(_model(options.model), options.page, env=options.env, seeds=seeds)}")
 
 
 def _export(options: Namespace) -> None:
@@ -172,7 +173,7 @@ def _export(options: Namespace) -> None:
         checks=_checks(options.checks),
         estimator=options.estimator,
     )
-    print(f"Written: {written}")
+    say(f"Written: {written}")
 
 
 def _commission(options: Namespace) -> None:
@@ -189,10 +190,10 @@ def _commission(options: Namespace) -> None:
         verbose=1,
     )
     found.run(options.batches)
-    print(found.report())
+    say(found.report())
     if options.save:
         model.save(options.save)
-        print(f"Written: {options.save}")
+        say(f"Written: {options.save}")
 
 
 # ---- What an argument stands for ----

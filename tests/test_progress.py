@@ -10,7 +10,7 @@ from numba.core.dispatcher import Dispatcher
 
 from fresh_process import run_python
 from sb3_yann import _progress
-from sb3_yann._progress import Progress, bar, is_watched, shown
+from sb3_yann._progress import Progress, bar, is_watched, say, shown
 from sb3_yann.control._kernels import law, online, polyhedra
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
 from sb3_yann_envs import cstr
@@ -84,6 +84,15 @@ def test_lines_name_the_time_the_steps_and_what_is_left(clock, capsys) -> None:
     assert capsys.readouterr().err == (
         "[    5 s     1,234 steps, about 20 s more if all is needed] a round is over\n"
     )
+
+
+def test_a_line_that_cannot_be_printed_as_it_is_ends_nothing(monkeypatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, "ascii", write_through=True))
+    say("3 °C")
+    assert written.getvalue() == b"3 \\xb0C\n"
+    sys.stdout.close()
+    say("nobody reads this")
 
 
 def test_false_silences_all_that_is_called(clock, capsys) -> None:

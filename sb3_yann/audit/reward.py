@@ -9,6 +9,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._progress import say
 from sb3_yann._validation import Array, check_bool, check_int, check_positive, warn
 from sb3_yann.audit.meaning import CostMismatchError, CostMismatchWarning, warn_of_order
 from sb3_yann.policy.observations import require_frozen
@@ -256,7 +257,7 @@ class CostAudit(BaseCallback):
         self.finding = CostFinding(not cause, cause, message, *line, count)
         if not cause:
             if self.verbose:
-                print(f"Cost audit: {message}")
+                say(f"Cost audit: {message}")
         elif self.strict:
             raise CostMismatchError(message)
         else:

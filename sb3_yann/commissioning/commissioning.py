@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import digest_of
-from sb3_yann._progress import bar, shown
+from sb3_yann._progress import bar, say, shown
 from sb3_yann._validation import Array, Feedback, check_bool, check_int, check_range, check_type
 from sb3_yann.audit.meaning import explained
 from sb3_yann.commissioning.journal import (
@@ -341,7 +341,7 @@ class Commissioning:
         self.candidate = None if state.tried else self.candidate
         self._watch(twin)
         if self.verbose:
-            print(self.journal.report().splitlines()[-1])
+            say(self.journal.report().splitlines()[-1])
 
     def _judge(
         self, state: CommissioningState, costs: Costs, twin: PlantTwin | None, number: int

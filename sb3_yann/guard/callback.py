@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
+from sb3_yann._progress import say
 from sb3_yann._validation import check_bool, check_int, check_options, check_range, warn
 from sb3_yann.audit.reward import CostAudit
 from sb3_yann.compare import AcceptanceRule
@@ -387,7 +388,7 @@ class ImprovementGuard(BaseCallback):
                 logger.record(f"guard/{name}", value)
         logger.dump(self.model.num_timesteps)  # as EvalCallback does, or the next would replace it
         if self.verbose:
-            print(decision)
+            say(decision)
         if self._record is not None:
             self._record.write(state.decisions)
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from threadpoolctl import threadpool_limits
 
-from sb3_yann._progress import Progress, shown
+from sb3_yann._progress import Progress, say, shown
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.compare import RULE, TOO_LITTLE
 from sb3_yann.control import LinearMPC, StateEstimator
@@ -376,7 +376,7 @@ def improve(
             found = Improvement(tuple(work.checks), 0.0, False, note="Ctrl-C ended the search")
             if simulator := work.say.simulator:
                 found = replace(found, where="the simulator", steps=simulator.steps)
-            print(found, file=sys.stderr)
+            say(found, sys.stderr)
             raise
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from sb3_yann._progress import Progress, shown
+from sb3_yann._progress import Progress, say, shown
 from sb3_yann._validation import Array, check_int, check_type
 from sb3_yann.compare import less_safe
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
@@ -362,8 +362,8 @@ class _Search:
             note = f"max_steps = {self.simulator.max_steps:,} were too few to go on."
         except KeyboardInterrupt:
             if hasattr(self, "base"):
-                print("Interrupted; of what was played so far:", file=sys.stderr)
-                print(self.figures(""), file=sys.stderr)
+                say("Interrupted; of what was played so far:", sys.stderr)
+                say(self.figures(""), sys.stderr)
             raise
         finally:
             self.simulator.close()
