@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
+from os import PathLike
+from pathlib import Path
 from typing import Any, TypeVar
 from unicodedata import category
 
@@ -245,6 +248,22 @@ def check_choice(name: str, value: Any, options: Sequence[str]) -> str:
     if not isinstance(value, str) or value not in options:
         raise ValueError(f"{name} = {_short(value)} must be one of {tuple(options)}.")
     return value
+
+
+def check_path(name: str, value: str | PathLike[str] | None) -> Path | None:
+    """Return ``value`` as a path, None for None; ValueError where no file can have that name."""
+    if value is None:
+        return None
+    try:
+        os.lstat(Path(value))
+    except OSError:  # it is not there yet
+        pass
+    except ValueError as error:
+        raise ValueError(
+            f"{name} = {value!r} can be no file of this computer ({error}). Give it a name without "
+            "such characters; where the locale lacks them, PYTHONUTF8=1 has them all."
+        ) from error
+    return Path(value)
 
 
 def check_type(name: str, value: Kind, kind: Any, wanted: str) -> Kind:

@@ -17,7 +17,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann._progress import say
-from sb3_yann._validation import check_bool, check_int, check_options, check_range, warn
+from sb3_yann._validation import (
+    check_bool,
+    check_int,
+    check_options,
+    check_path,
+    check_range,
+    warn,
+)
 from sb3_yann.audit.reward import CostAudit
 from sb3_yann.compare import AcceptanceRule
 from sb3_yann.env_pool import EnvPool, Source, as_source, name_of, require_like_training
@@ -190,9 +197,11 @@ class ImprovementGuard(BaseCallback):
                 "simulator use Commissioning (docs/improve.md)."
             )
         as_source(env)  # a name that cannot be imported is an error here
-        if log_path is not None and Path(log_path).is_dir():
+        self.log_path = check_path("log_path", log_path)
+        self.save_path = check_path("save_path", save_path)
+        if self.log_path is not None and self.log_path.is_dir():
             raise ValueError(f"log_path = {log_path!r} is a folder; name a file in it.")
-        if save_path is not None and Path(save_path).is_file():
+        if self.save_path is not None and self.save_path.is_file():
             raise ValueError(f"save_path = {save_path!r} is a file; name a folder.")
         check_int("n_eval_episodes", n_eval_episodes)
         check_int("n_new_starts", n_new_starts, 0)
@@ -200,8 +209,6 @@ class ImprovementGuard(BaseCallback):
         check_int("seed", seed, 0)
         self.env = env
         self.step_size = check_options("step_size", step_size, StepSize)
-        self.log_path = None if log_path is None else Path(log_path)
-        self.save_path = None if save_path is None else Path(save_path)
         self.settings = GuardSettings(
             env=name_of(env),
             seeds=range(seed, seed + n_eval_episodes),

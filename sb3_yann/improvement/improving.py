@@ -287,7 +287,8 @@ def improve(
         plant units where that is, or what the policy's ``observation`` makes theta of. The
         problem's stage cost counts, and no reward: a :class:`CostMismatchWarning` says where that
         is another one. A function or an id makes as many as are played side by side, a given env
-        is copied. The processes of a SubprocVecEnv play at once. Within
+        is copied, a VecEnv is not: in the model's own, `learn` begins new episodes afterwards. The
+        processes of a SubprocVecEnv play at once. Within
         ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, workers share the episodes.
     max_steps : int, optional
         Of a simulator, for everything. Where they do not suffice nothing is accepted; where they
@@ -362,6 +363,9 @@ def improve(
         if isinstance(twin, PlantTwin):
             require_problem_of_twin(policy, twin.problem)
             twin.require_trust()
+        own = model.get_env()
+        if isinstance(twin, VecEnv) and own is not None and own.unwrapped is twin.unwrapped:
+            model._last_obs = None  # the episodes under way are cut off: `learn` begins others
         work = _Work(policy, n_starts, rounds, updates, seed, _Progress(rounds), confine)
         try:
             if isinstance(twin, PlantTwin):
@@ -376,6 +380,8 @@ def improve(
             found = Improvement(tuple(work.checks), 0.0, False, note="Ctrl-C ended the search")
             if simulator := work.say.simulator:
                 found = replace(found, where="the simulator", steps=simulator.steps)
+                uncounted = ", and what its workers were playing is not counted" * simulator.shares
+                found = replace(found, note=found.note + uncounted)
             say(found, sys.stderr)
             raise
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
@@ -630,10 +636,11 @@ class _Work:
                 accepted = self._confirm(simulator, model, best)
         except OutOfStepsError:
             note = f"max_steps = {max_steps:,} are too few to go on, {simulator.steps:,} are taken"
-            needed = simulator.needed(most_episodes(self.rounds))
-            counts = f"; at best {simulator.needed(least):,}, for all rounds and tries {needed:,}"
+            needed = {"at best": least, "for all rounds and tries": most_episodes(self.rounds)}
+            steps = {words: simulator.needed(later) for words, later in needed.items()}
+            more = [f"{words} {n:,}" for words, n in steps.items() if n > simulator.counted.most]
             endless = ": an episode takes more, or has no end: wrap the env in a TimeLimit"
-            note += f"{counts} are needed" if needed else endless
+            note += f"; {', '.join(more)} are needed" if more else endless
         finally:
             simulator.close()
         change = self.checks[-1].change if accepted else 0.0

@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import gymnasium as gym
@@ -97,9 +98,10 @@ def _play_there(
     seeds: Sequence[int],
     problem: LinearMPC,
     count: _Count,
-) -> tuple[Trajectories, int]:
-    """Return episodes, and how many steps they took: in another process."""
-    with shown(False):  # many at once would write over each other
+) -> tuple[Trajectories | None, int]:
+    """Return episodes, None where steps do not suffice, and how many were taken, from a worker."""
+    played = None
+    with shown(False), suppress(OutOfStepsError):  # many bars would write over each other
         played = rollout(controller, lambda: _Counted(make(), count), seeds, problem=problem)
     return played, count.steps
 
@@ -109,7 +111,8 @@ class Simulator:
 
     It takes the problem's inputs in plant units, and ``observation`` makes theta of what it shows;
     by default it shows that. What is known of it is in ``episodes``, rows of the layout ``row``;
-    ``played`` of them took so many ``seconds``.
+    ``played`` of them took so many ``seconds``. While it ``shares`` a lot with workers, their steps
+    are not counted yet.
     """
 
     def __init__(
@@ -137,6 +140,7 @@ class Simulator:
         self.longest = 0
         self.episodes: list[Episode] = []
         self.rests_aside = False
+        self.shares = False
 
     def begin(self, later: int = 0) -> None:
         """Play the first episodes, of the MPC with and without random inputs; check the env.
@@ -245,8 +249,9 @@ class Simulator:
         jobs = 1 if alone else min(joblib.effective_n_jobs(None), len(seeds))
         if jobs > 1:
             parts = np.array_split(np.arange(len(seeds)), jobs)
-            found = joblib.Parallel()(
-                joblib.delayed(_play_there)(
+            tasks = [
+                partial(
+                    _play_there,
                     of_episode(controller, int(part[0])),
                     self.make,
                     [seeds[i] for i in part],
@@ -254,9 +259,17 @@ class Simulator:
                     _Count(np.floor(left * len(part) / len(seeds)), strict),
                 )
                 for part in parts
-            )
+            ]
+            self.shares = True
+            # Workers of "multiprocessing" are sent nothing else that holds a lambda.
+            sent = map(joblib.wrap_non_picklable_objects, tasks)
+            found = joblib.Parallel()(joblib.delayed(each)() for each in sent)
+            self.shares = False
             counted.steps += sum(steps for _, steps in found)
-            played = joined([part for part, _ in found])
+            complete = [part for part, _ in found if part is not None]
+            if len(complete) < jobs:
+                raise OutOfStepsError
+            played = joined(complete)
         else:
             counted.strict = strict
             played = rollout(controller, self.envs, seeds, problem=problem)

@@ -62,6 +62,8 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"rule": {"fresh": 3}}, TypeError, "rule has no 'fresh'. .* margin, cvar_alpha, by_region"),
     ({"step_size": {"shrink": 1.5}}, ValueError, "shrink = 1.5 must be between 0 and 1"),
     ({"step_size": {"grow": 0.9}}, ValueError, "grow = 0.9 must be a finite number of at least 1"),
+    ({"log_path": "\ud800.csv"}, ValueError, "csv' can be no file of this computer .'utf-8' codec"),
+    ({"save_path": "a\0"}, ValueError, "can be no file of this computer .embedded null"),
     ({"step_size": {"smallest": 2}}, ValueError, "smallest = 2 must be between 0 and 1"),
 ]
 

@@ -5,10 +5,11 @@ from functools import partial
 import joblib
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from improvement_samples import FEW, Spring, bits, model_of
-from sb3_yann import improve
+from sb3_yann import NoActionNoise, improve
 from sb3_yann.improvement.simulator import Excited, OutOfStepsError, Simulator, of_law
 
 SEEDS = range(5)
@@ -22,12 +23,14 @@ def same(ours, theirs) -> bool:
     )
 
 
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")
 def test_workers_of_joblib_play_the_same_episodes() -> None:
     problem = model_of().policy.problem
     alone, shared = (Simulator(problem, Spring, 0) for _ in range(2))
-    for controller in (of_law(problem), Excited(problem, 0)):
+    controllers = {"threading": of_law(problem), "multiprocessing": Excited(problem, 0)}
+    for backend, controller in controllers.items():
         ours = alone.play(controller, SEEDS)
-        with joblib.parallel_config("threading", n_jobs=2):  # processes: with dask, below
+        with joblib.parallel_config(backend, n_jobs=2):  # with dask, below
             theirs = shared.play(controller, SEEDS)
         assert same(ours, theirs)
         np.testing.assert_array_equal(ours.costs, theirs.costs)
@@ -41,6 +44,7 @@ def test_workers_take_no_step_more_than_is_left() -> None:
     simulator = Simulator(problem, Spring, 0, max_steps=99)
     with joblib.parallel_config("threading", n_jobs=2), pytest.raises(OutOfStepsError):
         simulator.play(of_law(problem), SEEDS)
+    assert simulator.steps == 59 + 39  # of the three episodes of one, and the two of the other
 
 
 @pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
@@ -66,6 +70,14 @@ def test_improve_finds_the_same_on_two_processes() -> None:
         assert other.checks == alone.checks and other.steps == alone.steps and alone.accepted
     assert bits(models[0]) == bits(models[1]) == bits(models[2])
     assert of_envs.source == "DummyVecEnv of 4"
+
+
+def test_in_the_model_s_own_envs_learning_begins_new_episodes() -> None:
+    envs = DummyVecEnv([Spring] * 2)
+    model = DDPG("YannPolicy", envs, device="cpu").learn(6, callback=NoActionNoise())
+    improve(model, envs, max_steps=25)  # an episode, and no more
+    model.learn(4, callback=NoActionNoise(), reset_num_timesteps=False)
+    assert [each.t for each in envs.envs] == [2, 2]
 
 
 @pytest.mark.slow
