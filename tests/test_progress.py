@@ -70,9 +70,7 @@ def test_a_terminal_gets_a_bar_that_goes_again(clock, monkeypatch) -> None:
     counted(clock, each=1.0)
     assert "\n" not in screen.getvalue() and "\rplans:  50%" in screen.getvalue()
     assert screen.getvalue().split("\r")[-2].strip() == ""
-
-
-def test_where_another_bar_has_taken_stderr_there_are_lines(monkeypatch) -> None:
+    # Where another bar has taken stderr there are lines.
     monkeypatch.setattr(sys, "stderr", Terminal())
     assert not is_watched()
 

@@ -220,6 +220,11 @@ class ImprovementGuard(BaseCallback):
             rule=check_options("rule", rule, AcceptanceRule),
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out of a copy what one `learn` shows, and what hears of its Ctrl-C."""
+        of_learn = {"locals", "globals", "_handler", "_audit"}
+        return {name: each for name, each in vars(self).items() if name not in of_learn}
+
     @property
     def state(self) -> GuardState:
         """What has been accepted, and on which evidence."""

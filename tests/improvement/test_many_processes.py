@@ -18,9 +18,7 @@ pytestmark = pytest.mark.usefixtures("brisk")
 
 def same(ours, theirs) -> bool:
     pairs = zip(ours.pairs, theirs.pairs, strict=True)
-    return all(
-        np.array_equal(a, b) for one, other in pairs for a, b in zip(one, other, strict=True)
-    )
+    return all(np.array_equal(*each) for both in pairs for each in zip(*both, strict=True))
 
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")
