@@ -38,7 +38,16 @@ def solve_explicit(
     none. Its errors are those of :meth:`LinearMPC.explicit`.
     """
     check_choice("solver", solver, ("walk", "ppopt"))
-    require_sane_sizes(program, u_min, u_max)
+    demanded = require_sane_sizes(program, u_min, u_max)
+    if np.any(demanded > 1e4):  # some regions are too thin for tolerances that are parts of a box
+        i = int(np.argmax(demanded))
+        raise ExplicitSolutionError(
+            f"theta_min[{i}] = {program.theta_min[i]:g} and theta_max[{i}] = "
+            f"{program.theta_max[i]:g} lie too far apart for regions: in this box the MPC asks for "
+            f"inputs {demanded[i]:.0e} times their range, expected are at most 1e4. Pass as "
+            "theta_min and theta_max, or x_min and x_max, what the plant can reach; or use "
+            "online(), which needs no regions."
+        )
     timer.tick()
     try:
         units = ProgramUnits(program, u_min, u_max, timer)
@@ -220,11 +229,12 @@ def _find_equalities(program: ParametricQP, timer: BudgetTimer) -> Equalities | 
     return Equalities(free, np.asarray(np.linalg.pinv(G, rcond=1e-9) @ limit), left)
 
 
-def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> None:
+def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
     """Raise where weights, the box of theta or an input's range make rounding hide the rest.
 
-    Asked for more than 1e8 times their range, inputs are wrong, or feasible sets too thin to be
-    found; asked for less than 1e-9 of it, constraints of states are too small beside it.
+    Return which part of an input's range each entry of theta (n,) asks for in its box. Asked for
+    more than 1e8 times their range, inputs are wrong, or feasible sets too thin to be found; asked
+    for less than 1e-9 of it, constraints of states are too small beside it.
     """
     unit = 1 / np.sqrt(np.maximum(np.diag(program.H), 1e-300))
     H = unit[:, None] * program.H * unit
@@ -269,6 +279,7 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Non
             "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
             "bound, and use online()."
         )
+    return np.asarray(demanded.max(axis=0))
 
 
 def _has_interior_point(program: ParametricQP) -> bool:
