@@ -223,7 +223,7 @@ class StateEstimator:
                 if np.any(cross):
                     # What v shows of w moves the state one sample later.
                     shared = np.linalg.solve(spread, cross.T).T
-                    gain = gain + np.linalg.lstsq(self.A, shared, rcond=None)[0]
+                    gain = gain + before_step(self.A, shared)
             if self._radius(gain) < 1:
                 return gain
         except ValueError:  # a LinAlgError is one
@@ -244,7 +244,7 @@ class StateEstimator:
             own = np.linalg.solve(S, C[seen] @ P).T
             next_step = np.linalg.solve(S, cross[:, seen].T).T
             if k >= (periods - 1) * period:
-                total[:, seen] += own + np.linalg.lstsq(A, next_step, rcond=None)[0]
+                total[:, seen] += own + before_step(A, next_step)
             ahead = A @ own + next_step
             moved = A - ahead @ C[seen]
             shared = ahead @ cross[:, seen].T
@@ -290,6 +290,13 @@ class DisturbanceObserver(StateEstimator):
             hint = "pass its matrix E, e.g. E = B for a load at the input."
             raise ValueError(f"The model has no disturbance to estimate: {hint}")
         return measured
+
+
+def before_step(A: Array, after: Array) -> Array:
+    """Return the least x (n, q) with ``A x = after``, balanced: states may differ much in units."""
+    balanced, (scale, _) = linalg.matrix_balance(A, permute=False, separate=True)
+    found = np.linalg.lstsq(balanced, after / scale[:, None], rcond=None)[0]
+    return np.asarray(scale[:, None] * found)
 
 
 def _covariance(name: str, value: ArrayLike, size: int) -> tuple[Array, list[float]]:

@@ -40,7 +40,7 @@ from sb3_yann.control.identification.residuals import curvature_test, listed, li
 from sb3_yann.control.linear_system import names
 from sb3_yann.control.model.identify import OfLog
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.observer import StateEstimator
+from sb3_yann.control.observer import StateEstimator, before_step
 from sb3_yann.log import Arrays, Episode, Log
 
 
@@ -141,7 +141,7 @@ class IdentifiedOutputs(OfLog):
         spread = self.gain @ self.noise
         own = len(self.model.A) - sum(self.delays)  # the rest are inputs on their way
         gain = np.zeros_like(self.gain)
-        gain[:own] = np.linalg.lstsq(self.model.A[:own, :own], self.gain[:own], rcond=None)[0]
+        gain[:own] = before_step(self.model.A[:own, :own], self.gain[:own])
         return StateEstimator(
             self.model,
             state_noise=spread @ self.gain.T,
