@@ -102,6 +102,13 @@ class StateEstimator:
         if len(periods) not in (1, q):
             raise ValueError(f"every = {every} must be one number, or one for each of {q} outputs.")
         self.every = np.resize(periods, q)
+        self._period = int(np.lcm.reduce(self.every))
+        if self._period > 2000:
+            raise ValueError(
+                f"every = {self.every.tolist()}: all outputs are read together each "
+                f"{self._period:,} samples only, expected are at most 2,000. Pass numbers with "
+                "common factors, such as 60 for 61 and 59."
+            )
         if gain is None:
             found = self._kalman_gain(linalg.block_diag(W, D), V, cross)
             if found is None:
@@ -235,27 +242,27 @@ class StateEstimator:
         periods = 40  # of all rates: the gain is that of the limit then
         A = self.A
         C = self.C_aug
-        period = int(np.lcm.reduce(self.every))
         total: Array = np.zeros((len(A), len(C)))
-        P = W + np.eye(len(A)) * np.trace(W) / len(A)
-        for k in range(periods * period):
+        _, (unit, _) = linalg.matrix_balance(A, permute=False, separate=True)
+        P = W + np.max(np.diag(W) / unit**2) * np.diag(unit**2)  # definite, whatever the units
+        for k in range(periods * self._period):
             seen = np.flatnonzero(k % self.every == 0)
             S = C[seen] @ P @ C[seen].T + V[np.ix_(seen, seen)]
             own = np.linalg.solve(S, C[seen] @ P).T
             next_step = np.linalg.solve(S, cross[:, seen].T).T
-            if k >= (periods - 1) * period:
+            if k >= (periods - 1) * self._period:
                 total[:, seen] += own + before_step(A, next_step)
             ahead = A @ own + next_step
             moved = A - ahead @ C[seen]
             shared = ahead @ cross[:, seen].T
             of_sensors = ahead @ V[np.ix_(seen, seen)] @ ahead.T
             P = moved @ P @ moved.T + W + of_sensors - shared - shared.T
-        return total / (period / self.every)
+        return total / (self._period / self.every)
 
     def _radius(self, gain: Array) -> float:
         """Return by which factor the error of the estimate changes in a period, in the end."""
         error = np.eye(len(self.A))
-        for k in range(int(np.lcm.reduce(self.every))):
+        for k in range(self._period):
             seen = k % self.every == 0
             error = (np.eye(len(self.A)) - gain[:, seen] @ self.C_aug[seen]) @ self.A @ error
         return lqr.spectral_radius(error)

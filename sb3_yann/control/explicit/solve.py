@@ -14,11 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from sb3_yann._validation import Array, check_choice, half_widths
+from sb3_yann._validation import Array, check_choice, half_widths, warn
 from sb3_yann.control.explicit.budget import BudgetTimer, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
 from sb3_yann.control.explicit.facet_walk import walk
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, moderated, row_norms
+from sb3_yann.control.explicit.parametric_qp import (
+    ParametricQP,
+    moderated,
+    row_norms,
+    slacks_made_cheap,
+)
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
 
@@ -278,6 +283,14 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Arr
             f"{demanded.max():.0e} times their range, expected are at most {1e8:g}. Pass as "
             "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
             "bound, and use online()."
+        )
+    scaled, _ = program.scaled(u_min, u_max, 0 * program.theta_min)
+    if np.any(lessened := slacks_made_cheap(scaled)):
+        warn(
+            f"Soft bounds may be violated {lessened.max():.0e} times as far in theta's box as "
+            "inputs move what they bound. So large a cost rounding would hide, and it is lessened: "
+            "inputs differ from those that SoftBounds(penalty=) asks for. Pass as theta_min and "
+            "theta_max, or x_min and x_max, what the plant can reach, or a lower penalty."
         )
     return np.asarray(demanded.max(axis=0))
 

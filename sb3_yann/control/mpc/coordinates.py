@@ -217,7 +217,8 @@ def steady_states(
     n, m = model.B.shape
     unit = np.concatenate([x_unit, u_unit])
     equations = np.block([[model.A - np.eye(n), model.B], [C, np.zeros((len(C), m))]]) * unit
-    row_unit = np.concatenate([x_unit, np.linalg.norm(equations[n:], axis=1)])
+    row_unit = np.linalg.norm(equations, axis=1)
+    row_unit[:n] = np.maximum(row_unit[:n], x_unit)  # an integrator's row may be all rounding
     row_unit[row_unit == 0] = 1.0
     equations = equations / row_unit[:, None]
     right = linalg.block_diag(np.zeros((n, 0)), np.eye(len(C)))
