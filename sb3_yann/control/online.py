@@ -177,7 +177,7 @@ class OnlineLaw(PlantLaw):
     def _inputs(self, rows: Array) -> Array:
         """Return the inputs (batch, m) at rows of theta, and warn where rounding hides the law."""
         u, feasible, _, _ = self._answers(rows)
-        if self.n_slacks and not feasible.all() and np.any(np.asarray(self.feedback)):
+        if self.n_slacks and not feasible.all():
             self._warn_beyond_reach(rows[~feasible])
         return u
 
@@ -186,15 +186,27 @@ class OnlineLaw(PlantLaw):
         inside = np.all((rows >= self.theta_min) & (rows <= self.theta_max), axis=1)
         if self.model is None or not inside.any() or "_has_warned" in vars(self):
             return
+        inputs = len(self.c) - self.n_slacks
+        hard = ~np.any(self.G[:, inputs:], axis=1) & np.any(self.S, axis=1)
+        place = f"no solution was found at theta = {rows[inside][0].tolist()}"
+        bounded = "The input is bounded, but not the MPC's; law.in_domain is False."
+        if np.any(np.asarray(self.feedback)):
+            words = (
+                f"{lqr.long_horizon(self.model.A, inputs // self.n_inputs)}, {place}: no input "
+                "brings the model back from there, or a hard bound cannot be kept. Predictions run "
+                f"away, and rounding hides the law. {bounded} Give theta_min and theta_max the "
+                "states from which inputs bring it back, or pass a shorter horizon."
+            )
+        elif hard.any():
+            return
+        else:
+            words = (
+                f"All bounds but the inputs' are soft, and {place}: they cost more than the digits "
+                f"of float64 hold. {bounded} Lower SoftBounds(penalty=), or give units that differ "
+                "less."
+            )
         vars(self)["_has_warned"] = True
-        steps = (len(self.c) - self.n_slacks) // self.n_inputs
-        warn(
-            f"{lqr.long_horizon(self.model.A, steps)}, no solution was found at theta = "
-            f"{rows[inside][0].tolist()}: no input brings the model back from there, or a hard "
-            "bound cannot be kept. Predictions run away, and rounding hides the law. The input is "
-            "bounded, but not the MPC's; law.in_domain is False. Give theta_min and theta_max the "
-            "states from which inputs bring it back, or pass a shorter horizon."
-        )
+        warn(words)
 
     def _answers(self, rows: Array) -> tuple[Array, NDArray[np.bool_], Answers, Answers | None]:
         """Return inputs, what is feasible, the answers, and those of infeasible rows softened."""

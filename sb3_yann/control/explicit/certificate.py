@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
@@ -55,6 +55,7 @@ class Certificate:
 
     Of U only the first input, ``to_inputs`` (m, v) of it, is the law: later ones, which are not
     played, may be far steeper. ``center`` and ``half`` (n,) take theta to the units of the problem.
+    Where inputs are ``demanded`` by far more than their range, regions are thin beside the box.
     """
 
     program: ParametricQP
@@ -63,6 +64,7 @@ class Certificate:
     center: Array
     half: Array
     timer: BudgetTimer
+    demanded: float = 0.0
 
     def __post_init__(self) -> None:
         self.outer = np.column_stack(self.program.theta_rows())
@@ -215,8 +217,9 @@ class Certificate:
     def _require_agreement(self) -> None:
         """Raise unless QPs at random points of the box agree with the regions."""
         n = self.program.F.shape[1]
-        for points in np.random.default_rng(1).uniform(-1, 1, (n, 50, n)):
-            self.timer.tick(50 * self.qp_effort)
+        rng = np.random.default_rng(1)
+        for points in [*rng.uniform(-1, 1, (n, 50, n)), *self._points_near_regions(rng)]:
+            self.timer.tick(len(points) * self.qp_effort)
             solved = [(point, self.program.solve(point)) for point in points]
             feasible = [(point, U) for point, U in solved if U is not None]
             if not feasible:
@@ -231,6 +234,18 @@ class Certificate:
             k = int(np.argmax(error))
             if error[k] > LAW_TOL:
                 self._fail(f"the law of region {nearest[k]} violates the KKT conditions", at[k])
+
+    def _points_near_regions(self, rng: np.random.Generator) -> Iterator[Array]:
+        """Yield points (200, n) at all distances from regions that a wide box makes thin."""
+        n = self.program.F.shape[1]
+        middles = [np.clip(-self.center / self.half, -1, 1), *(middle for middle, _ in self.balls)]
+        for _ in range(20 * n if self.demanded > 1e4 else 0):
+            # Half of them about the operating point.
+            chosen = np.array(middles)[
+                rng.integers(len(middles), size=200) * rng.integers(2, size=200)
+            ]
+            far = 10 ** rng.uniform(-10, 0, (200, 1)) * rng.uniform(-1, 1, (200, n))
+            yield np.clip(chosen + far, -1, 1)
 
     def _require_no_doubles(self) -> None:
         """Raise if a region lies in another: both have then the same law, whatever their sets."""

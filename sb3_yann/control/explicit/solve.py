@@ -43,23 +43,14 @@ def solve_explicit(
     none. Its errors are those of :meth:`LinearMPC.explicit`.
     """
     check_choice("solver", solver, ("walk", "ppopt"))
-    demanded = require_sane_sizes(program, u_min, u_max)
-    if np.any(demanded > 1e4):  # some regions are too thin for tolerances that are parts of a box
-        i = int(np.argmax(demanded))
-        raise ExplicitSolutionError(
-            f"theta_min[{i}] = {program.theta_min[i]:g} and theta_max[{i}] = "
-            f"{program.theta_max[i]:g} lie too far apart for regions: in this box the MPC asks for "
-            f"inputs {demanded[i]:.0e} times their range, expected are at most 1e4. Pass as "
-            "theta_min and theta_max, or x_min and x_max, what the plant can reach; or use "
-            "online(), which needs no regions."
-        )
+    demanded = float(require_sane_sizes(program, u_min, u_max).max(initial=0.0))
     timer.tick()
     try:
         units = ProgramUnits(program, u_min, u_max, timer)
         _require_feasible(units.scaled, timer)
         regions = critical_regions(units.scaled, solver, timer)
         regions = Certificate(
-            units.scaled, regions, units.to_inputs, units.center, units.half, timer
+            units.scaled, regions, units.to_inputs, units.center, units.half, timer, demanded
         ).check()
     except ExplicitSolutionError as error:
         if solver == "walk":
@@ -284,6 +275,8 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Arr
             "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
             "bound, and use online()."
         )
+    if not np.all(np.isfinite(width)):
+        return np.asarray(demanded.max(axis=0))
     scaled, _ = program.scaled(u_min, u_max, 0 * program.theta_min)
     if np.any(lessened := slacks_made_cheap(scaled)):
         warn(
