@@ -410,8 +410,7 @@ def controller_of(act: Feedback) -> Controller:
     """Return a policy as what acts in episodes side by side; on what is not finite, as at rest."""
 
     def controller(t: int, theta: Array, rows: Rows) -> Array:
-        finite = np.isfinite(theta).all(axis=1, keepdims=True)
-        return act(np.where(finite, theta, 0.0))
+        return act(np.where(np.isfinite(theta).all(axis=1, keepdims=True), theta, 0.0))
 
     return controller
 
@@ -445,13 +444,10 @@ def _discounted(
     problem = policy.problem
     gamma = policy.gamma
     dynamics = twin.dynamics
-    shape = len(dynamics.members), -1
-    starts = at.reshape(*shape, at.shape[-1])
-    u = u.reshape(*shape, problem.model.n_inputs)
+    starts, u = (each.reshape(len(dynamics.members), -1, each.shape[-1]) for each in (at, u))
     shown = dynamics.row.shown
     with np.errstate(all="ignore"):
-        first = dynamics.step(starts, u)
-        rows, inputs = dynamics.roll_out(act, first, RETURN_STEPS)
+        rows, inputs = dynamics.roll_out(act, dynamics.step(starts, u), RETURN_STEPS)
         thetas = shown(rows)
         stage = problem.deviations.stage_cost(thetas[:-1], inputs)
         end = problem.value_terms(gamma).at(thetas[-1])
@@ -470,18 +466,16 @@ def _fit_critic(
     ``inputs`` (rows, n_theta + m) are theta and actions.
     """
     critic = policy.critic
-    device = policy.device
-    points = th.as_tensor(inputs).to(device)
-    wanted = th.as_tensor(returns, dtype=th.float32)[:, None].to(device)
+    points = th.as_tensor(inputs).to(policy.device)
+    wanted = th.as_tensor(returns, dtype=th.float32)[:, None].to(policy.device)
     unit = float(np.std(returns)) or 1.0
     if critic.scales_itself and policy.critic_updates == 0:
         critic.batch = points
         critic.scale_values()
     optimizer = th.optim.Adam(critic.parameters(), lr=1e-3)
     for k in range(CRITIC_UPDATES):
-        for group in optimizer.param_groups:
-            group["lr"] = 1e-3 * (1 - k / CRITIC_UPDATES)
-        rows = th.as_tensor(rng.integers(len(returns), size=CRITIC_BATCH), device=device)
+        optimizer.param_groups[0]["lr"] = 1e-3 * (1 - k / CRITIC_UPDATES)
+        rows = th.as_tensor(rng.integers(len(returns), size=CRITIC_BATCH), device=policy.device)
         optimizer.zero_grad()
         loss = sum(
             th.mean(((each - wanted[rows]) / unit) ** 2)  # each quantile where it has several

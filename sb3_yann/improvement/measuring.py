@@ -441,10 +441,9 @@ class _Search:
         simulator = self.simulator
         unit = max(float(np.abs(base.costs).sum() / base.lengths.sum()), 1e-300)
         if self.twin is not None:
-            twin = self.twin
-            count = len(self.twin.dynamics.members)
-            acting = TwinPlant(twin.dynamics, [seed % count for seed in self.seeds])
-            self.add("plan", simulator.play(self._planning(twin, acting, unit), self.seeds))
+            dynamics = self.twin.dynamics
+            acting = TwinPlant(dynamics, [seed % len(dynamics.members) for seed in self.seeds])
+            self.add("plan", simulator.play(self._planning(self.twin, acting, unit), self.seeds))
             self.planned[:] = True
             self.say("plans in the twin")
             return

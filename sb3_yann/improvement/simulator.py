@@ -345,7 +345,7 @@ class Excited:
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m): those of an episode do not depend on what others there are."""
         problem = self.problem
-        every = (int(rows.max(initial=-1)) + 1, self.problem.model.n_inputs)
+        every = (int(rows.max(initial=-1)) + 1, problem.model.n_inputs)
         # Every five steps inputs move anew, for 70 % of the time.
         moves, times = (np.random.default_rng([self.seed, t // 5, i]) for i in range(2))
         moved = self.push * problem.u_half * moves.uniform(-1, 1, every)
@@ -430,22 +430,18 @@ def lacks(model: LearntModel) -> tuple[bool, bool]:
     """
     from scipy.spatial import cKDTree
 
-    dynamics = model.dynamics
-    coordinates = dynamics.coordinates
-    row = dynamics.row
-    rows = np.concatenate([each.thetas[:-1] for each in model.episodes])
-    inputs = np.concatenate([each.actions for each in model.episodes])
-    errors = np.concatenate([missed_of(model, each) for each in model.episodes])
-    errors /= coordinates.units
-    points = row.features(rows, inputs)
+    episodes = model.episodes
+    row = model.dynamics.row
+    errors = np.concatenate([missed_of(model, each) for each in episodes])
+    errors /= model.dynamics.coordinates.units
+    points = np.concatenate([row.features(each.thetas[:-1], each.actions) for each in episodes])
     points = points / np.maximum(points.std(axis=0), 1e-9)
     other = cKDTree(points).query(points, k=2)[1][:, 1]
-    apart = float(np.mean((errors - errors[other]) ** 2)) / 2
-    whole = float(np.mean(errors**2))
+    apart = np.mean((errors - errors[other]) ** 2) / 2
     # 0.01: standard deviations of the states: what errs less in most steps has no noise
     errs = bool(np.median(np.abs(errors), axis=0).max() > 0.01)
     # 0.5: share of the errors of neighboring steps that is not alike: more is noise
-    return errs, errs and apart < 0.5 * whole
+    return errs, errs and bool(apart < 0.5 * np.mean(errors**2))
 
 
 def task_of(model: LearntModel, unit: float, priced: bool = True) -> Task:
@@ -514,17 +510,15 @@ class Scenarios:
         steps = max(map(len, episodes))
         n = model.problem.model.n_states
         first = np.zeros(len(episodes), dtype=np.int64)
+        usual = len(first) - midway
         if rng is not None:
-            last = first[len(first) - midway :]
-            last[:] = rng.integers([len(each) for each in episodes[len(first) - midway :]])
-        thetas = row.shown(np.array([e.thetas[t] for e, t in zip(episodes, first, strict=True)]))
+            first[usual:] = rng.integers([len(each) for each in episodes[usual:]])
+        begun = [*zip(episodes, first, strict=True)]
+        thetas = row.shown(np.array([e.thetas[t] for e, t in begun]))
         if rng is not None:
-            moved = thetas[1 : len(first) - midway : 2, :n]
+            moved = thetas[1:usual:2, :n]
             moved[:] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
-        given = [
-            e.thetas[np.minimum(t + np.arange(steps), len(e))][:, row.given]
-            for e, t in zip(episodes, first, strict=True)
-        ]
+        given = [e.thetas[np.minimum(t + np.arange(steps), len(e))][:, row.given] for e, t in begun]
         once = {id(each): each for each in episodes}
         members = missed = None
         if isinstance(model, Family):
@@ -533,7 +527,7 @@ class Scenarios:
         if row.estimator is not None:
             of_each = {key: missed_of(model, each) for key, each in once.items()}
             missed = np.zeros((steps, len(episodes), n))
-            for i, (e, t) in enumerate(zip(episodes, first, strict=True)):
+            for i, (e, t) in enumerate(begun):
                 missed[: len(e) - t, i] = of_each[id(e)][t:]
         return cls(model, members, row.begin(thetas), np.stack(given, axis=1), missed)
 
