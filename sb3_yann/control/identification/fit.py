@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -208,7 +208,10 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
     rows = sum(map(len, states))
     found = list[Frozen]()
     for i in range(states[0].shape[1]):
-        runs = [*_runs([x[:, i] for x in states], i)]
+        runs = list[Frozen]()
+        for episode, x in enumerate(states):
+            edges = np.flatnonzero(np.diff(x[:, i], prepend=np.nan, append=np.nan))
+            runs += [Frozen(episode, i, int(a), int(b) - 1) for a, b in pairwise(edges)]
         usual, rare = np.quantile([*map(len, runs)], [0.5, 0.95])
         moves = np.abs(np.concatenate([np.diff(x[:, i]) for x in states]))
         steps = moves[moves > 0] / np.min(moves[moves > 0], initial=np.inf)
@@ -282,11 +285,3 @@ def _unexplained(
         if np.any(moving > REPEATED_SHARE * spread) and sure and not rests:
             found.append(run)
     return found
-
-
-def _runs(columns: Sequence[Array], state: int) -> Iterator[Frozen]:
-    """Yield all runs of equal readings, those of one reading as well."""
-    for episode, x in enumerate(columns):
-        edges = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0) + 1, [len(x)]])
-        for first, stop in pairwise(edges):
-            yield Frozen(episode, state, int(first), int(stop) - 1)

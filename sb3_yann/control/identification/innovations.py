@@ -263,7 +263,6 @@ class Chunks:
         self.read = read * self.there
         self.lost = ~read * self.there
         self.y[~read] = 0.0
-        self.gaps = bool(np.any(self.lost))
         self.samples = int(self.there.sum())
         self.readings: Array = self.read.sum(axis=(0, 1))
         self.rare: NDArray[np.bool_] = self.readings < self.samples
@@ -318,7 +317,7 @@ class Chunks:
             slopes[:, k, :, : n * w] = C @ flat
             moved = (inner @ flat).reshape(count, n, w, n)
             moved[:, rows, :, rows] += signals[:, k]
-            if self.gaps:
+            if self.rare.any():
                 gain = model.K * self.lost[:, k, None, :]
                 slopes[:, k, :, n * w :] += C @ by_C
                 moved += (gain @ slopes[:, k, :, : n * w]).reshape(count, n, w, n)
@@ -347,7 +346,7 @@ class Chunks:
             free[:, k] = power
             now = now @ inner.T + fed[:, k]
             power = inner @ power
-            if self.gaps:
+            if self.rare.any():
                 lost = self.lost[:, k]
                 now = now + (lost * (x[:, k] @ C.T)) @ K.T
                 power = power + K @ (lost[:, :, None] * (C @ free[:, k]))
