@@ -246,6 +246,9 @@ def describe(
         units = policy.action_units if isinstance(policy, StartsAsMPC) else units
         signals = estimator_arrays(problem, own, labels, seen_rest, units, order)
     limits = checks.arrays(len(signals["obs_rest"]))
+    if own is not None:  # what is read now and then is not missing in between
+        slow = limits["missing"][: own.n_measured]
+        np.maximum(slow, own.every - 1, out=slow)
     if problem is not None and problem.units.shifted:
         _warn_of_limits(limits, signals)
     return {
