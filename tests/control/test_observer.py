@@ -219,3 +219,20 @@ def test_a_filter_of_two_rates_uses_the_rare_readings_fully() -> None:
     assert rated < 0.85 * plain
     with pytest.raises(ValueError, match="one number, or one for each of 2 outputs"):
         StateEstimator(model, every=[1, 2, 3])
+
+
+def test_the_filter_of_identified_outputs_does_not_depend_on_their_units() -> None:
+    rng = np.random.default_rng(0)
+    A, B = np.array([[0.9, 0.1], [0.2, 0.7]]), np.array([[1.0, 0.0], [0.3, 0.5]])
+    u, y = rng.uniform(-1, 1, (400, 2)), np.zeros((401, 2))
+    for k in range(400):
+        y[k + 1] = A @ y[k] + B @ u[k] + 0.01 * rng.standard_normal(2)
+    plain, scaled = (identify_outputs(y * each, u, 1.0, 2, 0) for each in (1.0, [1e6, 1e-6]))
+    gains = (each.model.shown @ each.estimator().gain for each in (plain, scaled))
+    gain, other = gains
+    np.testing.assert_allclose(other * [[1e-6], [1e6]] * [1e6, 1e-6], gain, rtol=1e-3, atol=1e-4)
+
+
+def test_rates_that_hardly_ever_meet_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"every = \[61, 59\]: .* each 3,599 samples only"):
+        StateEstimator(THERMAL, every=[61, 59])

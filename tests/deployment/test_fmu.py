@@ -201,8 +201,8 @@ def test_its_sources_compile_at_the_strictest(prefix, compiler, tmp_path):
 
 
 def test_its_variables_have_the_units_and_limits_of_the_signals(tmp_path):
-    model = LinearModel([[0.9]], [[0.5]], 1, x_ss=[12], u_ss=[3], units=["m", "L/min"],
-                        state_names=["level"], input_names=["feed"])  # fmt: skip
+    model = LinearModel([[0.9]], [[0.5]], 2, x_ss=[12], u_ss=[3], units=["m", "L/min"],
+                        state_names=["level"], input_names=["feed"], time_unit="min")  # fmt: skip
     box = {"u_min": 1, "u_max": 9, "theta_min": 2, "theta_max": 20}
     r = Tracking([0], 5, 15, preview=1)
     mpc = LinearMPC(model, Q=[[1]], R=[[1]], horizon=2, tracking=r, **box)
@@ -210,6 +210,7 @@ def test_its_variables_have_the_units_and_limits_of_the_signals(tmp_path):
     export(mpc, path, checks=Checks(obs_min=[0, 4, 4], obs_max=[25, 16, 16]))
     assert validate_fmu(path) == []
     said = fmpy.read_model_description(path)
+    assert float(said.defaultExperiment.stepSize) == 120  # time is in seconds
     assert [each.name for each in said.unitDefinitions] == ["L/min", "m"]
     found = [(each.unit, each.min, each.max) for each in said.modelVariables if each.unit]
     assert found[:3] == [("m", "0.0", "25.0"), *[("m", "4.0", "16.0")] * 2]

@@ -360,3 +360,17 @@ def test_limits_and_a_present_input_in_other_units_are_told(tmp_path) -> None:
     controller = Controller.load(tmp_path / "plant.npz")
     with pytest.warns(UserWarning, match=r"300 of u\[0\], is far beyond its bounds, 1 to 5"):
         controller([50, 300, 50, 300, 1], manual=[300, 7])
+
+
+@pytest.mark.parametrize("x_ss", [0.0, 1e5])
+def test_slow_readings_are_not_missing_and_float_is_refused_far_from_zero(x_ss, tmp_path) -> None:
+    model = LinearModel([[0.9, 0.05], [0, 0.8]], [[0.1], [0.3]], 1, x_ss=[x_ss, 3], u_ss=[0])
+    box = {"theta_min": [x_ss - 0.5, 2], "theta_max": [x_ss + 0.5, 4], "u_min": -1, "u_max": 1}
+    tracking = Tracking([0], x_ss - 0.4, x_ss + 0.4)
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, tracking=tracking, **box)
+    mpc, observer = offset_free(mpc, every=[1, 20])
+    export(mpc, tmp_path / "slow.npz", estimator=observer)
+    assert Controller.load(tmp_path / "slow.npz").data["missing"].tolist() == [0, 19, 0]
+    if x_ss:
+        with pytest.raises(ValueError, match="Pass precision='double'"):
+            export(mpc, tmp_path / "slow.c", estimator=observer, precision="float")

@@ -11,7 +11,15 @@ import pytest
 from benchmarks.online_problems import points, six_masses, three_masses, wide_plant, worst_condition
 from general_problems import PROBLEMS, solved
 from sample_problems import braking
-from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, OutputBounds, SoftBounds
+from sb3_yann import Controller, export
+from sb3_yann.control import (
+    LinearModel,
+    LinearMPC,
+    OnlineLaw,
+    OutputBounds,
+    RateLimits,
+    SoftBounds,
+)
 from sb3_yann.control._kernels import online as _kernels
 from sb3_yann.control._kernels.online import SOLVED
 from sb3_yann.control.online import DualProgram, KnownPoints
@@ -252,3 +260,43 @@ def test_steep_bounds_that_cannot_all_hold_give_way_by_their_sizes() -> None:
     )  # fmt: skip
     for law in (mpc.online(), mpc.explicit()):  # least s + s^2 of s = 2 (1.7 + u) and 1.7 - u
         assert law([3, 3]) == pytest.approx(-1.12, abs=1e-6)
+
+
+def test_where_constraints_give_way_rounding_enters_no_active_set(tmp_path) -> None:
+    model = LinearModel([[0.8, 0.3], [-0.2, 0.9]], [[1.0, 0.2], [0.1, 0.7]], 1.0)
+    limits = {"u_min": -1, "u_max": 1, "theta_min": -5, "theta_max": 5}
+    soft = {"outputs": OutputBounds([0], -2, 2), "soft": SoftBounds(y=1.0)}
+    more = {"rate": RateLimits(-0.2, 0.2), "parametric_bounds": ["u_min"], **soft, **limits}
+    mpc = LinearMPC(model, Q=np.eye(2), R=0.1 * np.eye(2), horizon=4, **more)
+    mpc.law("online")
+    export(mpc, tmp_path / "law.npz")
+    law = mpc.online()
+    rng = np.random.default_rng(0)
+    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (300, mpc.n_theta))
+    outside = theta[~law.in_domain(theta)]
+    assert len(outside) > 50
+    found = Controller.load(tmp_path / "law.npz").evaluate(outside)
+    np.testing.assert_allclose(law.plant_input(outside), found, atol=1e-6)
+
+
+def test_a_given_penalty_that_a_wide_box_lessens_is_named() -> None:
+    outputs = {"outputs": OutputBounds([[-0.762]], -1, 186), "soft": SoftBounds(y=1.0, penalty=125)}
+    for box in (1e3, 1e6):
+        limits = {"u_min": -4, "u_max": 4, "theta_min": -box, "theta_max": box, **outputs}
+        model = LinearModel([[0.5677]], [[-0.5161, 0.0532]], 1.0)
+        mpc = LinearMPC(model, Q=[[1]], R=0.8 * np.eye(2), horizon=2, **limits)
+        if box == 1e3:
+            np.testing.assert_allclose(mpc.online()([8.0]), [4, -4], atol=1e-6)
+        else:
+            with pytest.warns(UserWarning, match=r"SoftBounds\(penalty=\)"):
+                mpc.online()
+
+
+def test_soft_bounds_that_cost_more_than_digits_hold_are_named() -> None:
+    model = LinearModel([[0.9, 0.3], [-0.2, 0.8]], [[0.1, 0.5], [0.6, 0.2]], 1.0)
+    box = {"u_min": -10, "u_max": 10, "theta_min": -100, "theta_max": 100, "horizon": 2}
+    bounds = {"x_min": [-np.inf, -30], "x_max": [np.inf, 30], "outputs": OutputBounds([0], -30, 20)}
+    soft = SoftBounds(y=0.013, x=0.5, penalty=1e5)
+    law = LinearMPC(model, Q=np.eye(2), R=0.1 * np.eye(2), **box, **bounds, soft=soft).online()
+    with pytest.warns(UserWarning, match="All bounds but the inputs' are soft"):
+        law([-83.2, 66.5])
