@@ -11,7 +11,6 @@ from sb3_yann.evaluation import Trajectories, comparison_table, evaluate
 from sb3_yann.evaluation.plots import (
     loops_figure,
     plot_gains,
-    plot_regions,
     plot_surface,
     use_figure,
 )
@@ -123,12 +122,3 @@ def test_use_counts_steps_and_distances_by_region() -> None:
     largest = below.lines[0].get_ydata()
     assert max(largest) == pytest.approx(10)  # of half the range
     assert all(bar.get_height() <= top for bar, top in zip(below.patches, largest, strict=True))
-
-
-def test_a_color_stands_for_the_constraints_that_act() -> None:
-    mpc = problems.cstr()
-    axes = plot_regions(mpc, entries=("C_A", "T"), by="constraint")
-    labels = axes.get_legend_handles_labels()[1]
-    assert {"U at its lower bound", "U at its upper bound", "no constraint acts"} <= {*labels}
-    with pytest.raises(ValueError, match="by"):
-        plot_regions(mpc, by="color")

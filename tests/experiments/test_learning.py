@@ -1,18 +1,13 @@
 """The learning tables hold what their runs do, and every plant shows the theta of its MPC."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
-from experiments import learning
-from experiments.learning import FROM_A_LOG, HEADER, IMPROVED, PLANNED, execute, main, rows
+from experiments.learning import FROM_A_LOG, HEADER, IMPROVED, PLANNED, main, rows
 from experiments.measures import OBSERVER
 from experiments.pictures import _shares, save_in_short
 from experiments.plants import CASES
 from experiments.runner import Outcome, Run, save
-from sb3_yann.improvement import simulator
-from sb3_yann.twin.selection import fit_ensemble
 
 pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
 
@@ -76,22 +71,6 @@ def test_each_plant_shows_the_theta_of_its_mpc(name, tmp_path, monkeypatch) -> N
     theta, _ = env.reset(seed=0)
     assert theta.shape == (case.mpc.n_theta,)
     assert env.observation_space.contains(env.step(np.float32(case.mpc.online()(theta)))[0])
-
-
-@pytest.mark.nightly
-def test_a_run_compares_with_the_mpc_on_the_same_episodes(monkeypatch) -> None:
-    monkeypatch.setattr(simulator, "fit_ensemble", partial(fit_ensemble, updates=500))
-    monkeypatch.setattr(learning, "TESTS", range(2000, 2004))
-    plans = execute(Run("pH", PLANNED, 40, 0))
-    law = CASES["pH"]().mpc.explicit()
-    played = learning.costs_on(CASES["pH"]().mpc, CASES["pH"]().make, law)
-    np.testing.assert_allclose(plans.test_costs[0], played.costs, rtol=1e-6)
-    assert not played.violations.any()
-    assert plans.test_costs[1].mean() < 0.8 * played.costs.mean()
-    steps = [np.abs(np.diff(each, axis=0)) for each in played.actions]
-    largest, mean = learning.moves_of(played)
-    assert largest == max(each.max() for each in steps)
-    assert mean == pytest.approx(np.concatenate(steps).mean())
 
 
 def test_the_picture_pairs_costs_with_the_mpc_that_has_no_observer(tmp_path) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 import sys
 import types
 from pathlib import Path
@@ -16,8 +15,7 @@ from experiments import runner
 from experiments.__main__ import main
 from experiments.measures import rows_of
 from experiments.results import in_short, write_report
-from experiments.runner import Outcome, Run, RunsFailed, load_all, run_all
-from fresh_process import run_module
+from experiments.runner import Outcome, Run, load_all, run_all
 
 pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
 
@@ -155,19 +153,6 @@ def test_the_short_table_has_a_row_for_each_plant_that_was_learnt() -> None:
     assert in_short(left) == ""
 
 
-@pytest.mark.nightly
-def test_the_quick_form_runs_to_its_report_and_does_nothing_twice(tmp_path) -> None:
-    assert "9 of 9 runs" in run_module(tmp_path, "experiments", "--quick")
-    folder = tmp_path / "out" / "paper-quick"
-    report = (folder / "results.md").read_text(encoding="utf-8")
-    assert "## After 4 training episodes" in report
-    for picture in re.findall(r"!\[.*?\]\((.*?)\)", report):
-        assert (folder / picture).stat().st_size > 10_000
-    before = (folder / "results.sqlite").read_bytes()
-    run_module(tmp_path, "experiments", "--quick")
-    assert (folder / "results.sqlite").read_bytes() == before
-
-
 RUNS = [Run("CSTR", "YANN-RL", seed, 10 * seed) for seed in range(3)]
 
 
@@ -209,43 +194,8 @@ def test_what_is_saved_is_not_done_again(results) -> None:
     assert all(same(first[run], again[run]) and same(first[run], outcome(run)) for run in RUNS)
 
 
-@pytest.mark.nightly
-def test_a_failing_run_is_reported_and_the_others_are_kept(results, capfd) -> None:
-    def fails(run: Run) -> Outcome:
-        if run.seed == 1:
-            raise ArithmeticError("seed one diverged")
-        return outcome(run)
-
-    with pytest.raises(RunsFailed, match=r"1 run\(s\) failed") as caught:
-        run_all(RUNS, fails, results, jobs=2)
-    assert list(caught.value.outcomes) == [RUNS[0], RUNS[2]]
-    assert "ArithmeticError: seed one diverged" in caught.value.failures[RUNS[1]]
-    assert f"FAILED: {RUNS[1]}" in capfd.readouterr().out
-
-    done = []
-
-    def counts(run: Run) -> Outcome:
-        done.append(run)
-        return outcome(run)
-
-    assert list(run_all(RUNS, counts, results, jobs=1, progress=False)) == RUNS
-    assert done == [RUNS[1]]
-
-
 def test_outcomes_of_other_settings_are_not_used(results, monkeypatch) -> None:
     run_all(RUNS, outcome, results, jobs=1, progress=False)
     assert not load_all([Run("CSTR", "YANN-RL", 0, 50)], results)
     monkeypatch.setattr(runner, "FINGERPRINT", "others")
     assert not load_all(RUNS, results)
-
-
-@pytest.mark.nightly
-def test_dask_gives_the_same_with_one_thread_each(results) -> None:
-    distributed = pytest.importorskip("distributed")  # of the extra `paper`
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as machines:
-        found = run_all(RUNS, outcome, results, dask=machines.scheduler_address, progress=False)
-    assert all(same(found[run], outcome(run)) for run in RUNS)
-    assert os.getpid() not in {int(each.extra["pid"]) for each in found.values()}
-    assert {int(each.extra["threads"]) for each in found.values()} == {1}
