@@ -399,13 +399,14 @@ class MPCProblem(ReadOnlyArrays):
             broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
             p = len(self.tracking.C)
             shown = constant + self.theta_ss[self.layout.now]
+            is_balanced = self.model.n_inputs > p and "u[" in broken
             raise ValueError(
                 f"The reference r = {shown[:p].tolist()} with d = {shown[p:].tolist()} is not "
                 f"reachable: its steady state is x_s = {x.tolist()}, u_s = {u.tolist()}, and "
                 f"{broken}. Ask is_reachable(r, d) first, or choose a reference nearer to the "
                 "operating point."
-                + " Another balance of the inputs may reach it: R sets it."
-                * (self.model.n_inputs > p)
+                + " Another balance of the inputs may reach it: R sets it, and R = 0 with "
+                "RateLimits(R_du=) leaves it to the law." * is_balanced
             )
         return x, u
 
