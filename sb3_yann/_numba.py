@@ -13,6 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_yann._progress import say
+
 Integers = NDArray[np.int64]
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -75,4 +77,4 @@ def _say(keep: bool) -> None:
         "once after an installation" if keep else "at each start, for its folder takes no file"
     )
     words = f"sb3-yann compiles its inner loops ({how_often}): half a minute in all."
-    print(words, file=sys.stderr, flush=True)
+    say(words, sys.stderr)
