@@ -24,6 +24,7 @@ from sb3_yann.commissioning.journal import (
     Journal,
     Record,
     Verdict,
+    uninterrupted,
 )
 from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.watchdog import Watchdog
@@ -180,7 +181,8 @@ class Commissioning:
             self._show()
             if state.twin is not None:
                 with shown(self.progress_bar):
-                    self._watch(self._fit(state.twin, state.twin_seed))
+                    self.twin = self._fit(state.twin, state.twin_seed)
+                self.watchdog = Watchdog.of(self.twin)
 
     @property
     def batches(self) -> list[Batch]:
@@ -205,12 +207,13 @@ class Commissioning:
         ValueError
             If the first reading of an episode is not finite. It does not count: run again.
         RuntimeError
-            If an episode does not end in a million steps.
+            If an episode does not end in a million steps, or another run has the record.
         """
         check_int("batches", batches)
         if len(self.batches) >= batches:
             return self.batches
-        with shown(self.progress_bar), one_env(self.plant_env) as env:
+        locked = self.journal.record.locked()
+        with locked, shown(self.progress_bar), one_env(self.plant_env) as env:
             plant = Plant(env, self.model)
             try:
                 while len(self.batches) < batches:
@@ -223,7 +226,8 @@ class Commissioning:
                     played.close()
                     self._decide(plant)
             finally:
-                self._show()
+                with uninterrupted():
+                    self._show()
         return self.batches
 
     def report(self) -> str:
@@ -277,17 +281,17 @@ class Commissioning:
         # would look like a changed plant.
         again = number % 2 if trial and not journal.doubted else 0
         first = plant.begin(self.seed + len(journal.episodes) - again)
-        journal.begin(acts)
         try:
+            journal.begin(acts)
             act: Feedback = plant.policy if acts else plant.mpc
             if excites:
                 act = plant.excited_mpc(self.seed + len(journal.episodes), self.excite)
             limit = float(allowed_excess(excess_of_mpc(journal, plant.problem).largest.max()))
             played = plant.play(first, act, self.watchdog, limit)
+            journal.add(played, acts)
         except KeyboardInterrupt:
             journal.interrupt()
             raise
-        journal.add(played, acts)
 
     def _size_of_batch(self) -> int:
         return int(self.batch * 2 ** (len(self.batches) - self.journal.state.anew))
@@ -305,7 +309,7 @@ class Commissioning:
         who, within = (before.policy, before.max_correction) if by_policy else ("MPC", 0.0)
         alarms = sum(each.alarm is not None for each, _ in journal.batch)
         self._become(self._acting, before.max_correction)
-        twin = None
+        twin = watchdog = None
         if self._changed:
             costs = compare(journal, plant, self.twin, None)
             state = CommissioningState(
@@ -321,6 +325,7 @@ class Commissioning:
             costs = compare(journal, plant, self.twin, twin or self.twin)
             state = before if twin is None else replace(before, twin=numbers, twin_seed=seed)
             state, verdict, reason = self._judge(state, costs, fitted, number)
+            watchdog = self.watchdog if twin is None else Watchdog.of(twin)
             twin = twin or self.twin
         if verdict == "accepted":
             saved = journal.record.save(self.model, number)
@@ -333,13 +338,15 @@ class Commissioning:
         acts = whole_policy(self.policy)
         shown = costs.actual, costs.predicted, costs.mpc
         pairs = costs.difference.pairs
-        journal.close(Batch(*sizes, who, within, *shown, pairs, verdict, reason), state)
-        # All of it holds from here on: an error or Ctrl-C before has changed nothing.
-        known = {before.kept: self._kept, before.acting: self._acting}
-        self._kept = known.get(state.kept, self._mpc)
-        self._acting = acts
-        self.candidate = None if state.tried else self.candidate
-        self._watch(twin)
+        batch = Batch(*sizes, who, within, *shown, pairs, verdict, reason)
+        with uninterrupted():  # an error or Ctrl-C before has changed nothing
+            journal.close(batch, state)
+            known = {before.kept: self._kept, before.acting: self._acting}
+            self._kept = known.get(state.kept, self._mpc)
+            self._acting = acts
+            self.candidate = None if state.tried else self.candidate
+            self.twin = twin
+            self.watchdog = watchdog
         if self.verbose:
             say(self.journal.report().splitlines()[-1])
 
@@ -380,12 +387,6 @@ class Commissioning:
             return wider, "accepted", f"{text}{found.change_in_words}."
         self._become(self._acting, state.max_correction)
         return state, verdict, f"{text}{found.reason}"
-
-    def _watch(self, twin: PlantTwin | None) -> None:
-        """Take a twin for the one in force, and watch the plant by it."""
-        if twin is not self.twin:
-            self.twin = twin
-            self.watchdog = None if twin is None else Watchdog.of(twin)
 
     def _become(self, whole: Whole, bound: float) -> None:
         """Give the model a policy, and bound it for good: a model that is saved keeps it."""

@@ -8,7 +8,12 @@ from __future__ import annotations
 import json
 import math
 import os
+import signal
+import sys
+import threading
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +30,23 @@ from sb3_yann.twin.log import SHORTEST
 Event = dict[str, Any]
 NAME = "commissioning.jsonl"
 BEGIN = b'{"event": "begin"'
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C wait until the block is over."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if not (is_main and callable(signal.getsignal(signal.SIGINT))):  # nothing is raised here
+        yield
+        return
+    came = list[int]()
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 class Record:
@@ -60,6 +82,31 @@ class Record:
                 ) from error
         self._size = len(read) - len(rest)
         self._seen = len(read)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep the record for this run until the block is over, or the process."""
+        if self.path is None:
+            yield
+            return
+        with self.path.open("ab") as file:
+            try:
+                if sys.platform == "win32":
+                    import msvcrt
+
+                    file.seek(2**30)  # where nobody reads or writes
+                    msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+                else:
+                    import fcntl
+
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:  # some file systems have no locks
+                if isinstance(error, BlockingIOError | PermissionError):
+                    raise RuntimeError(
+                        f"Another process runs on {self.path}, and one record belongs to one run. "
+                        "End that process, or name another file."
+                    ) from error
+            yield
 
     def append(self, event: Event) -> None:
         """Add an event; when this returns it is on the disk."""
@@ -308,14 +355,19 @@ class Journal:
         self._note("start", number=len(self.episodes), acts=self._acting(by_policy))
 
     def interrupt(self) -> None:
-        """Note that Ctrl-C has ended the episode: that says nothing of the policy."""
-        self._note("interrupted", number=len(self.episodes))
+        """Note that Ctrl-C or a full disk ended the episode: that says nothing of the policy."""
+        if self._open:
+            self._note("interrupted", number=len(self.episodes))
 
     def add(self, played: PlantEpisode, by_policy: bool) -> None:
         """Add an episode."""
         within = self.state.max_correction if by_policy else 0.0
         about = {"number": len(self.episodes), "acts": self._acting(by_policy)}
-        self._note("episode", **about, max_correction=within, **_as_event(played))
+        try:
+            self._note("episode", **about, max_correction=within, **_as_event(played))
+        except OSError:  # a short line may have room yet
+            self.interrupt()
+            raise
 
     def close(self, batch: Batch, state: CommissioningState) -> None:
         """Add the decision that ends a batch."""
@@ -327,8 +379,9 @@ class Journal:
     def _note(self, kind: str, **about: Any) -> None:
         """Write an event down, then do what it says."""
         event = {"event": kind, **about}
-        self.record.append(event)
-        self._take(event)
+        with uninterrupted():
+            self.record.append(event)
+            self._take(event)
 
     def _take(self, event: Event) -> None:
         """Do what an event says: as it happens, and again from the record."""

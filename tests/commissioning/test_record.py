@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+import signal
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from resumed import all_bits, envs, model_bits
 from sb3_yann import Commissioning, Improvement, YannPolicy, improve
 from sb3_yann.commissioning import commissioning
 from sb3_yann.commissioning.commissioning import why_taken_back
-from sb3_yann.commissioning.journal import CommissioningState, Journal, Record
+from sb3_yann.commissioning.journal import Accepted, CommissioningState, Journal, Record
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.watchdog import Alarm
 from sb3_yann.improvement import Check
@@ -105,6 +107,24 @@ def test_after_a_full_disk_or_ctrl_c_the_same_run_goes_on(
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(RuntimeError, match="was changed by somebody else"):
         again.begin(False)
+
+
+def test_an_episode_that_a_full_disk_has_no_room_for_is_not_held_against_the_policy(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = [OSError(errno.ENOSPC, "full")]
+
+    def fail_once(*_: object) -> None:
+        if full:
+            raise full.pop()
+
+    again = journal(path)
+    again.state = replace(again.state, acting=Accepted("batch 1"))
+    again.begin(True)
+    monkeypatch.setattr(os, "fsync", fail_once)
+    with pytest.raises(OSError, match="could not be written"):
+        again.add(again.episodes[0], True)
+    assert again.cut_off == journal(path).cut_off == 0
 
 
 class Unsaved:
@@ -209,3 +229,32 @@ def test_what_the_model_had_learnt_before_still_waits_after_a_stop(tmp_path, mon
     monkeypatch.setattr(commissioning, "why_taken_back", why_taken_back)
     again.run(2)
     assert commission(tmp_path, learnt()).candidate is None  # it has been tried
+
+
+def test_ctrl_c_while_an_event_is_noted_waits_until_it_holds(tmp_path, monkeypatch) -> None:
+    append = Record.append
+
+    def append_and_interrupt(record: Record, event: dict[str, Any]) -> None:
+        append(record, event)
+        if event["event"] in ("episode", "batch"):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Record, "append", append_and_interrupt)
+    monkeypatch.setattr(commissioning, "why_taken_back", lambda *_: "a test")
+    run = commission(tmp_path)
+    for _ in range(5):
+        with pytest.raises(KeyboardInterrupt):
+            run.run(1)
+    kinds = [each["event"] for each in events(tmp_path)]
+    assert kinds == ["begin", *(4 * ["start", "episode"]), "batch"]
+    assert len(run.episodes) == 4 and run.twin is not None and run.watchdog is not None
+
+
+def test_a_second_run_on_a_record_is_refused_before_it_plays(tmp_path) -> None:
+    run = commission(tmp_path)
+    with Record(run.journal.record.path).locked():
+        with pytest.raises(RuntimeError, match=r"plant\.jsonl.* End that process, or name another"):
+            run.run(1)
+    assert [each["event"] for each in events(tmp_path)] == ["begin"]
+    with run.journal.record.locked():
+        pass
