@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from experiments import pcgym, pcgym_nmpc
+from experiments import pcgym
 from experiments.runner import Outcome, Run
 
 PLANT = next(iter(pcgym.PLANTS))
@@ -56,22 +56,3 @@ def test_controllers_are_played_on_the_plant_they_know(name):
     for act in (law, nmpc):
         u = act(theta[None, :size])
         assert np.all(u >= case.mpc.u_min - 1e-9) and np.all(u <= case.mpc.u_max + 1e-9)
-
-
-@needs_pcgym
-@pytest.mark.parametrize("name", pcgym.HORIZONS)
-def test_the_polynomials_of_the_nmpc_end_where_the_plant_does(name):
-    import casadi
-
-    plant = pcgym.PCGymEnv(name)
-    n = len(plant.x0)
-    low, width = plant._box()
-    s = (plant.x0 - low[:n]) / width[:n]
-    v = np.full(len(plant.u_min), 0.7)
-    sample = pcgym_nmpc.collocated(plant)
-    z = casadi.MX.sym("z", sample.size1_in(2))
-    missed = casadi.Function("missed", [z], [sample(s, v, z)[1]])
-    inner = casadi.rootfinder("inner", "newton", missed)(np.tile(s, sample.size1_in(2) // n))
-    end = low[:n] + width[:n] * np.array(sample(s, v, inner)[0]).ravel()
-    wanted = plant.advance(plant.x0, low[n:] + width[n:] * v)
-    np.testing.assert_allclose(end, wanted, atol=2e-4 * width[:n].max())

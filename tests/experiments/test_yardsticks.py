@@ -1,51 +1,21 @@
-"""The yardsticks start where they claim to, and learn."""
-
-from functools import partial
+"""The yardsticks start where they claim to, and optima are those of the plants."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from experiments import optimum, yardsticks
-from experiments.yardsticks import cloned, maximum_entropy, residual_rl, sb3_ddpg, sb3_td3
-from sample_plants import Recorder
+from experiments import optimum
+from experiments.yardsticks import residual_rl
 from sb3_yann_envs import clipped_pendulum, cstr, problems
 
 ENVS = ["CSTR-v0", "ClippedPendulum-v0"]
-BUILDERS = [sb3_ddpg, sb3_td3, residual_rl, partial(residual_rl, noise=0.0), cloned]
-BUILDERS += [partial(maximum_entropy, algorithm=name) for name in ("SAC", "TQC")]
-
-
-def recorder(env_id: str) -> Recorder:
-    return Recorder(gym.make(env_id))
 
 
 def random_states(env: gym.Env, count: int = 200) -> np.ndarray:
     rng = np.random.default_rng(0)
     space = env.observation_space
     return rng.uniform(space.low, space.high, (count, *space.shape)).astype(np.float32)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("build", BUILDERS)
-@pytest.mark.parametrize("env_id", ENVS)
-def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, build, monkeypatch) -> None:
-    monkeypatch.setattr(yardsticks, "CLONING_STEPS", 20)
-    monkeypatch.setattr(yardsticks, "CLONING_SEEDS", range(500, 502))
-    env = recorder(env_id)
-    learner = build(lambda: env, 0)
-    states = random_states(env)
-    before, _ = learner.policy.predict(states)
-    learner.model.learn(150, callback=learner.callbacks)
-    for callback in learner.callbacks:
-        callback.steps = 100  # the second half is past the burn-in
-    learner.model.learn(150, callback=learner.callbacks, reset_num_timesteps=False)
-    after, _ = learner.policy.predict(states, deterministic=True)
-    assert len(env.pairs) == learner.model.num_timesteps == 300
-    assert after.shape == (len(states), 1) and np.any(after != before)
-    for actions in (after, env.recorded()[1]):
-        assert np.all(np.abs(actions) <= env.action_space.high)
 
 
 @pytest.mark.parametrize("env_id", ENVS)
@@ -118,12 +88,6 @@ def test_a_general_optimizer_finds_the_same_cost(env_id, start) -> None:
         options={"ftol": 1e-14, "gtol": 1e-9},
     )
     np.testing.assert_allclose(optimal([start], 8), found.fun, rtol=1e-6)
-
-
-def test_the_pendulum_swings_round_where_it_cannot_be_held() -> None:
-    held, swung = optimum.clipped_pendulum_optimum([[0.3, 0.0], [0.5, 0.8]], steps=100)
-    assert held < 5
-    assert 120 < swung < 127
 
 
 def test_the_temperature_limit_counts() -> None:
