@@ -508,8 +508,8 @@ def _solve(
     The dual method of Goldfarb & Idnani (Math. Programming 27, 1983).
     """
     gram = data["qp_gram"] + np.diag(extra)
-    # Where constraints give way multipliers are a million times as large as d, and sums round.
-    room = 1e-8 * (1 + np.abs(d).max()) if np.any(extra) else 1e-10 * (1 + np.abs(d))
+    # Where constraints give way multipliers are a million times violations, and sums round.
+    room = 1e-8 * (1 + max(-d.min(), 0.0)) if np.any(extra) else 1e-10 * (1 + np.abs(d))
     active: list[int] = []
     lam: Array = np.zeros(0)
     for _ in range(steps_of(data)):

@@ -76,16 +76,17 @@ def _slacks(d: Array, gram: Array, active: Integers, lam: Array, size: int, slac
 
 
 @compiled()
-def _most_violated(d: Array, slack: Array, least: float) -> int:
+def _most_violated(d: Array, slack: Array, soft: bool) -> int:
     """Return the constraint that is violated most, -1 if none is.
 
-    Hard ones may be violated by 1e-10, relative to 1 + |d|. Where constraints give way ``least`` is
-    the largest |d|, and 1e-8 of it is rounding: multipliers are a million times as large.
+    Hard ones may be violated by 1e-10, relative to 1 + |d|. Where constraints give way, 1e-8 of the
+    largest violation without any of them is rounding: multipliers are a million times as large.
     """
     worst = -1
     lowest = 0.0
+    far = max(-d.min(), 0.0)
     for j in range(len(d)):
-        room = 1e-8 * (1 + least) if least > 0 else 1e-10 * (1 + abs(d[j]))
+        room = 1e-8 * (1 + far) if soft else 1e-10 * (1 + abs(d[j]))
         if slack[j] < lowest and slack[j] < -room:
             worst = j
             lowest = slack[j]
@@ -250,7 +251,7 @@ def solve_batch(
         own_set = active[at]
         lam = multipliers[at]
         for _ in range(10 * (rows + 10)):
-            entering = _most_violated(d, slack, least)
+            entering = _most_violated(d, slack, soft)
             if entering < 0:
                 if _certified(d, gram, extra, own_set, lam, size, factor, slack, tolerance, least):
                     status[at] = SOLVED

@@ -118,16 +118,6 @@ static int qp_add(int entering, real violation, int size, int most, int soft)
     }
 }
 
-/* The largest |d|: where constraints give way, what is small beside it is rounding. */
-static real qp_largest(void)
-{
-    real largest = ZERO;
-    for (int j = 0; j < QP_ROWS; j++) {
-        largest = FABS(qp_d[j]) > largest ? FABS(qp_d[j]) : largest;
-    }
-    return largest;
-}
-
 /*
  * Solve anew for the active set in ascending order; return whether all conditions hold. Where
  * constraints give way multipliers are a million times as large as d, and sums of them round.
@@ -135,8 +125,10 @@ static real qp_largest(void)
 static int qp_is_optimal(int size, int soft)
 {
     const real tolerance = soft ? 1e-6 : 1e-9;
-    const real least = qp_largest();
-    real largest = ZERO;
+    real largest = ZERO, least = ZERO;
+    for (int j = 0; soft && j < QP_ROWS; j++) {
+        least = FABS(qp_d[j]) > least ? FABS(qp_d[j]) : least;
+    }
     for (int i = 1; i < size; i++) {
         const int own = qp_active[i];
         int k = i;
@@ -192,13 +184,16 @@ static int qp_solve(const real theta[N_THETA], int soft, real less[N_INPUTS])
             qp_d[j] += theta[i] * qp_D[i][j];
         }
     }
-    const real least = qp_largest();
     qp_slacks(0);
+    real far = ZERO; /* beside the largest violation 1e-8 is rounding where constraints give way */
+    for (int j = 0; j < QP_ROWS; j++) {
+        far = -qp_d[j] > far ? -qp_d[j] : far;
+    }
     for (int count = 0; count < QP_STEPS && size >= 0; count++) {
         int worst = -1;
         real lowest = ZERO;
         for (int j = 0; j < QP_ROWS; j++) {
-            const real room = soft ? 1e-8 * (ONE + least) : 1e-10 * (ONE + FABS(qp_d[j]));
+            const real room = soft ? 1e-8 * (ONE + far) : 1e-10 * (ONE + FABS(qp_d[j]));
             if (qp_slack[j] < lowest && qp_slack[j] < -room) {
                 worst = j;
                 lowest = qp_slack[j];
