@@ -103,13 +103,13 @@ class StateEstimator:
             raise ValueError(f"every = {every} must be one number, or one for each of {q} outputs.")
         self.every = np.resize(periods, q)
         self._period = int(np.lcm.reduce(self.every))
-        if self._period > 2000:
-            raise ValueError(
-                f"every = {self.every.tolist()}: all outputs are read together each "
-                f"{self._period:,} samples only, expected are at most 2,000. Pass numbers with "
-                "common factors, such as 60 for 61 and 59."
-            )
         if gain is None:
+            if self._period > max(2000, 2 * self.every.max()):
+                raise ValueError(
+                    f"every = {self.every.tolist()}: all outputs are read together each "
+                    f"{self._period:,} samples only, and the filter's gain would take too long. "
+                    "Pass numbers with common factors, such as 60 for 61 and 59."
+                )
             found = self._kalman_gain(linalg.block_diag(W, D), V, cross)
             if found is None:
                 raise ValueError(

@@ -226,16 +226,18 @@ def slack_costs(program: ParametricQP) -> tuple[Array, Array]:
 def slacks_made_cheap(program: ParametricQP) -> Array:
     """Return how many times as far as inputs move it each bound that `moderated` makes cheap gives.
 
-    Where a violation that the inputs can mend still costs a multiple of what they do, as it does in
-    all but the widest boxes, the law is the same: others are 0.
+    Where a violation that the inputs can mend still costs a thousand times what they do, as it does
+    in all but the widest boxes, the law is the same: others are 0.
     """
     inputs = len(program.c) - program.n_slacks
     ratio, largest = slack_costs(program)
+    linear = program.c[inputs:] * largest / np.mean(np.diag(program.H)[:inputs])
     own = np.abs(program.G[:, inputs:])
     moved = np.abs(program.G[:, :inputs]).sum(axis=1)[:, None]
     moved = np.divide(moved, own, out=np.zeros_like(own), where=own > 0).max(axis=0, initial=0.0)
     times = largest / np.maximum(moved, 1e-300)
-    return np.where((ratio > MILD) & (moved > 0) & (MILD < 10 * times**2), times, 0.0)
+    left = np.minimum(linear, MILD) / times + MILD / times**2
+    return np.where((ratio > MILD) & (moved > 0) & (left < 1e3), times, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

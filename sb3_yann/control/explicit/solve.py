@@ -282,7 +282,7 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Arr
         warn(
             f"Soft bounds may be violated {lessened.max():.0e} times as far in theta's box as "
             "inputs move what they bound. So large a cost rounding would hide, and it is lessened: "
-            "inputs differ from those that SoftBounds(penalty=) asks for. Pass as theta_min and "
+            "inputs may differ from those that the penalty asks for. Pass as theta_min and "
             "theta_max, or x_min and x_max, what the plant can reach, or a lower penalty."
         )
     return np.asarray(demanded.max(axis=0))
