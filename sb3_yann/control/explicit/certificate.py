@@ -185,10 +185,14 @@ class Certificate:
                 each < outer or all(a in self.by_set for a in kkt.across(each - outer))
                 for each in np.flatnonzero(known).tolist()
             ):
-                self._require_covered_across(self.regions[i], row)
+                self._require_covered_across(i, row)
 
-    def _require_covered_across(self, region: Region, row: int) -> None:
-        """Raise if no region touches a facet from the other side where that is feasible."""
+    def _require_covered_across(self, i: int, row: int) -> None:
+        """Raise if no region touches a facet from the other side where that is feasible.
+
+        In a wide box the law may not jump there: regions that are too thin to be met lie between.
+        """
+        region = self.regions[i]
         self.timer.tick(effort_of_lp(*region.A.shape) + self.qp_effort)
         middle, distance = largest_ball(region.A, region.b, row)
         for step in (1e-5, 1e-6, 1e-7):
@@ -203,6 +207,9 @@ class Certificate:
             if at is not None:
                 other = self.regions[at]
                 if min(np.min(other.b - other.A @ x) for x in (point, middle)) >= -INSIDE_TOL:
+                    jump = (self.laws[at] - self.laws[i]) @ np.append(middle, 1.0)
+                    if self.demanded > 1e4 and np.abs(jump).max() > LAW_TOL:
+                        self._fail(f"the law jumps at the edge of region {i}", middle)
                     return
             slacks = self._slacks(point)
             if np.max(slacks) < -INSIDE_TOL:

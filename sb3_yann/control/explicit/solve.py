@@ -44,6 +44,13 @@ def solve_explicit(
     """
     check_choice("solver", solver, ("walk", "ppopt"))
     demanded = float(require_sane_sizes(program, u_min, u_max).max(initial=0.0))
+    if demanded > 1e7:
+        raise ExplicitSolutionError(
+            "The box of theta is too wide for regions: in it the MPC asks for inputs "
+            f"{demanded:.0e} times their range, expected are at most 1e7. Pass as theta_min and "
+            "theta_max, or x_min and x_max, what the plant can reach; or use online(), which needs "
+            "no regions."
+        )
     timer.tick()
     try:
         units = ProgramUnits(program, u_min, u_max, timer)
