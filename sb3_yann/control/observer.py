@@ -104,11 +104,11 @@ class StateEstimator:
         self.every = np.resize(periods, q)
         self._period = int(np.lcm.reduce(self.every))
         if gain is None:
-            if self._period > max(2000, 2 * self.every.max()):
+            if self._period > max(20_000, 2 * self.every.max()):
                 raise ValueError(
                     f"every = {self.every.tolist()}: all outputs are read together each "
                     f"{self._period:,} samples only, and the filter's gain would take too long. "
-                    "Pass numbers with common factors, such as 60 for 61 and 59."
+                    "Pass numbers with common factors, such as 60 for 59 and 61."
                 )
             found = self._kalman_gain(linalg.block_diag(W, D), V, cross)
             if found is None:
@@ -238,26 +238,29 @@ class StateEstimator:
         return None
 
     def _gain_of_rates(self, W: Array, V: Array, cross: Array) -> Array:
-        """Return the mean gain of each output, over the samples at which it is read."""
-        periods = 40  # of all rates: the gain is that of the limit then
+        """Return the mean gain of each output, over the samples at which it is read, in the end."""
         A = self.A
         C = self.C_aug
-        total: Array = np.zeros((len(A), len(C)))
+        gain: Array = np.zeros((len(A), len(C)))
         _, (unit, _) = linalg.matrix_balance(A, permute=False, separate=True)
-        P = W + np.max(np.diag(W) / unit**2) * np.diag(unit**2)  # definite, whatever the units
-        for k in range(periods * self._period):
-            seen = np.flatnonzero(k % self.every == 0)
-            S = C[seen] @ P @ C[seen].T + V[np.ix_(seen, seen)]
-            own = np.linalg.solve(S, C[seen] @ P).T
-            next_step = np.linalg.solve(S, cross[:, seen].T).T
-            if k >= (periods - 1) * self._period:
-                total[:, seen] += own + before_step(A, next_step)
-            ahead = A @ own + next_step
-            moved = A - ahead @ C[seen]
-            shared = ahead @ cross[:, seen].T
-            of_sensors = ahead @ V[np.ix_(seen, seen)] @ ahead.T
-            P = moved @ P @ moved.T + W + of_sensors - shared - shared.T
-        return total / (self._period / self.every)
+        P = W + np.mean(np.diag(W) / unit**2) * np.diag(unit**2)  # definite, whatever the units
+        for _ in range(max(40, 100_000 // self._period)):  # some seconds at most
+            before = gain
+            gain = np.zeros_like(before)
+            for k in range(self._period):
+                seen = np.flatnonzero(k % self.every == 0)
+                S = C[seen] @ P @ C[seen].T + V[np.ix_(seen, seen)]
+                own = np.linalg.solve(S, C[seen] @ P).T
+                next_step = np.linalg.solve(S, cross[:, seen].T).T
+                gain[:, seen] += own + before_step(A, next_step)
+                ahead = A @ own + next_step
+                moved = A - ahead @ C[seen]
+                shared = ahead @ cross[:, seen].T
+                of_sensors = ahead @ V[np.ix_(seen, seen)] @ ahead.T
+                P = moved @ P @ moved.T + W + of_sensors - shared - shared.T
+            if np.allclose(gain, before, rtol=1e-9, atol=1e-12 * np.abs(gain).max()):
+                break
+        return gain / (self._period / self.every)
 
     def _radius(self, gain: Array) -> float:
         """Return by which factor the error of the estimate changes in a period, in the end."""

@@ -234,5 +234,5 @@ def test_the_filter_of_identified_outputs_does_not_depend_on_their_units() -> No
 
 
 def test_rates_that_hardly_ever_meet_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"every = \[61, 59\]: .* each 3,599 samples only"):
-        StateEstimator(THERMAL, every=[61, 59])
+    with pytest.raises(ValueError, match=r"every = \[997, 1009\]: .* each 1,005,973 samples"):
+        StateEstimator(THERMAL, every=[997, 1009])
