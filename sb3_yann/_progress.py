@@ -23,16 +23,19 @@ _silent = ContextVar("silent", default="TQDM_DISABLE" in os.environ)
 _parts = ContextVar("parts", default=False)
 
 
-def say(text: object, file: TextIO | None = None) -> None:
-    """Print on stdout, or in a file: all of this package's lines. None of them ends a training.
-
-    Characters that the file's encoding lacks are escaped.
-    """
+def answer(text: object, file: TextIO | None = None) -> None:
+    """Print on stdout, or in a file. Characters that its encoding lacks are escaped."""
     file = file or sys.stdout
-    encoding = getattr(file, "encoding", None) or "utf-8"
-    line = str(text).encode(encoding, "backslashreplace").decode(encoding)
+    line = str(text)
+    with suppress(LookupError, TypeError, AttributeError):  # a stream that names no encoding
+        line = line.encode(file.encoding, "backslashreplace").decode(file.encoding)
+    print(line, file=file)
+
+
+def say(text: object, file: TextIO | None = None) -> None:
+    """Print what is no command's answer: none of these lines ends a training."""
     with suppress(OSError, ValueError):  # a pipe whose reader has gone, a file that is closed
-        print(line, file=file)
+        answer(text, file)
 
 
 def is_watched() -> bool:

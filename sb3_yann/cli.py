@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_yann import __version__
-from sb3_yann._progress import say
+from sb3_yann._progress import answer, say
 from sb3_yann._validation import check_int, message_of
 
 
@@ -125,10 +125,10 @@ def _solve(options: Namespace) -> None:
             raise FileNotFoundError(f"There is no folder {path.parent}: make it first.")
     problem = _problem(options.problem)
     law = problem.explicit(time_limit=options.time_limit, region_limit=options.region_limit)
-    say(problem.report())
+    answer(problem.report())
     if options.save:
         law.save(options.save)
-        say(f"Written: {options.save}")
+        answer(f"Written: {options.save}")
 
 
 def _evaluate(options: Namespace) -> None:
@@ -141,7 +141,7 @@ def _evaluate(options: Namespace) -> None:
     model.policy.limit_correction(0.0)  # what is left is the MPC
     mpc = evaluation.evaluate(model, options.env, seeds)
     title = f"{options.episodes} episodes from seed {options.seed}: the MPC, and {options.model}"
-    say(evaluation.comparison_table(title, mpc, policy))
+    answer(evaluation.comparison_table(title, mpc, policy))
 
 
 def _plot(options: Namespace) -> None:
@@ -149,14 +149,14 @@ def _plot(options: Namespace) -> None:
 
     figure = new_figure()
     _law(options.law).plot(figure.subplots(), entries=tuple(options.axes))
-    say(f"Written: {save_figure(figure, options.picture, dpi=150)}")
+    answer(f"Written: {save_figure(figure, options.picture, dpi=150)}")
 
 
 def _report(options: Namespace) -> None:
     from sb3_yann import report as write
 
     seeds = _seeds(options.episodes)
-    say(f"Written: {write(_model(options.model), options.page, env=options.env, seeds=seeds)}")
+    answer(f"Written: {write(_model(options.model), options.page, env=options.env, seeds=seeds)}")
 
 
 def _export(options: Namespace) -> None:
@@ -173,7 +173,7 @@ def _export(options: Namespace) -> None:
         checks=_checks(options.checks),
         estimator=options.estimator,
     )
-    say(f"Written: {written}")
+    answer(f"Written: {written}")
 
 
 def _commission(options: Namespace) -> None:
@@ -190,10 +190,10 @@ def _commission(options: Namespace) -> None:
         verbose=1,
     )
     found.run(options.batches)
-    say(found.report())
+    answer(found.report())
     if options.save:
         model.save(options.save)
-        say(f"Written: {options.save}")
+        answer(f"Written: {options.save}")
 
 
 # ---- What an argument stands for ----

@@ -116,7 +116,13 @@ class OnlineLaw(PlantLaw):
 
     @classmethod
     def of(cls, program: ParametricQP, u_min: Array, u_max: Array, infeasible: str) -> OnlineLaw:
-        """Return the law of a program whose first variables are the inputs."""
+        """Return the law of a program whose first variables are the inputs.
+
+        Parameters
+        ----------
+        program, u_min, u_max, infeasible
+            As in :class:`OnlineLaw`.
+        """
         parts = {each.name: getattr(program, each.name) for each in fields(program)}
         return cls(**parts, u_min=u_min, u_max=u_max, infeasible=infeasible)
 

@@ -56,7 +56,7 @@ def known_answers(data: ControllerArrays, precision: str) -> dict[str, str]:
         change = np.abs(moved["actions"] - answers["actions"]) / ranges
         room_in_loop = max(room_in_loop, 10 * float(change.max()))
         unsure |= moved["status"] ^ answers["status"]
-    if precision == "float" and room_in_loop > 0.1:
+    if precision == "float" and room_in_loop > 1:
         raise ValueError(
             f"In float roundings of readings move the inputs of the estimator's loop by "
             f"{room_in_loop / 10:.0e} of their range: readings are large beside what they move by. "

@@ -223,7 +223,8 @@ class ImprovementGuard(BaseCallback):
     def __getstate__(self) -> dict[str, Any]:
         """Leave out of a copy what one `learn` shows, and what hears of its Ctrl-C."""
         of_learn = {"locals", "globals", "_handler", "_audit"}
-        return {name: each for name, each in vars(self).items() if name not in of_learn}
+        kept = {name: each for name, each in vars(self).items() if name not in of_learn}
+        return kept | {"locals": {}, "globals": {}}
 
     @property
     def state(self) -> GuardState:

@@ -226,7 +226,7 @@ class Certificate:
         n = self.program.F.shape[1]
         rng = np.random.default_rng(1)
         for points in [*rng.uniform(-1, 1, (n, 50, n)), *self._points_near_regions(rng)]:
-            self.timer.tick(len(points) * self.qp_effort)
+            self.timer.tick(50 * self.qp_effort)
             solved = [(point, self.program.solve(point)) for point in points]
             feasible = [(point, U) for point, U in solved if U is not None]
             if not feasible:
@@ -246,7 +246,7 @@ class Certificate:
         """Yield points (200, n) at all distances from regions that a wide box makes thin."""
         n = self.program.F.shape[1]
         middles = [np.clip(-self.center / self.half, -1, 1), *(middle for middle, _ in self.balls)]
-        for _ in range(20 * n if self.demanded > 1e4 else 0):
+        for _ in range(20 if self.demanded > 1e4 else 0):
             # Half of them about the operating point.
             chosen = np.array(middles)[
                 rng.integers(len(middles), size=200) * rng.integers(2, size=200)
