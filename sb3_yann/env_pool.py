@@ -161,7 +161,7 @@ class EnvPool:
         except BaseException:
             self.close()
             raise
-        self.close(200)  # of a pool
+        self.close(200)  # envs that a pool keeps
 
     def close(self, kept: int = 0) -> None:
         """Close all envs but so many."""

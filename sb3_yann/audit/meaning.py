@@ -121,7 +121,7 @@ def warn_of_signs(
             expected[~np.isfinite(effect)] = 0  # readings that come now and then
             effect = np.nan_to_num(effect)
             size = float(np.sum(expected**2))
-            # 1e-3: of the states' standard deviation: an effect that is smaller may be rounding
+            # An effect below 1e-3 of the states' standard deviation may be rounding.
             if size > 0 and np.linalg.norm(effect) > 1e-3:
                 gains.append(float(np.sum(effect * expected)) / size)
         if not starts or len(gains) < len(starts):
@@ -192,7 +192,7 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories) -> None:
     if np.count_nonzero(known) < 10 or not np.any(rewards[known]):  # steps that must be seen
         return
     share = max(explained(-cost, rewards, known) for cost in costs)
-    if share < 0.95:  # of the rewards' variance: they are another cost
+    if share < 0.95:  # explained of the rewards' variance: another cost
         warn(
             f"The env has a reward of its own, and it is ignored: the MPC's stage cost explains "
             f"{100 * share:.0f} % of it over {np.count_nonzero(known)} steps of the MPC. Weights "

@@ -103,8 +103,8 @@ class Record:
             except OSError as error:  # some file systems have no locks
                 if isinstance(error, BlockingIOError | PermissionError):
                     raise RuntimeError(
-                        f"Another process runs on {self.path}, and one record belongs to one run. "
-                        "End that process, or name another file."
+                        f"Another run has {self.path}, and one record belongs to one run. End that "
+                        "one, or name another file."
                     ) from error
             yield
 

@@ -54,7 +54,7 @@ class Gains(ReadOnlyArrays):
         found[2] *= integrators > 1
         widths = np.array([*errors] or np.zeros(found.shape))
         P = np.abs(projector(A, integrators))
-        # 1e-7: of a slope, relative to its parts
+        # Rounding of a slope is 1e-7 of its parts.
         parts = np.abs(found[1:3]) - 1e-7 * np.array([P @ np.abs(B), np.abs(A) @ P @ np.abs(B)])
         # 3.0: standard errors from which a state is said to go on and on
         moves_on, speeds_up = parts > 3.0 * widths[1:3]

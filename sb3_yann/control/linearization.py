@@ -245,7 +245,7 @@ def _steady_state(
     high = np.append(np.full(n, np.inf), simulator.space.high)
 
     def search(start: Array) -> tuple[Array, float]:
-        # 1e-3: in scales, as a float32 state needs: SciPy's own would vanish in its rounding
+        # Steps of 1e-3 scales: SciPy's own would vanish in the rounding of a float32 state.
         return _least_moved(motion, start, free, scale, 1e-3, (low, high))
 
     point, most = search(start)
@@ -568,7 +568,7 @@ def _rest_of(
 
     found: list[Array] = []
     begun = [np.where(free, start * scale, given) for start in STARTS]
-    # 1e-6: of the slopes that a search takes, in scales
+    # Slopes are taken over 1e-6 scales.
     tried = [_least_moved(motion, each, free, scale, 1e-6) for each in begun]
     for point, left in tried:
         # 1e-3: distance, in scales, from which two steady states are different ones

@@ -25,7 +25,7 @@ def riccati(
     A = np.sqrt(gamma) * model.A
     B = np.sqrt(gamma) * model.B
     # Inputs that cost their moves alone may rest anywhere: no more than rounding holds them.
-    # 1e-12: of the largest weight: it is given to all inputs where there is no solution without
+    # Where there is no solution, all inputs are given 1e-12 of the largest weight.
     for nudge in (0.0, 1e-12):
         weight = R + nudge * np.max(np.abs(R)) * np.eye(len(R))
         try:

@@ -288,7 +288,7 @@ def refine(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     price = 40.0 * (teacher.caution if is_family else 1.0)
     # 4: times as many steps, and as small ones, where a policy cannot know what plans do
     finer = 4 if is_family else 1
-    size = 0.1 / finer  # of an action in the first of these, root mean square
+    size = 0.1 / finer  # an action's first move, root mean square
     weight = 0.0
     last = teacher.mpc
     most = (False, -np.inf)
@@ -392,8 +392,7 @@ def _fit(
     """Fit a layer to actions (rows, m) at theta (rows, n_theta), see :meth:`LawLayer.descend`."""
     count = range(updates if len(at) else 0)
     shown = bar("the policy learns: steps of Adam", count, timed=True)
-    # 512: rows in a step of Adam
-    # 1e-2: of Adam at first; it falls to zero
+    # Batches of 512 rows; the rate begins at 1e-2 and falls to zero.
     steps = ((rng.integers(len(at), size=512), 1e-2 * (1 - k / updates)) for k in shown)
     layer.descend(at, to, largest, steps)
 

@@ -181,7 +181,7 @@ class Headroom:
         if costs is None:
             return f"not played: {self.why[name]}" if name in self.why else "not played"
         each = (costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
-        more = np.count_nonzero(each > 1e-9)  # of an episode's cost: so much more is the same
+        more = np.count_nonzero(each > 1e-9)  # 1e-9 of an episode's cost is rounding
         return (
             f"{change_in_percent(-gain(self.mpc_costs, costs))} as it was played, worst start "
             f"{change_in_percent(each.max())} of its own cost; {more} of {len(costs)} cost more"

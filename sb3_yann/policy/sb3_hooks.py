@@ -204,7 +204,7 @@ def warn_of_first_steps(policy: Any, algorithm: Any) -> None:
         return
     wrong = np.median(np.abs(rewards - expected)[most])
     typical = options.reward_scale * np.median(cost[most])
-    if wrong > 0.25 * typical:  # of the stage cost: a reward that differs by more is another one
+    if wrong > 0.25 * typical:  # a reward that differs by a quarter is another cost
         warn(
             f"Rewards are not the MPC's cost: of the first {len(rewards)} steps half of the most "
             f"costly {np.count_nonzero(most)} differ by {wrong:.3g} or more from what the critic, "

@@ -332,7 +332,7 @@ def _other_pace(log: Logged) -> Iterator[str]:
         rest -= rest.mean(axis=0)
         u = (log.inputs - log.inputs.mean(axis=0))[:, None] * (driven / log.unit[:, None])
         gains = np.linalg.lstsq(u.reshape(-1, m), rest.ravel(), rcond=1e-9)[0]
-        # 1e-9: of a half-width: an input that moves by less stands still
+        # An input that moves by less than 1e-9 of a half-width stands still.
         left.append(np.var(rest - u @ gains, axis=0) + 1e-9)
     ratio = np.array(left) / left[0]
     best = int(np.argmin(ratio.mean(axis=1)))

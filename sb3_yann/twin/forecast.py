@@ -94,7 +94,7 @@ class _Replays:
             self.errors = np.where(alive, self.errors - remembered, 0.0)
         number = np.arange(len(episodes))
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
-        # 1e-20: of squared errors, in how far the states move
+        # Squared errors of 1e-20 of how far the states move are none.
         sizes = np.log(np.sum(unseen**2, axis=-1) + 1e-20)
         self.left = np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0)
 
@@ -182,8 +182,8 @@ class _Replays:
             weights.append(_ridge(z[fit], e[fit]))
             rests = e - z @ weights[-1], e - z[..., :plain] @ _ridge(z[fit][:, :plain], e[fit])
             left += [np.sum((each[test] / self.units) ** 2) for each in rests]
-        # 0.02: share of the errors of one step that it must explain on held-out episodes
-        self.explains = bool(left[0] < (1 - 0.02) * left[1])
+        # It must explain 2 % of the errors of one step on held-out episodes.
+        self.explains = bool(left[0] < 0.98 * left[1])
         return np.array(weights)
 
 
@@ -192,7 +192,7 @@ def _ridge(z: Array, y: Array) -> Array:
     size = np.sqrt(np.mean(z**2, axis=0))
     size = np.where(size > 0, size, 1.0)
     z = z / size
-    gram = z.T @ z + 1e-3 * len(z) * np.eye(z.shape[1])  # of its standardized regressors
+    gram = z.T @ z + 1e-3 * len(z) * np.eye(z.shape[1])  # a ridge of standardized regressors
     return np.asarray(np.linalg.solve(gram, z.T @ y) / size[:, None])
 
 
@@ -216,7 +216,7 @@ def forecast(
     independent = sum(len(each[::2]) for each in records(problem, episodes))
     count = len(episodes)
     rng = np.random.default_rng(0)
-    some = -(-100 // count)  # from new starts, at least
+    some = -(-100 // count)  # so that a hundred runs begin anew
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
     plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
     logged = np.stack([each.thetas[:1] for each in episodes]), None

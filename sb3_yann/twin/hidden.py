@@ -23,10 +23,10 @@ GUESS = 1e-5  # weight of the given states where windows begin, beside the outpu
 
 
 def shoot(
-    # 1e-2: weight of states that another fit found: the hidden ones keep their coordinates
     coordinates: Coordinates,
     episodes: Sequence[Episode],
     setting: Setting,
+    # Weight of states that another fit found: the hidden ones keep their coordinates.
     trust: float = 1e-2,
 ) -> tuple[Residual, list[Episode]]:
     """Return the residual of the plant's states, and episodes with the states that it found.
@@ -129,7 +129,7 @@ def _descended(
 
     damping = 1e-2
     cost, e, J = judged(weights, begin)
-    for _ in range(15):  # of a search, at most
+    for _ in range(15):  # corrections, at most
         of_begin, of_weights = np.split(J, [n], axis=2)
         own = of_begin.swapaxes(1, 2) @ of_begin + trust * np.eye(n)
         cross = of_weights.swapaxes(1, 2) @ of_begin

@@ -244,7 +244,7 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
     if not parts.n_disturbances:
         return
     d_min, d_max = (each[parts.disturbance] for each in (own.theta_min, own.theta_max))
-    # 1e-6: so near to its bound, relative to their distance, an estimate may lie beyond it
+    # An estimate may lie beyond its bound by 1e-6 of the bounds' distance.
     room = 1e-6 * (d_max - d_min)
     errors = []
     moves = []

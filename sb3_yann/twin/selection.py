@@ -220,7 +220,7 @@ class _Networks:
         )
         turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
         per_turn = th.where(turn > 0, 1 / turn, 0.0)
-        adam = th.optim.Adam(self.weights, lr=1e-3)  # of Adam at first; it falls to zero
+        adam = th.optim.Adam(self.weights, lr=1e-3)  # at first; it falls to zero
         schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
         for _ in bar("networks of a model: steps of Adam", range(updates), timed=True):
             # 32: windows of a log in a step of Adam
@@ -273,7 +273,7 @@ def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
     """Return the linear part (k, n) of y, and the deviation (1, n) of what it leaves."""
     about = z - z.mean(axis=0)
     y = y - y.mean(axis=0)
-    # 1e-6: of the linear part, relative to the variance of what it is fitted to
+    # The ridge of the linear part, relative to the variance of what it is fitted to.
     ridge = 1e-6 * (np.trace(about.T @ about) / z.shape[1] + 1e-300)
     linear = np.linalg.solve(about.T @ about + ridge * np.eye(z.shape[1]), about.T @ y)
     left = y - about @ linear

@@ -253,7 +253,7 @@ def test_ctrl_c_while_an_event_is_noted_waits_until_it_holds(tmp_path, monkeypat
 def test_a_second_run_on_a_record_is_refused_before_it_plays(tmp_path) -> None:
     run = commission(tmp_path)
     with Record(run.journal.record.path).locked():
-        with pytest.raises(RuntimeError, match=r"plant\.jsonl.* End that process, or name another"):
+        with pytest.raises(RuntimeError, match=r"plant\.jsonl.* End that one, or name another"):
             run.run(1)
     assert [each["event"] for each in events(tmp_path)] == ["begin"]
     with run.journal.record.locked():

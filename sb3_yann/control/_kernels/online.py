@@ -229,9 +229,9 @@ def solve_batch(
     """
     rows = len(d0)
     soft = bool(np.any(extra > 0))
-    # 1e-9: of an answer: the same, and of multipliers relative to 1 + the largest.
-    # 1e-6: the same where constraints give way, relative to 1 + the largest |d|. Multipliers are
-    # violations over softness, a million times as large as d: sums of them round.
+    # An answer may violate a constraint by 1e-9 of 1 + |d|, and multipliers by as much of 1 + the
+    # largest. Where constraints give way it is 1e-6, of 1 + the largest |d|: multipliers are
+    # violations over softness, a million times as large as d, and sums of them round.
     tolerance = 1e-6 if soft else 1e-9
     factor = np.empty((most, most))
     step = np.empty(most)

@@ -190,7 +190,8 @@ class Certificate:
     def _require_covered_across(self, i: int, row: int) -> None:
         """Raise if no region touches a facet from the other side where that is feasible.
 
-        In a wide box the law may not jump there: regions that are too thin to be met lie between.
+        In a wide box a law that jumps there is looked at closely: between may lie regions that are
+        too thin to be met.
         """
         region = self.regions[i]
         self.timer.tick(effort_of_lp(*region.A.shape) + self.qp_effort)
@@ -209,7 +210,8 @@ class Certificate:
                 if min(np.min(other.b - other.A @ x) for x in (point, middle)) >= -INSIDE_TOL:
                     jump = (self.laws[at] - self.laws[i]) @ np.append(middle, 1.0)
                     if self.demanded > 1e4 and np.abs(jump).max() > LAW_TOL:
-                        self._fail(f"the law jumps at the edge of region {i}", middle)
+                        outward = region.A[row]
+                        self._require_right([middle + k * outward for k in (1e-10, 1e-9, 1e-8)])
                     return
             slacks = self._slacks(point)
             if np.max(slacks) < -INSIDE_TOL:
@@ -227,20 +229,24 @@ class Certificate:
         rng = np.random.default_rng(1)
         for points in [*rng.uniform(-1, 1, (n, 50, n)), *self._points_near_regions(rng)]:
             self.timer.tick(50 * self.qp_effort)
-            solved = [(point, self.program.solve(point)) for point in points]
-            feasible = [(point, U) for point, U in solved if U is not None]
-            if not feasible:
-                continue
-            at, inputs = (np.array(each) for each in zip(*feasible, strict=True))
-            slacks = self._slacks(at)
-            nearest = np.argmax(slacks, axis=1)
-            k = int(np.argmin(slacks.max(axis=1)))
-            if slacks[k, nearest[k]] < -INSIDE_TOL:
-                self._fail("no region covers a feasible parameter", at[k])
-            error = self._error(nearest, at, inputs)
-            k = int(np.argmax(error))
-            if error[k] > LAW_TOL:
-                self._fail(f"the law of region {nearest[k]} violates the KKT conditions", at[k])
+            self._require_right(points)
+
+    def _require_right(self, points: Iterable[Array]) -> None:
+        """Raise unless QPs at points (n,) agree with the regions there."""
+        solved = [(point, self.program.solve(point)) for point in points]
+        feasible = [(point, U) for point, U in solved if U is not None]
+        if not feasible:
+            return
+        at, inputs = (np.array(each) for each in zip(*feasible, strict=True))
+        slacks = self._slacks(at)
+        nearest = np.argmax(slacks, axis=1)
+        k = int(np.argmin(slacks.max(axis=1)))
+        if slacks[k, nearest[k]] < -INSIDE_TOL:
+            self._fail("no region covers a feasible parameter", at[k])
+        error = self._error(nearest, at, inputs)
+        k = int(np.argmax(error))
+        if error[k] > LAW_TOL:
+            self._fail(f"the law of region {nearest[k]} violates the KKT conditions", at[k])
 
     def _points_near_regions(self, rng: np.random.Generator) -> Iterator[Array]:
         """Yield points (200, n) at all distances from regions that a wide box makes thin."""

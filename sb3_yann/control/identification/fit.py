@@ -215,7 +215,7 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
         usual, rare = np.quantile([*map(len, runs)], [0.5, 0.95])
         moves = np.abs(np.concatenate([np.diff(x[:, i]) for x in states]))
         steps = moves[moves > 0] / np.min(moves[moves > 0], initial=np.inf)
-        # 1e-3: of a step of a sensor: readings that are off by more do not count in steps
+        # Readings that are off by more than 1e-3 of a sensor's step do not count in steps.
         on_grid = bool(np.all(np.abs(steps - np.round(steps)) < 1e-3))
         # A frozen sensor shows ten equal readings in a row, and ten times as many as usual.
         least = max(10, 10.0 * usual, 6 * rare if on_grid else 0.0)

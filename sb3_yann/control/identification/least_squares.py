@@ -196,7 +196,7 @@ def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
 
 def gains_of(found: Regression) -> Gains:
     """Return what held inputs do to states in the end, with errors by the delta method."""
-    step = 1e-3  # of a standard deviation, in which responses are linear
+    step = 1e-3  # standard deviations, in which responses are linear
     n, m, _ = found.sizes
     A, B = np.split(found.coefficients[:, : n + m], [n], axis=1)
     part = found.correlation[: n + m, : n + m]

@@ -322,7 +322,7 @@ def _regressed(episodes: Sequence[Episode], slow: NDArray[np.bool_]) -> list[Arr
         at = np.isfinite(y[:, i])
         count = max(at.sum(), 1)  # the part that is fitted may have none
         mean = y[at, i].sum() / count
-        # 1e-3: of the number of readings: filtered signals depend on each other
+        # A ridge of 1e-3 of the number of readings: filtered signals depend on each other.
         gram = rows[at].T @ rows[at] + 1e-3 * count * np.eye(rows.shape[1])
         found[:, i] = mean + rows @ np.linalg.solve(gram, rows[at].T @ (y[at, i] - mean))
     return np.split(found, np.cumsum([*map(len, parts)])[:-1])
