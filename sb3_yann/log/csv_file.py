@@ -16,7 +16,6 @@ import numpy as np
 from sb3_yann._validation import Array, warn
 
 SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86400}  # in a unit of time
-WORDS = {"sec": "s", "min": "min", "hour": "h", "hr": "h", "day": "d"}  # how headers begin them
 
 
 class CsvFile:
@@ -102,7 +101,8 @@ class CsvFile:
     def times(self, name: str, unit: str) -> tuple[Array, str]:
         """Return a column of times (rows,) in a unit, and the unit: without one the header's."""
         own = self.name_and_unit(name)[1]
-        own = next((s for word, s in WORDS.items() if own.lower().startswith(word)), own)
+        words = {"sec": "s", "min": "min", "hour": "h", "hr": "h", "day": "d"}
+        own = next((short for word, short in words.items() if own.lower().startswith(word)), own)
         unit = unit or own
         instants, stamped = np.array([self._time(k, name, unit) for k in range(len(self.rows))]).T
         if np.any(stamped):

@@ -152,6 +152,7 @@ def part_of(title: str, content: Iterable[Any], *findings: Finding) -> Part:
 
 
 NOT_SHOWN = part_of("", [])
+"""A part without content, which is left out of the page."""
 
 
 def is_rewarded(loops: Mapping[str, Trajectories]) -> bool:

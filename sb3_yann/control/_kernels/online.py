@@ -76,17 +76,15 @@ def _slacks(d: Array, gram: Array, active: Integers, lam: Array, size: int, slac
 
 
 @compiled()
-def _most_violated(d: Array, slack: Array, soft: bool) -> int:
+def _most_violated(d: Array, slack: Array, rounding: float) -> int:
     """Return the constraint that is violated most, -1 if none is.
 
-    Hard ones may be violated by 1e-10, relative to 1 + |d|. Where constraints give way, 1e-8 of the
-    largest violation without any of them is rounding: multipliers are a million times as large.
+    Each may be by ``rounding``; where that is 0, by 1e-10, relative to 1 + |d|.
     """
     worst = -1
     lowest = 0.0
-    far = max(-d.min(), 0.0)
     for j in range(len(d)):
-        room = 1e-8 * (1 + far) if soft else 1e-10 * (1 + abs(d[j]))
+        room = rounding if rounding > 0 else 1e-10 * (1 + abs(d[j]))
         if slack[j] < lowest and slack[j] < -room:
             worst = j
             lowest = slack[j]
@@ -246,12 +244,14 @@ def solve_batch(
                 d[j] += own * D[i, j]
         slack[:] = d
         least = np.abs(d).max() if soft else 0.0
+        # Beside the largest violation: multipliers are a million times as large where it gives way.
+        rounding = 1e-8 * (1 + max(-d.min(), 0.0)) if soft else 0.0
         size = 0
         status[at] = UNCERTIFIED
         own_set = active[at]
         lam = multipliers[at]
         for _ in range(10 * (rows + 10)):
-            entering = _most_violated(d, slack, soft)
+            entering = _most_violated(d, slack, rounding)
             if entering < 0:
                 if _certified(d, gram, extra, own_set, lam, size, factor, slack, tolerance, least):
                     status[at] = SOLVED

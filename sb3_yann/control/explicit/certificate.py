@@ -251,12 +251,11 @@ class Certificate:
     def _points_near_regions(self, rng: np.random.Generator) -> Iterator[Array]:
         """Yield points (200, n) at all distances from regions that a wide box makes thin."""
         n = self.program.F.shape[1]
-        middles = [np.clip(-self.center / self.half, -1, 1), *(middle for middle, _ in self.balls)]
+        rest = np.clip(-self.center / self.half, -1, 1)
+        middles = np.array([rest, *(middle for middle, _ in self.balls)])
         for _ in range(20 if self.demanded > 1e4 else 0):
             # Half of them about the operating point.
-            chosen = np.array(middles)[
-                rng.integers(len(middles), size=200) * rng.integers(2, size=200)
-            ]
+            chosen = middles[rng.integers(len(middles), size=200) * rng.integers(2, size=200)]
             far = 10 ** rng.uniform(-10, 0, (200, 1)) * rng.uniform(-1, 1, (200, n))
             yield np.clip(chosen + far, -1, 1)
 

@@ -282,10 +282,10 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Arr
             "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
             "bound, and use online()."
         )
-    if not np.all(np.isfinite(width)):
-        return np.asarray(demanded.max(axis=0))
-    scaled, _ = program.scaled(u_min, u_max, 0 * program.theta_min)
-    if np.any(lessened := slacks_made_cheap(scaled)):
+    lessened = np.zeros(0)
+    if program.n_slacks and np.all(np.isfinite(width)):
+        lessened = slacks_made_cheap(program.scaled(u_min, u_max, 0 * program.theta_min)[0])
+    if np.any(lessened):
         warn(
             f"Soft bounds may be violated {lessened.max():.0e} times as far in theta's box as "
             "inputs move what they bound. So large a cost rounding would hide, and it is lessened: "
