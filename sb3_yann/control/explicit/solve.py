@@ -282,7 +282,7 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Arr
             "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
             "bound, and use online()."
         )
-    lessened = np.zeros(0)
+    lessened: Array = np.zeros(0)
     if program.n_slacks and np.all(np.isfinite(width)):
         lessened = slacks_made_cheap(program.scaled(u_min, u_max, 0 * program.theta_min)[0])
     if np.any(lessened):
