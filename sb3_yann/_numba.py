@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from functools import cache
+from multiprocessing.spawn import get_executable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +19,7 @@ from sb3_yann._progress import say
 
 Integers = NDArray[np.int64]
 F = TypeVar("F", bound=Callable[..., Any])
+compiles_apart = False  # whether this process compiles for another
 
 
 def compiled_sources(package: Path) -> list[Path]:
@@ -62,12 +65,36 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
         if not hasattr(kept, "_source_stamp"):  # another numba: rather slow than out of date
             raise AttributeError("numba keeps no stamp of the sources.")
         kept._source_stamp = SOURCES
+        codegen = dispatcher.targetctx.codegen()
+        keys = {dispatcher._cache._index_key(each, codegen) for each in signatures}
+        if not keys <= set(kept._load_index()):
+            _compile_apart(dispatcher.py_func.__module__)
     for signature in signatures:
         dispatcher.compile(signature)
     dispatcher.disable_compile()
     if not keep or dispatcher.stats.cache_misses:
         _say(keep)
     return dispatcher
+
+
+@cache
+def _compile_apart(module: str) -> None:
+    """Let another process compile a module and all of this package, so that this one loads it.
+
+    What one process compiles shares functions, what it loads does not, and with ``fastmath`` two
+    copies sum in different orders: a training would depend on who compiled.
+    """
+    if compiles_apart or module == "__main__":
+        return
+    _say(keep=True)
+    package = Path(__file__).parent
+    own = [each.relative_to(package.parent).with_suffix("") for each in compiled_sources(package)]
+    names = [module, *(".".join(each.parts) for each in own)]
+    code = (
+        f"import sys; sys.path[:] = {sys.path}; from sb3_yann import _numba; "
+        f"_numba.compiles_apart = True; [__import__(each) for each in {names}]"
+    )
+    subprocess.run([get_executable(), "-c", code], stdin=subprocess.DEVNULL, capture_output=True)
 
 
 @cache

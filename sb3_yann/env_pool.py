@@ -13,11 +13,11 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.vector import VectorEnv
 
-from sb3_yann._validation import check_type
+from sb3_yann._validation import check_type, half_widths
 from sb3_yann.control.simulator import require_makes
+from sb3_yann.units import same_bounds
 
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
 
@@ -204,14 +204,17 @@ def require_like_training(source: Source | EnvPool, training_env: Any, name: str
 def require_like(env: Any, other: Any, name: str, whose: str) -> None:
     """Raise ValueError unless an env shows and takes what another one does, or a model.
 
-    The bounds of the actions may be rounded.
+    The bounds of the actions may be rounded. Copies that step as one array are one env.
     """
-    (x, u), (other_x, other_u) = ((e.observation_space, e.action_space) for e in (env, other))
+    names = ("observation_space", "action_space")
+    x, u = (getattr(env, f"single_{each}", getattr(env, each)) for each in names)
+    other_x, other_u = (getattr(other, each) for each in names)
     same = x.shape == other_x.shape and u.shape == other_u.shape
-    if not same or not np.allclose([u.low, u.high], [other_u.low, other_u.high], rtol=1e-4):
+    wanted = (other_u.low, other_u.high)
+    if not same or not same_bounds((u.low, u.high), wanted, half_widths(*wanted)):
         raise ValueError(
             f"{name} has observations of shape {x.shape} and {u}, {whose} {other_x.shape} and "
-            f"{other_u}. Give it a simulator of this plant, or the plant."
+            f"{other_u}. Give it a simulator of this plant, or the plant, in the same wrappers."
         )
 
 

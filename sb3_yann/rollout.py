@@ -22,7 +22,7 @@ from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.mpc.bound_excess import BoundExcess, costs_of
 from sb3_yann.control.wrapper_stack import require_state_shown
-from sb3_yann.env_pool import EnvPool, Source, vector_env_of
+from sb3_yann.env_pool import EnvPool, Source, require_like, vector_env_of
 from sb3_yann.units import same_bounds
 
 Rows = NDArray[np.intp]
@@ -237,7 +237,11 @@ def as_controller(policy: Any) -> Controller:
         )
     if hasattr(policy, "predict"):
         predict = policy.predict
-        return lambda t, observations, rows: predict(observations, deterministic=True)[0]
+        normalize = getattr(policy, "get_vec_normalize_env", lambda: None)()
+        if normalize is None:
+            return lambda t, observations, rows: predict(observations, deterministic=True)[0]
+        shown = normalize.normalize_obs  # to a model, of an env below it
+        return lambda t, observations, rows: predict(shown(observations), deterministic=True)[0]
     if not callable(policy):
         raise TypeError(f"policy = {policy!r} must have a predict method or be callable.")
     act = policy
@@ -512,18 +516,13 @@ def as_played(name: str, value: Trajectories) -> Trajectories:
 
 
 def _require_fit(policy: Any, env: Any) -> None:
-    """Raise where a model's shapes are not the env's, or a law does not see the state.
+    """Raise where a model's spaces are not the env's, or a law does not see the state.
 
-    Or where the env takes deviations, and the law's plant has an operating point.
+    Or where the env takes deviations, and the law's plant has an operating point, or inputs that
+    do not hold the law's.
     """
-    for name in ("observation_space", "action_space"):
-        own = getattr(getattr(policy, name, None), "shape", None)
-        its = getattr(env, f"single_{name}", getattr(env, name)).shape
-        if own is not None and own != its:
-            raise ValueError(
-                f"The model's {name} has the shape {own}, the env's {its}: the env is of another "
-                "problem, or lacks the model's wrappers."
-            )
+    if isinstance(getattr(policy, "action_space", None), gym.spaces.Box):
+        require_like(env, policy, "env", "the model")
     acts = getattr(policy, "policy", policy)  # a model's
     owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
     is_law = isinstance(owner, PiecewiseAffine | OnlineLaw)
@@ -533,12 +532,22 @@ def _require_fit(policy: Any, env: Any) -> None:
     model = getattr(policy, "model", None)
     if not isinstance(policy, PiecewiseAffine | OnlineLaw) or not isinstance(model, LinearModel):
         return
-    if not isinstance(space, gym.spaces.Box) or not np.any(model.u_ss):
+    if not isinstance(space, gym.spaces.Box):
         return
-    own = (policy.u_min, policy.u_max)
-    if same_bounds((space.low, space.high), own, half_widths(*own)):
+    takes = f"The env takes inputs from {space.low.tolist()} to {space.high.tolist()}"
+    own = (policy.u_min, policy.u_max)  # in deviations
+    half = half_widths(*own)
+    if np.any(model.u_ss) and same_bounds((space.low, space.high), own, half):
         raise ValueError(
-            f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "
-            f"the law is of a plant with u_ss = {model.u_ss.tolist()}. Leave x_ss and u_ss out of "
-            "the model, or take the env in plant units."
+            f"{takes}, which are deviations, and the law is of a plant with u_ss = "
+            f"{model.u_ss.tolist()}. Leave x_ss and u_ss out of the model, or take the env in "
+            "plant units."
+        )
+    low, high = (each + model.u_ss for each in own)
+    beyond = (space.low > low + 0.01 * half) & np.isfinite(low)
+    beyond |= (space.high < high - 0.01 * half) & np.isfinite(high)
+    if np.any(beyond):
+        warn(
+            f"{takes}, and the law's are from {low.tolist()} to {high.tolist()}: if the env is in "
+            "other units, wrap it in gymnasium.wrappers.RescaleAction(env, mpc.u_min, mpc.u_max)."
         )

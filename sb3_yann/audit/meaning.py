@@ -122,7 +122,7 @@ def warn_of_signs(
             effect = np.nan_to_num(effect)
             size = float(np.sum(expected**2))
             # An effect below 1e-3 of the states' standard deviation may be rounding.
-            if size > 0 and np.linalg.norm(effect) > 1e-3:
+            if size > 0 and max(np.linalg.norm(effect), 0.01 * size**0.5) > 1e-3:
                 gains.append(float(np.sum(effect * expected)) / size)
         if not starts or len(gains) < len(starts):
             continue
@@ -134,20 +134,24 @@ def warn_of_signs(
                 f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "
                 "the wrong way. Look at the sign and the order of the actions, and at B.",
             )
-        elif min(gains) > FAR or (0 < min(gains) and max(gains) < 1 / FAR):
+        elif min(gains) > FAR or (0 <= min(gains) and max(gains) < 1 / FAR):
             warnings.append(
                 f"{name} moves the env otherwise than the model's B says: {found}. Is a step of "
                 f"the env the model's dt, {model.step_length}, and the input in the "
-                "same unit? Else identify the model anew.",
+                "same unit? Does it act, and without a delay? Else identify the model anew.",
             )
-    swapped = _swapped(modelled, answers) if estimating is not None else ""
+    swapped = _swapped(modelled, answers, spread, estimating is not None)
     for words in [swapped] if swapped else warnings:
         warn(words)
     return taken
 
 
-def _swapped(modelled: Array, answers: Array) -> str:
-    """Return in which other order alone outputs answer pushes (m, steps, q) as the model says."""
+def _swapped(modelled: Array, answers: Array, spread: Array, outputs: bool) -> str:
+    """Return in which other order alone what is shown answers pushes as the model says.
+
+    Pushes and answers have the shape (m, steps, q). States may have their order: it is looked at by
+    `warn_of_order`.
+    """
 
     def likeness(shown: Sequence[int], taken: Sequence[int]) -> float:
         both = np.stack([answers[:, :, shown], modelled[[*taken]]]) / units
@@ -156,16 +160,19 @@ def _swapped(modelled: Array, answers: Array) -> str:
         return float(np.min(both.prod(axis=0).sum(axis=-1) / sizes))
 
     m, _, q = modelled.shape
-    units = np.maximum(np.linalg.norm(modelled, axis=(0, 1)), 1e-300)
-    orders = [*product(permutations(range(q)), permutations(range(m)))] if max(q, m) <= 4 else []
+    units = np.linalg.norm(modelled, axis=(0, 1)) if outputs else spread
+    units = np.where(units > 0, units, np.inf)
+    shows = permutations(range(q)) if outputs else [tuple(range(q))]
+    orders = [*product(shows, permutations(range(m)))] if max(q * outputs, m) <= 4 else []
     found = max(orders, key=lambda each: likeness(*each), default=None)
     # The cosines of answers to pushes and the model's: these are others, or in another order.
     if found is None or not likeness(range(q), range(m)) < 0.7 < 0.95 < likeness(*found):
         return ""
     return (
-        f"The env seems to show the model's outputs in the order {np.argsort(found[0]).tolist()}, "
-        f"and to take its inputs in the order {[*found[1]]}: so it answers pushes as the model "
-        "says, and as it is it does not. Sort what it shows, or takes, as the model has it."
+        f"The env seems to show the model's {'outputs' if outputs else 'states'} in the order "
+        f"{np.argsort(found[0]).tolist()}, and to take its inputs in the order {[*found[1]]}: so "
+        "it answers pushes as the model says, and as it is it does not. Sort what it shows, or "
+        "takes, as the model has it."
     )
 
 

@@ -27,6 +27,11 @@ from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.watchdog import Alarm
 from sb3_yann.twin.log import SHORTEST
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
 Event = dict[str, Any]
 NAME = "commissioning.jsonl"
 BEGIN = b'{"event": "begin"'
@@ -92,13 +97,9 @@ class Record:
         with self.path.open("ab") as file:
             try:
                 if sys.platform == "win32":
-                    import msvcrt
-
                     file.seek(2**30)  # where nobody reads or writes
                     msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
                 else:
-                    import fcntl
-
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:  # some file systems have no locks
                 if isinstance(error, BlockingIOError | PermissionError):
@@ -106,7 +107,11 @@ class Record:
                         f"Another run has {self.path}, and one record belongs to one run. End that "
                         "one, or name another file."
                     ) from error
-            yield
+            try:
+                yield
+            finally:  # a process that was forked meanwhile holds the file open
+                if sys.platform != "win32":
+                    fcntl.flock(file, fcntl.LOCK_UN)
 
     def append(self, event: Event) -> None:
         """Add an event; when this returns it is on the disk."""

@@ -265,11 +265,19 @@ def test_a_guard_names_an_input_of_the_other_sign(gains: Any) -> None:
 
 
 @pytest.mark.parametrize("gains", [(3, 0.2), (5, 1), (1, 1)])
-def test_another_gain_and_dead_time_are_no_other_sign_and_far_ones_are_told(gains: Any) -> None:
+def test_another_gain_is_no_other_sign_and_far_ones_and_dead_time_are_told(gains: Any) -> None:
     make = lambda: StageCost(Plant(gains, late=gains == (1, 1)), STEERED)  # noqa: E731
-    told = said(lambda: guarded(STEERED, make), "moves the env")
-    far = {(3, 0.2): "heater moves the env otherwise", (5, 1): "valve moves the env otherwise"}
-    assert [each.split(" than")[0] for each in told] == [v for k, v in far.items() if k == gains]
+    told = said(lambda: guarded(STEERED, make), "moves the env otherwise")
+    far = {(3, 0.2): ["heater"], (5, 1): ["valve"], (1, 1): ["valve", "heater"]}
+    assert [each.split()[0] for each in told] == far[gains]
+    assert all("0 times as far" in each for each in told) == (gains == (1, 1))
+
+
+def test_inputs_in_another_order_are_told() -> None:
+    space = Plant.action_space
+    turned = lambda: gym.wrappers.TransformAction(Plant((1, 1)), lambda u: u[::-1], space)  # noqa: E731
+    told = said(lambda: guarded(STEERED, lambda: StageCost(turned(), STEERED)), "answers pushes")
+    assert len(told) == 1 and "states in the order [0, 1], and to take its inputs in" in told[0]
 
 
 def test_headroom_tells_it_too_and_improve_though_its_steps_are_few() -> None:

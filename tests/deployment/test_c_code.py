@@ -141,12 +141,13 @@ def test_readings_that_are_large_beside_their_box_are_exported(precision, tmp_pa
     assert self_test(tmp_path).returncode == 0
 
 
-def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
+@pytest.mark.parametrize("file", ["plant.c", "plant.st", "plant.xml"])
+def test_float_beside_a_huge_operating_point_is_refused(file, tmp_path):
     model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, x_ss=[1e8, 0], u_ss=[0])
     bounds = {"x_min": [1e8 - 5, -2], "x_max": [1e8 + 5, 2], "u_min": -1, "u_max": 1}
     law = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds).explicit()
     with pytest.raises(ValueError, match="Pass precision='double'"):
-        export(law, tmp_path / "plant.c", precision="float")
+        export(law, tmp_path / file, precision="float")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -7,11 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import unit_samples as units
 from sb3_yann._validation import message_of
 from sb3_yann.env_pool import EnvPool
 from sb3_yann.evaluation import Trajectories, evaluate
+from sb3_yann.policy import AffineObservation
 
 SEEDS = range(3)
 
@@ -130,8 +132,33 @@ def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> 
 
 def test_a_model_of_another_env_is_named() -> None:
     model = DDPG("YannPolicy", "ClippedPendulum-v0", device="cpu")
-    with pytest.raises(ValueError, match=r"observation_space has the shape \(2,\), the env's \(4,"):
+    with pytest.raises(
+        ValueError, match=r"env has observations of shape \(4,\) .*the model \(2,\)"
+    ):
         evaluate(model, "CSTR-v0", seeds=[0])
+    tripled = lambda: gym.wrappers.RescaleAction(gym.make("ClippedPendulum-v0"), -3, 3)  # noqa: E731
+    with pytest.raises(ValueError, match="in the same wrappers"):
+        evaluate(model, tripled, seeds=[0])
+
+
+def test_a_law_in_an_env_of_other_inputs_is_told() -> None:
+    mpc = units.plant_mpc()
+    make = partial(units.plant, "plant", "plant")
+    scaled = lambda: gym.wrappers.RescaleAction(make(), np.float64(-1), np.float64(1))  # noqa: E731
+    with pytest.warns(UserWarning, match="in other units, wrap it in gymnasium.wrappers.Rescale"):
+        evaluate(mpc.explicit(), scaled, seeds=[0])
+
+
+def test_a_model_that_sees_normalized_observations_is_shown_them() -> None:
+    venv = VecNormalize(DummyVecEnv([lambda: gym.make("ClippedPendulum-v0")]), norm_reward=False)
+    venv.obs_rms.mean[:] = 0.3, -0.2
+    venv.obs_rms.var[:] = 2, 5
+    venv.training = False
+    seen = {"observation": AffineObservation.from_vec_normalize(venv)}
+    model = DDPG("YannPolicy", venv, policy_kwargs=seen, device="cpu")
+    plain = DDPG("YannPolicy", "ClippedPendulum-v0", device="cpu")
+    costs = [evaluate(each, "ClippedPendulum-v0", SEEDS).costs for each in (model, plain)]
+    np.testing.assert_allclose(*costs, rtol=1e-4)
 
 
 def test_an_env_that_is_given_stays_open() -> None:
@@ -148,7 +175,7 @@ def test_a_law_is_played_in_plant_units() -> None:
     expected = evaluate(mpc.deviations.explicit(), own, SEEDS).costs
     for law in (mpc.explicit(), mpc.online(), mpc.explicit().plant_input):
         np.testing.assert_allclose(evaluate(law, make, SEEDS).costs, expected, rtol=1e-9)
-    with pytest.raises(ValueError, match=r"takes deviations, from \[-2.*u_ss = \[40.0\]"):
+    with pytest.raises(ValueError, match=r"from \[-2.*which are deviations, .*u_ss = \[40.0\]"):
         evaluate(mpc.explicit(), own, SEEDS)
 
 

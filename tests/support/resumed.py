@@ -22,6 +22,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from guard_samples import STEPS, Slide, bits, buffer_bits, build, make_guard, train
+from sb3_yann import NoActionNoise
 
 
 class Checkpoint(BaseCallback):
@@ -112,6 +113,8 @@ def fresh_trainings() -> None:
             go_on(model, LENGTH - HALFWAY, guard_in_simulator(log_path=record))
             print("resumed", n, _digest(model_bits(model), record.read_bytes()))
         record.unlink()
+    model = DDPG("YannPolicy", "CSTR-v0", seed=0, device="cpu", learning_starts=10)
+    print("anew", "CSTR-v0", _digest(model_bits(model.learn(200, callback=NoActionNoise()))))
 
 
 def go_on(model: Any, steps: int, *callbacks: BaseCallback) -> None:
