@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import itertools
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +16,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-from sb3_yann._validation import check_type, half_widths
+from sb3_yann._validation import check_type, half_widths, warn
 from sb3_yann.control.simulator import require_makes
 from sb3_yann.units import same_bounds
 
@@ -199,6 +200,22 @@ def require_like_training(source: Source | EnvPool, training_env: Any, name: str
                 "another one, e.g. its id."
             )
         require_like(env, training_env, name, "the training env")
+        its = _arguments(env)
+        for each in training:
+            own = _arguments(each)
+            if own[0] == its[0] and own != its:
+                warn(f"{name} makes {its[0]} with {its[1]}, and the training env has {own[1]}.")
+                break
+
+
+def _arguments(env: gym.Env[Any, Any]) -> tuple[str, str]:
+    """Return the id of a registered env and in words what it was made with."""
+    spec = env.spec
+    if spec is None:
+        return "", ""
+    given = {name: each for name, each in spec.kwargs.items() if name != "render_mode"}
+    words = re.sub(" at 0x[0-9a-f]+", "", repr(given))  # gymnasium copies what it is given
+    return spec.id, words if given else "no arguments of its own"
 
 
 def require_like(env: Any, other: Any, name: str, whose: str) -> None:

@@ -277,6 +277,8 @@ def test_a_csv_file_that_does_not_fit_is_named(write, text, states, said) -> Non
     with pytest.raises(ValueError, match=r"level is '1\.0', expected .* decimal sign is ','"):
         text = CSV.replace(",", ";")
         Log.from_csv(write(text), ["level"], ["valve"], 10, delimiter=";", decimal=",")
+    with pytest.raises(ValueError, match="level is '1_0', expected a number"):
+        Log.from_csv(write(CSV.replace("1.0", "1_0")), ["level"], ["valve"], 10)
     with pytest.raises(ValueError, match=r"no column 'level'; .* pass delimiter=','.$"):
         Log.from_csv(write(CSV), states=["level"], inputs=["valve"], dt=10, delimiter=";")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,13 +36,36 @@ from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
 from sb3_yann.improvement.imitation import controller_of
 from sb3_yann.improvement.simulator import Scenarios
-from sb3_yann.policy.checkpoint import ActorCheckpoint, restore_whole, whole_policy
+from sb3_yann.policy.checkpoint import (
+    ActorCheckpoint,
+    fingerprint,
+    restore_whole,
+    whole_policy,
+)
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
 Whole = tuple[dict[str, Any], list[Any]]  # weights and optimizers: see `whole_policy`
+
+
+@dataclass(frozen=True)
+class Commissioned:
+    """What a commissioning has left in a model; it travels in its zip, in ``model.commissioned``.
+
+    ``kept`` is the policy that the plant has confirmed, as in `Commissioning`, ``report`` the text
+    of then, and ``policy`` the fingerprint of the actor.
+    """
+
+    kept: str
+    report: str
+    policy: str
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the plant has confirmed a policy that is not the MPC."""
+        return self.kept != "MPC"
 
 
 class Commissioning:
@@ -316,7 +339,8 @@ class Commissioning:
                 self._first_bound, first=len(journal.episodes), anew=number, tried=before.tried
             )
             verdict: Verdict = "begins anew"
-            reason = "Two episodes in a row had an alarm."
+            last = journal.episodes[-1].alarm
+            reason = f"Two episodes in a row had an alarm. {last.message if last else ''}".rstrip()
         else:
             numbers = journal.log
             seed = self.seed + number
@@ -397,6 +421,8 @@ class Commissioning:
         """Give the model what the plant has confirmed, else the MPC, while nothing is played."""
         state = self.journal.state
         self._become(self._kept, state.max_correction if self.kept == "MPC" else state.kept.bound)
+        record: Any = self.model
+        record.commissioned = Commissioned(self.kept, self.report(), fingerprint(self.policy.actor))
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]

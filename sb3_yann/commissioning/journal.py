@@ -178,7 +178,8 @@ def _named(kind: type, event: Event) -> Event:
 
 
 Verdict = Literal["accepted", "stays", "the MPC acts", "begins anew"]
-NOT_DYNAMICS = ("not a number", "violation")  # alarms that say nothing of how the plant moves
+NOT_DYNAMICS = ("not a number", "violation", "frozen sensor")
+"""Alarms that say nothing of how the plant moves."""
 
 
 @dataclass(frozen=True)

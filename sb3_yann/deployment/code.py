@@ -76,7 +76,7 @@ def controller_tables(
     data: ControllerArrays, precision: str, walk: bool = True
 ) -> tuple[Tables, Tables]:
     """Return the tables of numbers and those of indices, by their names; a walk's are last."""
-    same = "A b box_middle box_per_half gains offsets obs_matrix obs_offset obs_rest seen_rest"
+    same = "A b box_middle box_per_half gains offsets obs_matrix obs_offset obs_rest resting"
     same += " obs_min obs_max action_shift"
     numbers: Tables = {name: data[name] for name in same.split()}
     numbers["action_scale"] = action_scale(data, precision)
@@ -92,8 +92,6 @@ def controller_tables(
         numbers["est_min"], numbers["est_max"] = data["est_box"]
         if len(data["est_loads"]):
             indices["est_loads"] = data["est_loads"]
-    if data["zero_input"]:
-        numbers["resting"] = data["resting"]
     if len(data["change"]):
         numbers["change_min"], numbers["change_max"] = data["change"]
     if len(data["moving"]):

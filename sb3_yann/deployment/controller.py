@@ -176,7 +176,8 @@ class Controller:
         self._absent: NDArray[np.int64] = np.zeros(n_read, np.int64)
         self._faults = 0
         self._sound = int(self.data["recover"])
-        self._output: Array = self.evaluate(self.data["seen_rest"], networks=False)
+        rest = self.data["resting"] * self.data["action_scale"] + self.data["action_shift"]
+        self._output: Array = rest  # u_ss, within its bounds
         self._estimate: Array | None = None  # x_hat, d_hat in plant units
         self._loads: Array = np.zeros(0)  # the measured disturbances that act until the next step
         self._bump = np.zeros(m)

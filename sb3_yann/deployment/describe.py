@@ -24,6 +24,7 @@ from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMAT
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
+from sb3_yann.policy.checkpoint import is_confirmed
 from sb3_yann.policy.observations import AffineObservation, keeps_entries
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.units import ActionUnits
@@ -202,7 +203,8 @@ def describe(
     problem = policy.problem if isinstance(policy, StartsAsMPC) else None
     problem = policy if isinstance(policy, LinearMPC) else problem
     own = estimator if isinstance(estimator, StateEstimator) else None
-    note = " ".join(filter(None, [_lacks(policy, problem, estimator), _unconfirmed(given)]))
+    notes = _lacks(policy, problem, estimator), _unconfirmed(given), _normalized(given)
+    note = " ".join(filter(None, notes))
     layer = policy.actor.mu if isinstance(policy, StartsAsMPC) else None
     base: Any = policy.law() if isinstance(policy, LinearMPC) else policy
     law, program = _with_regions(base if layer is None else layer.base_law)
@@ -264,7 +266,6 @@ def describe(
         "dt": np.float64(0.0 if law.model is None else law.model.dt),
         "obs_matrix": matrix,
         "obs_offset": offset,
-        "seen_rest": seen_rest,
         "action_scale": scale,
         "action_shift": shift,
         "action_names": np.array([*input_names]),
@@ -352,17 +353,22 @@ def _with_sources(problem: LinearMPC) -> list[str]:
 def _unconfirmed(given: Exportable) -> str:
     """Return whether a model has learnt what nothing has confirmed; empty if not, and of others."""
     policy = given.policy if isinstance(given, BaseAlgorithm) else None
-    if not isinstance(policy, StartsAsMPC) or getattr(given, "improvements", False):
+    if not isinstance(policy, StartsAsMPC) or policy.actor.mu.network.is_zero():
         return ""
-    state = getattr(given, "guard_state", None)
-    if policy.actor.mu.network.is_zero() or (state and state.accepted.is_actor_of(policy)):
+    if is_confirmed(given):
         return ""
-    if state is None:
-        return "Neither a guard nor improve has confirmed this policy."
+    if getattr(given, "guard_state", None) is None:
+        return "Neither a guard nor improve nor a commissioning has confirmed this policy."
     return (
         "The guard has not accepted this policy: it is a candidate, or was changed since. "
         "restore_accepted(model) gives the accepted one."
     )
+
+
+def _normalized(given: Exportable) -> str:
+    """Return whether a model takes what a VecNormalize shows; empty if not, and of others."""
+    seen = getattr(given, "sees_normalized", False)
+    return "It takes observations as VecNormalize shows them, not the plant's readings." * seen
 
 
 def _signal_maps(policy: Any, law: PiecewiseAffine) -> tuple[Array, Array, Array, Array]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -51,7 +50,7 @@ from sb3_yann.improvement.simulator import (
 )
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.plan import value_at_end
-from sb3_yann.policy.checkpoint import all_or_nothing
+from sb3_yann.policy.checkpoint import all_or_nothing, fingerprint
 from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.policies import (
     StartsAsMPC,
@@ -386,19 +385,10 @@ def improve(
             raise
     names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
     settings = {name: given[name] for name in names if given[name] is not None}
-    found = replace(found, settings=settings, policy=fingerprint(policy.actor.state_dict()))
+    found = replace(found, settings=settings, policy=fingerprint(policy.actor))
     record: Any = model
     record.improvements = (*getattr(model, "improvements", ()), found)
     return replace(found, model=model, estimator=work.estimator)
-
-
-def fingerprint(state: dict[str, th.Tensor]) -> str:
-    """Return the SHA-256 of tensors, whatever their order and device."""
-    found = hashlib.sha256()
-    for name in sorted(state):
-        found.update(name.encode())
-        found.update(np.ascontiguousarray(state[name].cpu().numpy()).tobytes())
-    return found.hexdigest()
 
 
 @dataclass

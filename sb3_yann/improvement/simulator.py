@@ -317,8 +317,9 @@ def rests_aside(row: RowLayout, episodes: Sequence[Episode]) -> bool:
         return False
     C = problem.tracking.C
     C = C if len(C) else np.eye(problem.model.n_states)[np.diag(problem.Q) > 0]
-    ends = row.shown(np.array([each.thetas[-1] for each in episodes]))
-    wanted = ends[:, layout.reference][:, : len(C)] if layout.n_references else 0.0
+    # The last row may show a set-point for which nothing has been done.
+    asked, ends = (row.shown(np.array([each.thetas[i] for each in episodes])) for i in (-2, -1))
+    wanted = asked[:, layout.reference][:, : len(C)] if layout.n_references else 0.0
     left = (ends[:, layout.state] @ C.T - wanted) / (np.abs(C) @ problem.theta_half[layout.state])
     error = 3 * left.std(axis=0, ddof=1) / np.sqrt(len(left))
     # 0.01: half-widths of a state, by which the MPC rests beside its target

@@ -86,7 +86,7 @@ class CsvFile:
     def _number(self, k: int, name: str) -> float:
         text = (self.rows[k][name] or "").strip()
         try:
-            if self.decimal != "." and "." in text:
+            if (self.decimal != "." and "." in text) or "_" in text:  # Python reads 20_0 as 200
                 raise ValueError
             return float(text.replace(self.decimal, ".")) if text else np.nan
         except ValueError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import inspect
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
 
 from sb3_yann._validation import check_type, warn
 from sb3_yann.control import LinearMPC
@@ -259,11 +261,16 @@ def _require_same_theta(old: LinearMPC, new: LinearMPC) -> None:
             f"theta of the MPC is {[*new.layout.names]}, that of the model "
             f"{[*old.layout.names]}: a correction needs the same entries. Make a new model."
         )
-    was, is_now = (np.concatenate([each.model.x_ss, each.model.u_ss]) for each in (old, new))
+    was, is_now = (np.concatenate([each.theta_ss, each.model.u_ss]) for each in (old, new))
     if not np.array_equal(was, is_now):
         raise ValueError(
             f"The operating point of the MPC is {is_now.tolist()}, that of the model "
-            f"{was.tolist()}: a correction counts from it. Keep x_ss and u_ss."
+            f"{was.tolist()}: a correction counts from it. Keep x_ss, u_ss and d_ss."
+        )
+    if not np.array_equal(old.tracking.C, new.tracking.C):
+        raise ValueError(
+            f"The MPC tracks the outputs {new.tracking.C.tolist()} x, the model "
+            f"{old.tracking.C.tolist()} x: a correction needs the same set-points."
         )
 
 
@@ -295,3 +302,23 @@ def _hand_over(old: LawLayer, new: LawLayer) -> None:
         weight.copy_(value)
     new.confines.copy_(old.confines)
     new._keep_constants()
+
+
+def fingerprint(module: nn.Module) -> str:
+    """Return the SHA-256 of a module's tensors, whatever their order and device."""
+    found = hashlib.sha256()
+    for name, each in sorted(module.state_dict().items()):
+        found.update(name.encode())
+        found.update(np.ascontiguousarray(each.cpu().numpy()).tobytes())
+    return found.hexdigest()
+
+
+def is_confirmed(model: Any) -> bool:
+    """Return whether a guard, `improve` or a commissioning has accepted the policy as it is."""
+    policy = model.policy
+    state = getattr(model, "guard_state", None)
+    if state is not None and state.accepted.is_actor_of(policy):
+        return True
+    records = [*getattr(model, "improvements", ()), getattr(model, "commissioned", None)]
+    now = fingerprint(policy.actor)
+    return any(each is not None and each.accepted and each.policy == now for each in records)

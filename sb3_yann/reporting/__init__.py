@@ -39,7 +39,7 @@ TITLE = "Report on a policy that starts as an MPC"
 PARTS = (
     problem.plant_part, problem.constraints_part, problem.law_part, evidence.loops_part,
     evidence.statistics_part, evidence.distance_part, evidence.guard_part, evidence.improve_part,
-    evidence.twin_part, evidence.headroom_part, evidence.again_part,
+    evidence.commissioning_part, evidence.twin_part, evidence.headroom_part, evidence.again_part,
 )  # fmt: skip
 
 
@@ -59,8 +59,8 @@ def report(
     It is one HTML file without scripts, and loads nothing: pictures are part of it. It has the
     plant and the problem in plant units, the register of constraints, the law and how it was
     checked, closed loops against the MPC, what they prove, where and how far the policy leaves the
-    MPC, every decision of the guard, what `improve` did, the twin, the headroom, versions and
-    seeds. A part without evidence is left out.
+    MPC, every decision of the guard, what `improve` and a commissioning did, the twin, the
+    headroom, versions and seeds. A part without evidence is left out.
 
     Parameters
     ----------

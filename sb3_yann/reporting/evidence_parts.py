@@ -33,7 +33,8 @@ from sb3_yann.evaluation import change_in_percent, plots
 from sb3_yann.guard import Decision
 from sb3_yann.guard.start import OTHER_REWARD
 from sb3_yann.guard.state import summary_of
-from sb3_yann.improvement.improving import fingerprint, of_estimates
+from sb3_yann.improvement.improving import of_estimates
+from sb3_yann.policy.checkpoint import fingerprint
 from sb3_yann.reporting.subject import (
     NOT_SHOWN,
     OF_MPC,
@@ -379,15 +380,16 @@ def guard_part(subject: Subject) -> Part:
     """Return every decision of the guard with its reason, and whether its policy is this one."""
     state = subject.state
     if state is None:
-        if subject.improved is not None:
+        if subject.is_confirmed:
             return NOT_SHOWN
         text = "No guard was at work: nothing has confirmed it on new starts."
         return part_of("", [], Finding("note", text))
     passed: bool | None = state.accepted.is_actor_of(subject.policy)
     text = "The policy is the one that the guard accepted last."
-    if not passed and subject.improved is not None:
+    if not passed and subject.is_confirmed:
         passed = None
-        text = "The policy is not the guard's: improve has accepted another one since."
+        by = "improve" if subject.improved is not None else "a commissioning"
+        text = f"The policy is not the guard's: {by} has accepted another one since."
     elif not passed:
         text = (
             "The policy is NOT the one that the guard accepted last: it is a candidate, or was "
@@ -463,8 +465,10 @@ def improve_part(subject: Subject) -> Part:
         text = f"{whose}improve was at work. {found[-1].reason}"
     elif is_mpc:
         text = "The policy is the MPC again: what improve accepted is gone."
-    elif state is not None and state.accepted.is_actor_of(subject.policy):
-        text = "The guard has accepted another policy after improve."
+    elif subject.is_confirmed:
+        by_guard = state is not None and state.accepted.is_actor_of(subject.policy)
+        by = "The guard" if by_guard else "A commissioning"
+        text = f"{by} has accepted another policy after improve."
     else:
         passed = False
         text = "The policy is NOT the one that improve accepted last: it was changed since."
@@ -497,6 +501,27 @@ def improve_part(subject: Subject) -> Part:
         table(["setting", "value", "what it is"], settings),
     ]
     return part_of("What improve did", content, make_finding(passed, text))
+
+
+def commissioning_part(subject: Subject) -> Part:
+    """Return the batches of a commissioning, what its pairs show, and whose the policy is."""
+    found = subject.commissioned
+    if found is None:
+        return NOT_SHOWN
+    is_its = found.policy == fingerprint(subject.policy.actor)
+    passed: bool | None = None
+    if is_its and found.accepted:
+        passed = True
+        text = f"The policy is the one of {found.kept}, which the plant has confirmed in pairs."
+    elif is_its:
+        text = "The policy is the MPC: the plant has confirmed no other one."
+    elif subject.is_confirmed:
+        text = "The policy is not the commissioning's: another one has been accepted since."
+    else:
+        passed = False
+        text = "The policy is NOT the one that the plant has confirmed: it was changed since."
+    content = [paragraph(text), lines(found.report)]
+    return part_of("What the plant has shown", content, make_finding(passed, text))
 
 
 def twin_part(subject: Subject) -> Part:
@@ -564,7 +589,7 @@ def again_part(subject: Subject) -> Part:
     arrays |= {name: getattr(problem, name) for name in ("theta_min", "theta_max", "theta_ss")}
     given = {name: each for name, each in arrays.items() if each is not None}
     prints = [
-        ["the policy's weights", fingerprint(subject.policy.actor.state_dict())],
+        ["the policy's weights", fingerprint(subject.policy.actor)],
         ["the MPC problem", digest_of(given)],
     ]
     parts = [

@@ -18,6 +18,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._validation import Array, is_text
+from sb3_yann.commissioning.commissioning import Commissioned
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import costs_of, excess_of_episodes
 from sb3_yann.control.online import Law
@@ -26,7 +27,8 @@ from sb3_yann.env_pool import Source, name_of, one_env, require_like
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.state import GuardState
 from sb3_yann.improvement import Headroom
-from sb3_yann.improvement.improving import Improvement, fingerprint
+from sb3_yann.improvement.improving import Improvement
+from sb3_yann.policy.checkpoint import fingerprint, is_confirmed
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Controller, Trajectories, rollout
@@ -202,8 +204,19 @@ class Subject:
     def improved(self) -> Improvement | None:
         """What made the policy that it is: the last improvement, if nothing changed it since."""
         accepted = [each for each in self.improvements if each.accepted]
-        now = fingerprint(self.policy.actor.state_dict())
+        now = fingerprint(self.policy.actor)
         return accepted[-1] if accepted and accepted[-1].policy == now else None
+
+    @property
+    def commissioned(self) -> Commissioned | None:
+        """What a commissioning has left in the model."""
+        found = getattr(self.model, "commissioned", None)
+        return found if isinstance(found, Commissioned) else None
+
+    @cached_property
+    def is_confirmed(self) -> bool:
+        """Whether a guard, `improve` or a commissioning has accepted the policy as it is."""
+        return is_confirmed(self.model)
 
     @cached_property
     def env_name(self) -> str:

@@ -23,7 +23,7 @@ from sb3_yann.commissioning.watchdog import Alarm
 from sb3_yann.compare import Difference
 from sb3_yann.env_pool import one_env
 from sb3_yann.improvement import Check
-from sb3_yann.policy.checkpoint import whole_policy
+from sb3_yann.policy.checkpoint import is_confirmed, whole_policy
 from twin_samples import Cart, problem
 from weights import is_mpc
 
@@ -263,6 +263,7 @@ def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> Non
 def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(begun, monkeypatch) -> None:
     run = begun()
     assert is_mpc(run.model)  # until the plant has confirmed it
+    assert not run.model.commissioned.accepted
     run._become(run._acting, bound := run.policy.max_correction)
     before = [each.clone() for each in run.policy.actor.parameters()]
     refused = Check(0, False, "start 3 violates a limit", 0.0, 0.0, False)
@@ -272,6 +273,7 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(begun, mon
     assert run.run(2)[-1].verdict == "stays"
     assert all(th.equal(a, b) for a, b in zip(before, run.policy.actor.parameters(), strict=True))
     assert run.policy.max_correction == bound
+    assert run.model.commissioned.accepted and is_confirmed(run.model)
     monkeypatch.setattr(commissioning, "is_kept", lambda _: False)
     assert run.run(3)[-1].verdict == "stays"  # it has been kept
     table, _, rest = run.report().partition("The policy of batch 1 surely costs less than the MPC")

@@ -36,6 +36,7 @@ from sb3_yann import (
 from sb3_yann._archive import write_arrays
 from sb3_yann.deployment.code import insensitive
 from sb3_yann.deployment.controller import Status
+from sb3_yann.improvement.improving import Improvement
 from weights import last_layer
 
 
@@ -428,7 +429,9 @@ def test_a_policy_that_nothing_has_confirmed_says_so_in_its_files(tmp_path) -> N
     learnt = last_layer(model.policy)
     with th.no_grad():
         learnt[..., -1] += 0.1
-    assert note() == "Neither a guard nor improve has confirmed this policy."
+    assert note() == "Neither a guard nor improve nor a commissioning has confirmed this policy."
+    model.improvements = (Improvement((), -0.1, True, policy="of another"),)
+    assert note().startswith("Neither")  # what was accepted is not this one
     with th.no_grad():
         learnt[..., -1] -= 0.1
     guard = ImprovementGuard("CSTR-v0", n_eval_episodes=2, n_final_starts=2)

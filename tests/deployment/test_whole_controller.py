@@ -1,5 +1,6 @@
 """A controller is exported with its estimator: outputs in, inputs out, in every format."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from sb3_yann import (
     Checks,
     Controller,
     DisturbanceBounds,
+    LinearCost,
     LinearModel,
     LinearMPC,
     RateLimits,
@@ -327,6 +329,19 @@ def test_a_start_goes_on_from_the_plants_present_input(tmp_path) -> None:
     for _ in range(50):  # the plant rests there, and that is where it is asked to be
         inputs.append(controller([*y, *y, 1.0]))
     np.testing.assert_allclose(inputs, np.tile(u, (51, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("form", [IN_C, InStructuredText])
+def test_the_first_step_keeps_the_rate_beside_a_price(form, tmp_path) -> None:
+    given, _ = problem(rates=True)
+    model = LinearModel(A, B, 1.0, X_SS, U_SS, C=C)
+    parts = {"model": model, "tracking": None, "disturbances": None, "price": LinearCost(u=[9, 0])}
+    mpc = replace(given, **parts, terminal=None)
+    coded = form(mpc, tmp_path, estimator=StateEstimator(model))
+    y = C @ X_SS
+    wanted = coded.controller(y)
+    np.testing.assert_allclose(wanted[0], U_SS[0] - 0.5, atol=1e-12)
+    np.testing.assert_allclose(coded.step(y, 1.0, 0, None)[0], wanted, atol=1e-12)
 
 
 def test_what_estimates_is_refused_where_it_does_not_fit(tmp_path) -> None:

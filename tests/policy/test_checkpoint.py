@@ -11,7 +11,8 @@ from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
 from guard_samples import RIGHT, build, correct, randomize
-from sb3_yann import retarget
+from sample_plants import LinearPlant
+from sb3_yann import LinearModel, LinearMPC, Tracking, retarget
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from weights import network_of, shake
 
@@ -125,5 +126,17 @@ def test_what_is_not_kept_is_named() -> None:
     moved = replace(problem.model, x_ss=np.ones(4))
     bounds = {"x_min": problem.x_min + 1, "x_max": problem.x_max + 1}
     bounds |= {"theta_min": problem.theta_min + 1, "theta_max": problem.theta_max + 1}
-    with pytest.raises(ValueError, match="Keep x_ss and u_ss"):
+    with pytest.raises(ValueError, match="Keep x_ss, u_ss and d_ss"):
         retarget(model, replace(problem, model=moved, **bounds))
+
+
+def test_a_correction_of_other_set_points_is_refused() -> None:
+    tank = LinearModel([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]], dt=1.0)
+    bounds = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 1}
+    old, new = (
+        LinearMPC(tank, Q=np.eye(2), R=[[1]], horizon=3, tracking=Tracking([i], -1, 1), **bounds)
+        for i in range(2)
+    )
+    model = DDPG("YannPolicy", LinearPlant(old), policy_kwargs={"problem": old}, device="cpu")
+    with pytest.raises(ValueError, match=r"tracks the outputs \[\[0.0, 1.0\]\] x, the model"):
+        retarget(model, new)

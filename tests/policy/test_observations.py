@@ -20,6 +20,7 @@ from sb3_yann import (
     ImprovementGuard,
     NoActionNoise,
     YannPolicy,
+    export,
     headroom,
 )
 from sb3_yann.commissioning.plant import Plant
@@ -296,6 +297,7 @@ def test_a_loaded_model_whose_statistics_are_lost_is_named(tmp_path) -> None:
     whole = DDPG.load(tmp_path / "model", env=venv)
     obs = env.normalize_obs((states() + STEADY).astype(np.float32))
     assert error(whole, obs, states()) < 1e-5
+    assert "as VecNormalize shows them" in export(whole, tmp_path / "plant.npz").note
     theta = Plant(plain, whole)._theta((states()[0] + STEADY).astype(np.float32))
     np.testing.assert_allclose(theta, states()[0], atol=1e-4)
     whole.save(tmp_path / "again")

@@ -36,10 +36,12 @@ from sb3_yann import (
     RateLimits,
     SoftBounds,
     StateEstimator,
+    export,
     offset_free,
     report,
     reporting,
 )
+from sb3_yann.commissioning.commissioning import Commissioned
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement.confirmation import Check
 from sb3_yann.improvement.improving import Improvement
@@ -413,7 +415,7 @@ def improved(tmp_path_factory):
     """A saved and loaded model with what `improve` leaves in one that it has made better."""
     model = moved(0.1)
     settings = {"n_starts": 7, "updates": 1000}
-    weights = evidence_parts.fingerprint(model.policy.actor.state_dict())
+    weights = evidence_parts.fingerprint(model.policy.actor)
     checks = Check(1, False, "it fell", -0.2, 0.07, True), Check(2, True, "", -0.1, 0.01, True)
     found = Improvement(
         checks, -0.1, True, source="a log", episodes=5, settings=settings, policy=weights
@@ -465,7 +467,7 @@ def test_improve_after_a_guard_is_no_failure_and_one_that_found_nothing_is_a_not
     with th.no_grad():
         unpin(model)
         last_layer(model)[..., -1] = 0.2
-    now = evidence_parts.fingerprint(model.policy.actor.state_dict())
+    now = evidence_parts.fingerprint(model.policy.actor)
     model.improvements = (Improvement((), -0.1, True, policy=now),)
     (finding,) = evidence_parts.guard_part(subject_of(model)).findings
     assert finding.verdict == "note" and "improve has accepted another one" in finding.text
@@ -473,6 +475,25 @@ def test_improve_after_a_guard_is_no_failure_and_one_that_found_nothing_is_a_not
     model.improvements = (Improvement((check,), 0.0, False, source="Slide", episodes=9),)
     part = evidence_parts.improve_part(subject_of(model))
     assert part.findings[0].verdict == "note" and "a start costs more" in part.content
+
+
+def test_what_the_plant_has_confirmed_travels_with_the_model_and_is_on_the_page(tmp_path) -> None:
+    model = moved(0.1)
+    now = evidence_parts.fingerprint(model.policy.actor)
+    model.commissioned = Commissioned("batch 3", "12 pairs\n3 alarms", now)
+    model.save(tmp_path / "model.zip")
+    loaded = DDPG.load(tmp_path / "model.zip")
+    text = Outline(report(loaded, tmp_path / "page.html", env=Slide, seeds=range(40, 43))).text
+    for said in ("one of batch 3, which the plant has confirmed", "12 pairs", "3 alarms"):
+        assert said in text
+    assert "nothing has confirmed" not in text
+    assert export(loaded, tmp_path / "plant.npz").note == ""
+    cases = [("batch 3", "of another", "failed", "NOT"), ("MPC", now, "note", "no other one")]
+    for kept, policy, verdict, said in cases:
+        loaded.commissioned = Commissioned(kept, "", policy)
+        (finding,) = evidence_parts.commissioning_part(subject_of(loaded)).findings
+        assert finding.verdict == verdict and said in finding.text
+        assert export(loaded, tmp_path / "plant.npz").note.startswith("Neither a guard nor")
 
 
 def test_the_page_says_that_an_observer_is_no_part_of_the_policy(tmp_path) -> None:

@@ -188,7 +188,7 @@ def theta_box(
         part: Any = fallback if value is None else value
         # `dataclasses.replace` passes the stored box, which is read-only, and means the states.
         is_stored = isinstance(part, np.ndarray) and not part.flags.writeable
-        parts.append(part[:n] if is_stored and part.shape == (layout.size,) else part)
+        parts.append(part[:n] if is_stored and part.ndim == 1 else part)
     pieces = [check_bounds("theta", parts[0], parts[1], n), *others]
     settled = np.argmax(layout.lift, axis=1)
     low, high = (np.concatenate(side)[settled] for side in zip(*pieces, strict=True))

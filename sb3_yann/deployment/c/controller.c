@@ -382,6 +382,7 @@ void yann_init(yann_state *state)
         state->absent[i] = 0;
     }
     for (int i = 0; i < N_INPUTS; i++) {
+        state->output[i] = resting[i] * action_scale[i] + action_shift[i];
         state->bump[i] = ZERO;
         state->anchor[i] = ZERO;
     }
@@ -398,7 +399,6 @@ void yann_init(yann_state *state)
     for (int i = 0; i < 6; i++) {
         state->found[i] = 0;
     }
-    (void)yann_law(seen_rest, state->output);
 }
 
 /* Keep what is good of the readings; return what is wrong with the others, NaN in `good`. */

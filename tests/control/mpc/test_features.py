@@ -338,3 +338,29 @@ def test_a_disturbance_that_no_input_can_hold_is_named() -> None:
 def test_references_without_a_box_are_named_when_the_law_is_asked_for() -> None:
     with pytest.raises(ValueError, match="where theta holds them, r_min and r_max"):
         servo(tracking=Tracking([0], r_max=1)).explicit()
+
+
+def test_offset_free_keeps_a_terminal_set_of_the_user_s_and_makes_the_invariant_one_anew() -> None:
+    tank = LinearModel([[0.9, 0.2], [0.0, 0.8]], [[0.0], [1.0]], 1.0, x_ss=[10, 5], u_ss=[2])
+    box = {"u_min": 1, "u_max": 3, "theta_min": [5, 2], "theta_max": [15, 8]}
+    near = Terminal(set=([[1, 0], [-1, 0]], [10.05, -9.95]))
+    own, invariant = (
+        LinearMPC(tank, Q=np.eye(2), R=[[0.1]], horizon=4, terminal=each, **box)
+        for each in (near, Terminal(set="invariant"))
+    )
+    found, _ = offset_free(own)
+    for x in ([10.3, 5.2], [9.8, 4.9]):
+        given = own.online().plant_input(x)
+        np.testing.assert_allclose(found.online().plant_input([*x, 0, 0]), given, atol=1e-9)
+    anew = offset_free(invariant)[0].terminal.set[0]
+    assert anew.shape[1] == 4 and np.any(anew[:, 2:])  # the room depends on the disturbance
+
+
+def test_replace_adds_to_theta_what_it_had_not() -> None:
+    tank = LinearModel([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]], dt=1.0)
+    bounds = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 1}
+    follows = {"tracking": Tracking([0], -1, 1)}
+    plain = LinearMPC(tank, Q=np.eye(2), R=[[1]], horizon=3, **follows, **bounds)
+    more = {"tracking": Tracking([0], -1, 1, preview=2), "rate": RateLimits(-1, 1)}
+    found = replace(plain, **more, terminal=None)
+    assert found.n_theta == 2 + 3 + 1
