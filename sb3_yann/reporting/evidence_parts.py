@@ -14,17 +14,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_yann._archive import digest_of
 from sb3_yann._validation import Array
-from sb3_yann.compare import (
-    COST_ROUNDING,
-    EXCESS_ROOM,
-    INPUT_STEP,
-    RULE,
-    Difference,
-    Scores,
-    less_safe,
-    no_worse,
-    relative_costs,
-)
+from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, INPUT_STEP, RULE, Difference, less_safe
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
 from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds
@@ -230,43 +220,7 @@ def statistics_part(subject: Subject) -> Part:
         "These statements hold for starts that are drawn as these are, and for a plant that "
         "behaves as this env does.",
     ]
-    beyond = _beyond(subject)
-    sentences.append(beyond.text)
-    return part_of(title, map(paragraph, sentences), make_finding(passed, text), beyond)
-
-
-def _beyond(subject: Subject) -> Finding:
-    """Return in what box episodes begin, and what comes of starts beyond that the env can take."""
-    problem = subject.problem
-    part = problem.layout.state
-    begins = np.array([each[0] for each in subject.shown_loops[OF_MPC].observations])[:, part]
-    low = begins.min(axis=0)
-    high = begins.max(axis=0)
-    ends = zip(with_units(problem.model)[0], map(number, low), map(number, high), strict=True)
-    box = ", ".join(f"{name} {a}" + f" to {b}" * (a != b) for name, a, b in ends)
-    solved = subject.samples[subject.law.in_domain(subject.samples)]
-    states = problem.units.to_plant(solved)[:, part]
-    states = states[((states < low) | (states > high)).any(axis=1)]
-    loops = subject.loops_from(states)
-    mpc, policy = (Scores(loops[who].costs, loops[who].unsafe()) for who in (OF_MPC, OF_POLICY))
-    text = f"Episodes begin at {box}."
-    count = len(mpc.costs)
-    if not count:
-        why = 'The env takes no reset(options={"state": x})'
-        if not len(states):
-            count = len(subject.samples)
-            why = f"None of {count} states of the box is beyond, where the MPC has a solution"
-        return Finding("note", f"{text} {why}: other starts are not tried.")
-    change = relative_costs(policy.costs - mpc.costs, mpc.costs)
-    more = int(np.sum(change > COST_ROUNDING))
-    reason = no_worse(policy, mpc, mpc, RULE.tolerance(mpc.costs)).reason
-    text += (
-        f" From {count} states beyond, where the MPC has a solution, the cost changes by "
-        f"{change_in_percent(float(np.median(change)))} in the median; from {more or 'none'} it is "
-        f"more{f', by {change_in_percent(change.max())} at most' * bool(more)}"
-        f"{'; ' * bool(reason)}{reason}."
-    )
-    return Finding("look" if reason else "note", text)
+    return part_of(title, map(paragraph, sentences), make_finding(passed, text))
 
 
 def distance_part(subject: Subject) -> Part:

@@ -33,7 +33,6 @@ from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import Controller, Trajectories, rollout
 from sb3_yann.twin import PlantTwin
-from sb3_yann.units import FLOAT32_ROUNDING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -234,34 +233,9 @@ class Subject:
         with one_env(self.env) as env:
             require_like(env, self.policy, f"env = {name_of(env)}", "the model")
             require_state_shown(env, self.policy.observation_given)
-        return self._play()
-
-    def loops_from(self, states: Array) -> dict[str, Trajectories]:
-        """Return closed loops from those states (k, n) that the env takes, as many as seeds."""
-        assert self.env is not None
-        problem = self.problem
-        room = FLOAT32_ROUNDING * problem.theta_half
-        begins = []
-        with one_env(self.env) as env:
-            # 5: states for each seed that an env is asked to begin in
-            for state in states[: 5 * len(self.seeds)]:
-                try:
-                    shown = env.reset(seed=0, options={"state": state})[0]
-                except Exception:  # whatever an env raises that has no such option or state
-                    continue
-                begun = problem.units.to_plant(self._theta(shown[None])[0])
-                apart = np.abs(begun[problem.layout.state] - state)
-                if np.all(apart <= room[problem.layout.state] + FLOAT32_ROUNDING * np.abs(state)):
-                    begins.append(state)
-        return self._play(begins[: len(self.seeds)])
-
-    def _play(self, states: Sequence[Array] | None = None) -> dict[str, Trajectories]:
-        """Return the closed loops of MPC and policy, from states (n,) of the plant if given."""
-        assert self.env is not None
         found = {}
-        seeds = self.seeds[: None if states is None else len(states)]
         for name, act in {OF_MPC: self.act_as_mpc, OF_POLICY: self.act_as_policy}.items():
-            played = rollout(_as_controller(act), self.env, seeds, states)
+            played = rollout(_as_controller(act), self.env, self.seeds)
             played = played.mapped(self._theta, self.policy.inputs)
             found[name] = replace(played, excess=excess_of_episodes(self.problem, played.pairs))
         if not is_rewarded(found):

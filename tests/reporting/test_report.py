@@ -319,33 +319,6 @@ def test_where_an_env_gives_no_reward_the_stage_cost_counts() -> None:
         np.testing.assert_allclose(subject.loops[who].costs, wanted, rtol=1e-5)
 
 
-@pytest.mark.parametrize("takes", [True, False])
-def test_starts_beyond_those_of_episodes_are_a_finding_of_their_own(takes) -> None:
-    tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3], units=["m", "A"])
-    mpc = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=3, x_min=0, x_max=20, u_min=0, u_max=10)
-
-    def make() -> gym.Env:
-        box = {"start_low": 11.5, "start_high": 12.5, "max_episode_steps": 20}
-        env = PlantEnv(lambda x, u: 0.1 * (12 - x) + 0.5 * (u - 3), mpc, **box)
-        return env if takes else OwnStarts(env)
-
-    model = DDPG("YannPolicy", make(), policy_kwargs={"problem": mpc, "networks": "shared"})
-    for moves in (False, True):
-        part = evidence_parts.statistics_part(subject_of(model, env=make))
-        found = part.findings[-1]
-        assert re.match(r"Episodes begin at x\[0\] \(m\) 11\.\d* to 12\.\d*\.", found.text)
-        assert ("From 8 states beyond" in found.text) is takes
-        assert ("takes no reset" in found.text) is not takes
-        assert found.verdict == ("look" if takes and moves else "note")
-        assert found.text in unescape(part.content)
-        with th.no_grad():
-            for weights in model.actor.mu.network.parameters():
-                weights += 0.3
-    within = subject_of(model, env=make)
-    vars(within)["samples"] = np.zeros((5, 1))
-    assert "None of 5 states" in evidence_parts._beyond(within).text
-
-
 def test_a_penalty_that_rounding_alone_makes_larger_is_no_failure() -> None:
     tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
     box = {"x_max": 13, "u_min": 0, "u_max": 10, "theta_min": 0, "theta_max": 20}
@@ -378,11 +351,6 @@ def test_what_moves_cost_is_no_cost_of_states() -> None:
     paid = np.sum(0.3 * x[:, 0] + 0.2 * u[:, 0] + 1)
     wanted = np.sum((x @ mpc.Q) * x), np.sum(mpc.R * u**2), np.sum(2 * (u - before) ** 2), paid
     assert evidence_parts._stage_costs(mpc, loops) == pytest.approx(np.array(wanted) / 2)
-
-
-class OwnStarts(gym.Wrapper):
-    def reset(self, *, seed=None, options=None):
-        return self.env.reset(seed=seed)
 
 
 @pytest.mark.parametrize("shows", ["plant", "normalized"])
