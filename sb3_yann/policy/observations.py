@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from torch import nn
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_type
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int
 from sb3_yann.control import LinearMPC, with_extra
 
 
@@ -162,22 +162,6 @@ class AffineObservation(ReadOnlyArrays):
     def __repr__(self) -> str:
         """Name the matrix and the offset, so that it can be pasted."""
         return f"AffineObservation(matrix={self.matrix.tolist()}, offset={self.offset.tolist()})"
-
-
-ObservationSpec = AffineObservation | Mapping[str, ArrayLike]
-"""What may be said of an observation, see :func:`as_observation`."""
-
-
-def as_observation(given: ObservationSpec | None, problem: LinearMPC) -> AffineObservation | None:
-    """Return the map from what an env shows to theta in plant units, None for the identity."""
-    if given is None or isinstance(given, AffineObservation):
-        return given
-    wanted = "an AffineObservation, a mapping with 'center' and 'scale', or None"
-    check_type("observation", given, Mapping, f"{wanted}: an env shows plant units")
-    if set(given) != {"center", "scale"}:
-        raise ValueError(f"observation = {dict(given)} must have a 'center' and a 'scale'.")
-    center = check_array("observation['center']", given["center"], (problem.n_theta,))
-    return AffineObservation.normalized(center, given["scale"])
 
 
 def to_deviations(given: AffineObservation | None, problem: LinearMPC) -> AffineObservation | None:

@@ -28,6 +28,7 @@ from sb3_yann._validation import (
     check_discount,
     check_int,
     check_range,
+    check_type,
     warn,
 )
 from sb3_yann.control import LinearMPC, wrapper_stack
@@ -45,8 +46,7 @@ from sb3_yann.policy.actor_critic import (
 from sb3_yann.policy.checks import require_own_problem, resolve_problem
 from sb3_yann.policy.observations import (
     AffineFeatures,
-    ObservationSpec,
-    as_observation,
+    AffineObservation,
     to_deviations,
     with_extra_shown,
 )
@@ -103,7 +103,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         critic_warmup: int = 2000,
         max_correction: float | None = None,
         pin_equilibrium: bool | None = None,
-        observation: ObservationSpec | None = None,
+        observation: AffineObservation | None = None,
         law: str = "auto",
         networks: str | None = None,
         keep_bounds: bool | None = None,
@@ -122,17 +122,19 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         self.saved_kwargs: dict[str, Any] = {}  # those that an algorithm saves
         if algorithm is not None:  # no longer the user's own dict
             self.saved_kwargs = algorithm.policy_kwargs = dict(algorithm.policy_kwargs)
+        if observation is not None:
+            wanted = "an AffineObservation, or None: an env shows plant units"
+            check_type("observation", observation, AffineObservation, wanted)
         if check_int("extra", extra, 0):
-            shown = as_observation(observation, self.problem)
             self.problem, observation = with_extra_shown(
-                self.problem, observation_space, shown, extra
+                self.problem, observation_space, observation, extra
             )
             self.saved_kwargs["extra"] = 0
         if isinstance(problem, str) or extra:
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             self.saved_kwargs["problem"] = self.problem
         self.action_units = checks.as_action_units(self.problem, action_space)
-        self.observation = as_observation(observation, self.problem)
+        self.observation = observation
         # Whether the user said what the env shows.
         self.observation_given = self.observation is not None
         self._meets(algorithm, observation_space)
@@ -475,10 +477,9 @@ class YannPolicy(StartsAsMPC, TD3Policy):
         Whether actor and critic keep their value at ``theta = 0`` for good: not where the model's
         steady-state input is wrong. False for problems with references, disturbances, prices or
         bounds that change at run time, else True.
-    observation : AffineObservation or mapping, optional
-        The map from what the env shows to theta. A mapping has a ``center`` and a ``scale`` of
-        ``(theta - center) / scale``. By default the env shows theta, in plant units where the
-        problem's model has an operating point.
+    observation : AffineObservation, optional
+        The map from what the env shows to theta. By default the env shows theta, in plant units
+        where the problem's model has an operating point.
     law : {"auto", "explicit", "online"}, default "auto"
         The explicit law, or the one whose program is solved at each point: see
         :meth:`LinearMPC.law`.

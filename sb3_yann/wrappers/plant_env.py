@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -56,7 +56,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     problem : LinearMPC
     violation_cost : float, default 0
         Added to the cost of a step that reports ``info["violation"]``.
-    observation : AffineObservation or mapping, optional
+    observation : AffineObservation, optional
         The map from what the env shows to theta: as in :class:`YannPolicy`. By default it is theta,
         in plant units where the problem's model has an operating point. Actions in [-1, 1] count as
         the inputs that they stand for.
@@ -75,7 +75,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         env: Env,
         problem: LinearMPC,
         violation_cost: float = 0.0,
-        observation: Callable[[ArrayLike], Array] | Mapping[str, ArrayLike] | None = None,
+        observation: Callable[[ArrayLike], Array] | None = None,
     ) -> None:
         space = require_vector(env, "observation_space")
         super().__init__(env)
@@ -84,10 +84,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         units = ActionUnits.of(problem, self.inputs.low, self.inputs.high)
         u_ss = problem.model.u_ss
         self.units = units or ActionUnits("plant", np.ones_like(u_ss), u_ss.copy())
-        if observation is not None and not callable(observation):
-            from sb3_yann.policy.observations import as_observation  # loads PyTorch
-
-            observation = as_observation(observation, problem)
+        if observation is not None:
+            check_type("observation", observation, Callable, "an AffineObservation, or None")
         self.seen: Callable[[ArrayLike], Array] = observation or np.asarray
         shape = np.shape(self.seen(np.zeros(space.shape)))
         if shape != (problem.n_theta,):

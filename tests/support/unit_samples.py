@@ -5,7 +5,7 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 
 from sample_plants import Sampled
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import AffineObservation, LinearModel, LinearMPC
 
 X_SS = np.array([350.0, 2.0])
 U_SS = np.array([40.0])
@@ -26,7 +26,7 @@ SHOWS = {
     "plant": lambda x: x + X_SS,
     "normalized": lambda x: (x + X_SS - CENTER) / SCALE,
 }
-SAYS = {"plant": None, "normalized": {"center": CENTER.tolist(), "scale": SCALE.tolist()}}
+SAYS = {"plant": None, "normalized": AffineObservation.normalized(CENTER, SCALE)}
 TAKES = {"deviation": (-2.0, 5.0, 0.0), "plant": (38.0, 45.0, 40.0), "normalized": (-1, 1, None)}
 
 

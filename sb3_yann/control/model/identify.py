@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtrit
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_choice, check_range
+from sb3_yann._validation import Array, ReadOnlyArrays
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.log import Arrays, Log
@@ -59,8 +58,8 @@ class Identified(OfLog):
     >>> x, u = np.zeros((201, 1)), rng.normal(size=(200, 1))
     >>> for k in range(200):
     ...     x[k + 1] = 0.8 * x[k] + 0.5 * u[k] + 0.01 * rng.normal()
-    >>> low, high = identify(x, u, dt=1).interval("A")
-    >>> bool(low < 0.8 < high)
+    >>> found = identify(x, u, dt=1)
+    >>> bool(abs(found.model.A - 0.8) < 3 * found.standard_error_A)
     True
     """
 
@@ -75,18 +74,6 @@ class Identified(OfLog):
     ten_step_fit: Array
     excitation: float
     delays: tuple[int, ...]
-
-    def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
-        """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E".
-
-        It is one under process noise alone: of sensor noise it knows nothing.
-        """
-        name = check_choice("name", name, ("A", "B", "E"))
-        level = check_range("level", level, 0, 1, "()")
-        value = getattr(self.model, name)
-        error = getattr(self, f"standard_error_{name}")
-        width = stdtrit(self.degrees_of_freedom, (1 + level) / 2) * error
-        return value - width, value + width
 
 
 def identify(  # noqa: PLR0913 (what a log may bring along)
