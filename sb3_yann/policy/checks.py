@@ -245,19 +245,12 @@ def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits
     units = ActionUnits.of(problem, action_space.low, action_space.high)
     if units is not None:
         return units
-    u_ss = problem.model.u_ss
-    advice = (
-        "They must be the same: build the LinearMPC with the bounds of the env, or rescale actions "
-        "to [-1, 1] in all entries; retarget(model, mpc, env=) takes an env of the new bounds."
-    )
-    if np.any(u_ss) and ActionUnits.of(problem.deviations, action_space.low, action_space.high):
-        advice = (
-            f"The env takes deviations from u_ss = {u_ss.tolist()}, and the MPC is in plant units: "
-            "leave x_ss and u_ss out of its model, or take the env in plant units."
-        )
     raise ValueError(
         f"The action space is [{action_space.low.tolist()}, {action_space.high.tolist()}], but the "
-        f"MPC has u_min = {problem.u_min.tolist()} and u_max = {problem.u_max.tolist()}. {advice}"
+        f"MPC has u_min = {problem.u_min.tolist()} and u_max = {problem.u_max.tolist()}. They must "
+        "be the same, in plant units: build the LinearMPC with the bounds of the env, or rescale "
+        "actions to [-1, 1] in all entries; retarget(model, mpc, env=) takes an env of the new "
+        "bounds."
     )
 
 

@@ -108,7 +108,8 @@ def refused(env: Any, observation: Any = None, mpc: LinearMPC = MPC) -> str:
 
 
 def test_an_env_in_deviations_is_refused() -> None:
-    assert "takes deviations from u_ss = [40.0]" in refused(units.plant("deviation", "deviation"))
+    message = "The action space is [[-2.0], [5.0]], but the MPC has u_min = [38.0]"
+    assert message in refused(units.plant("deviation", "deviation"))
 
 
 @pytest.mark.parametrize(

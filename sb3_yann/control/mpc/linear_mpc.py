@@ -638,56 +638,41 @@ def _warn_of_unreachable(tracking: Tracking, bounds: Bounds, box: Bounds) -> Non
 
 
 def _warn_of_misread_bounds(problem: MPCProblem) -> None:
-    """Warn of bounds that seem to be deviations, or in which the law cannot rest.
+    """Warn of the first bounds that leave out the operating point: the law cannot rest there.
 
-    References and disturbances are other places to rest at.
+    References and disturbances are other places to rest at: beside them it counts for inputs, and
+    for what holds 0, which are deviations.
     """
     model = problem.model
     tracking = problem.tracking
     d = problem.disturbances
     states = problem.layout.state
-    has_constants = problem.layout.has_constants
+    names, inputs = labels_of(model)
     ranges = {
-        "x": (*problem.limits["x"], model.x_ss),
-        "theta": (problem.theta_min[states], problem.theta_max[states], model.x_ss),
-        "u": (*problem.limits["u"], model.u_ss),
-        "d": (d.d_min, d.d_max, model.d_ss),
-        "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
-        "y": (*problem.limits["y"], problem.outputs.C @ model.x_ss),
+        "x": (*problem.limits["x"], model.x_ss, names),
+        "theta": (problem.theta_min[states], problem.theta_max[states], model.x_ss, names),
+        "u": (*problem.limits["u"], model.u_ss, inputs),
+        "d": (d.d_min, d.d_max, model.d_ss, model.disturbance_labels),
+        "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss, None),
+        "y": (*problem.limits["y"], problem.outputs.C @ model.x_ss, None),
     }
-    left_out = {name: (low > point) | (high < point) for name, (low, high, point) in ranges.items()}
-    for name, (lower, upper, points) in ranges.items():
-        for i in np.flatnonzero(left_out[name] & (lower < 0) & (upper > 0))[:1]:
-            low = lower[i]
-            high = upper[i]
-            point = points[i]
+    has_point = bool(np.any(model.x_ss) or np.any(model.u_ss))
+    has_constants = problem.layout.has_constants
+    always = ["u"] * (has_point or not has_constants)
+    always += ["x", "theta"] * (has_point and not has_constants)
+    for name, (lower, upper, points, labels) in ranges.items():
+        left_out = (lower > points) | (upper < points)
+        if name not in always:
+            left_out &= (lower < 0) & (upper > 0)
+        for i in np.flatnonzero(left_out)[:1]:
+            called = labels[i] if labels else f"{name}[{i}]"
             warn(
-                f"{name}_min = {low:g} and {name}_max = {high:g} of entry {i} leave out the "
-                f"operating point, {point:g}, and hold 0. Bounds are what the plant shows. If "
-                f"these are deviations, pass {name}_min = {low + point:g} and {name}_max = "
-                f"{high + point:g}, or leave x_ss and u_ss out of the model."
+                f"{name}_min = {lower[i]:g} and {name}_max = {upper[i]:g} leave out {called} = "
+                f"{points[i]:g}, the operating point: the law cannot rest there. Bounds are what "
+                "the plant shows and takes, no deviations, and so are x_ss and u_ss of the model. "
+                "Have they the same units and order?"
             )
             return
-    has_point = bool(np.any(model.x_ss) or np.any(model.u_ss))
-    if has_constants and not has_point:
-        return
-    cure = "If these are what the plant takes, give the model its x_ss and u_ss."
-    if has_point:
-        cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
-    if has_constants:
-        cure = "Have they the same units?"
-    names, inputs = labels_of(model)
-    asked = [("u", inputs, cure)]
-    if has_point and not has_constants:
-        left_out["theta"] &= ~left_out["x"]  # said once
-        asked += [(each, names, "Look at the order of the states.") for each in ("x", "theta")]
-    for name, called, cure in asked:
-        for i in np.flatnonzero(left_out[name]):
-            low, high, point = (each[i] for each in ranges[name])
-            warn(
-                f"{name}_min = {low:g} and {name}_max = {high:g} leave out {called[i]} = "
-                f"{point:g}, the operating point: the law cannot rest there. {cure}"
-            )
 
 
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
