@@ -19,7 +19,7 @@ from sb3_yann.control.linear_system import (
     missing_observer,
     with_units,
 )
-from sb3_yann.control.mpc.bound_excess import BoundNames, Bounds, costs_of
+from sb3_yann.control.mpc.bound_excess import BoundNames, costs_of
 from sb3_yann.control.mpc.report import ActiveConstraints
 from sb3_yann.env_pool import one_env
 from sb3_yann.evaluation.plots import plot_regions
@@ -133,26 +133,13 @@ def constraints_part(subject: Subject) -> Part:
         f"The terminal set has {len(last)} half-spaces." if len(last) else "No terminal set.",
     ]
     findings = _bound_findings(problem, loops) if loops else []
-    if unseen := _unseen(subject):
-        text = f"No sensor shows {', '.join(unseen)}: what counts are estimates, and the plant may "
-        findings.append(Finding("note", f"{text}be beyond the bounds where no estimate is."))
-    content = paragraph(*sentences), table(head, rows)
-    return part_of("Constraints register", content, *findings)
-
-
-def _unseen(subject: Subject) -> list[str]:
-    """Return the bounded states and outputs that an estimator tells from others."""
-    between = None
     if subject.env is not None:
         with one_env(subject.env) as env:
-            between = below(env, EstimateState)
-    if between is None:
-        return []
-    C = between.observer.C
-    rows = Bounds.of(subject.problem).C
-    seen: Any = np.isclose(rows @ np.linalg.pinv(C) @ C, rows).all(axis=1)
-    names = BoundNames.of(subject.problem).names
-    return [name for name, shown in zip(names, seen, strict=False) if not shown]
+            if below(env, EstimateState) is not None:
+                text = "Bounds count on an observer's estimates: the plant may be beyond them."
+                findings.append(Finding("note", text))
+    content = paragraph(*sentences), table(head, rows)
+    return part_of("Constraints register", content, *findings)
 
 
 def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> list[Finding]:

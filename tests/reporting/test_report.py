@@ -7,14 +7,13 @@ from functools import cache, partial
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import Wrapper
-from gymnasium.wrappers import TimeLimit, TransformReward
+from gymnasium.wrappers import TimeLimit, TransformObservation, TransformReward
 from scipy import stats
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -473,9 +472,19 @@ def test_the_page_says_that_an_observer_is_no_part_of_the_policy(tmp_path) -> No
     for said in (text, Improvement((), -0.02, True, model=model).report()):
         assert "Costs and bounds are those of the estimates, not of the plant." in said
     assert "measured disturbance" not in text
-    bounded = replace(twin_samples.problem(), x_max=[2.0, 2.0])
-    env = EstimateState(Slide(), StateEstimator(bounded.model, [[1.0, 0.0]]))
-    assert problem_parts._unseen(SimpleNamespace(env=env, problem=bounded)) == ["x[1]"]
+
+
+def test_bounds_that_are_counted_on_estimates_are_said_to_be() -> None:
+    bounded = replace(problems.clipped_pendulum(), x_max=[2.0, 2.0])
+    observer = StateEstimator(bounded.model, [[1.0, 0.0]])
+
+    def make() -> gym.Env:
+        angle = TransformObservation(LinearPlant(bounded), lambda x: x[:1], gym.spaces.Box(-9, 9))
+        return TimeLimit(EstimateState(angle, observer), 3)
+
+    model = DDPG("YannPolicy", make(), policy_kwargs={"problem": bounded})
+    found = problem_parts.constraints_part(subject_of(model, env=make)).findings
+    assert "Bounds count on an observer's estimates" in found[-1].text
 
 
 class Untouchable(Wrapper):
