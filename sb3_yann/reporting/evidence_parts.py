@@ -63,6 +63,15 @@ def loops_part(subject: Subject) -> Part:
     names = "states", "inputs off their rest", "moves of inputs", "prices"
     parts = zip(names, *shares, strict=True)
     values += [(f"mean stage cost of {name}", *both) for name, *both in parts if any(both)]
+    steps = [
+        np.concatenate([np.abs(np.diff(np.asarray(u), axis=0)) for u in each.actions])
+        for each in (mpc, policy)
+    ]
+    for i, name in enumerate(with_units(subject.problem.model)[1]):
+        if len(steps[0]) and len(steps[1]):
+            both = [each[:, i] for each in steps]
+            values.append((f"largest step of {name}", float(both[0].max()), float(both[1].max())))
+            values.append((f"mean step of {name}", float(both[0].mean()), float(both[1].mean())))
     rows = [[name, f"{old:.6g}", f"{new:.6g}", _change(old, new)] for name, old, new in values]
     for name, before, after in (
         ("steps that violate a limit", mpc.violations.sum(), policy.violations.sum()),

@@ -394,6 +394,14 @@ def improved(tmp_path_factory):
     return loaded, report(loaded, folder / "page.html", env=Slide, seeds=range(40, 43))
 
 
+def test_how_far_inputs_move_is_beside_the_mpc_s(tmp_path) -> None:
+    text = Outline(report(moved(0.1), tmp_path / "page.html", env=Slide, seeds=range(40, 43))).text
+    largest = re.search(r"largest step of u\[0\] (\S+) (\S+) ", text)
+    mean = re.search(r"mean step of u\[0\] (\S+) (\S+) ", text)
+    both = zip(largest.groups(), mean.groups(), strict=True)
+    assert all(0 < float(b) <= float(a) for a, b in both)
+
+
 def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) -> None:
     model, page = improved
     text = Outline(page).text
