@@ -194,7 +194,7 @@ def test_a_best_model_that_nobody_accepted_is_told_and_the_accepted_one_lies_bes
         UserWarning, match="best_model.zip that EvalCallback.*accepted_model.zip"
     ) as told:
         train(model, STEPS, At([2], partial(correct, region=RIGHT, value=2.0)), guard, other)
-    assert len(told) == 1
+    assert sum("best_model" in str(each.message) for each in told) == 1
     assert (tmp_path / "best_model.zip").is_file()
     assert is_mpc(saved(tmp_path))
 
