@@ -6,7 +6,9 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
+from itertools import groupby
 from multiprocessing.spawn import get_executable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -67,8 +69,8 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
         kept._source_stamp = SOURCES
         codegen = dispatcher.targetctx.codegen()
         keys = {dispatcher._cache._index_key(each, codegen) for each in signatures}
-        if not keys <= set(kept._load_index()):
-            _compile_apart(dispatcher.py_func.__module__)
+        if not (compiles_apart or keys <= set(kept._load_index())):
+            _compile_apart()
     for signature in signatures:
         dispatcher.compile(signature)
     dispatcher.disable_compile()
@@ -78,23 +80,25 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
 
 
 @cache
-def _compile_apart(module: str) -> None:
-    """Let another process compile a module and all of this package, so that this one loads it.
+def _compile_apart() -> None:
+    """Let other processes compile, one for each folder of the package, so that this one loads.
 
     What one process compiles shares functions, what it loads does not, and with ``fastmath`` two
     copies sum in different orders: a training would depend on who compiled.
     """
-    if compiles_apart or module == "__main__":
-        return
     _say(keep=True)
     package = Path(__file__).parent
-    own = [each.relative_to(package.parent).with_suffix("") for each in compiled_sources(package)]
-    names = [module, *(".".join(each.parts) for each in own)]
-    code = (
-        f"import sys; sys.path[:] = {sys.path}; from sb3_yann import _numba; "
-        f"_numba.compiles_apart = True; [__import__(each) for each in {names}]"
-    )
-    subprocess.run([get_executable(), "-c", code], stdin=subprocess.DEVNULL, capture_output=True)
+    files = [each.relative_to(package.parent) for each in compiled_sources(package)[1:]]
+    code = f"import sys; sys.path[:] = {[*map(str, sys.path)]}; from sb3_yann import _numba; "
+    code += "_numba.compiles_apart = True; import "
+    silent: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    running = []
+    with suppress(OSError, TypeError):  # no Python of its own: this process compiles
+        for _, group in groupby(files, key=lambda file: file.parent):
+            modules = ", ".join(".".join(file.with_suffix("").parts) for file in group)
+            running.append(subprocess.Popen([get_executable(), "-c", code + modules], **silent))
+    for each in running:
+        each.wait()
 
 
 @cache

@@ -272,6 +272,13 @@ def in_deviations(
             f"and the MPC inputs from {problem.u_min.tolist()} to {problem.u_max.tolist()}. Wrap "
             "it in gymnasium.wrappers.RescaleAction(env, mpc.u_min, mpc.u_max)."
         )
+    own = problem.deviations
+    if units is None and own is not problem and ActionUnits.of(own, space.low, space.high):
+        raise ValueError(
+            f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "
+            f"the MPC is in plant units, from {problem.u_min.tolist()} to {problem.u_max.tolist()}."
+            " Leave x_ss and u_ss out of its model, or take the env in plant units."
+        )
     if observation is None and not problem.units.shifted:
         return make
     return partial(_in_deviations, make, problem.units, observation)

@@ -382,7 +382,8 @@ def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
     ("shows", "takes", "message"),
     [
         ("plant", "normalized", r"normalized inputs, from \[-1.*RescaleAction"),
-        ("deviation", "deviation", "temperature = .* is shown.* this is a deviation"),
+        ("deviation", "deviation", r"takes deviations, from \[-2.*plant units"),
+        ("plant", "deviation", r"takes deviations, from \[-2.*plant units"),
         ("deviation", "plant", "temperature = .* is shown.* this is a deviation"),
     ],
 )
