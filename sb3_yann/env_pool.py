@@ -226,9 +226,12 @@ def require_like(env: Any, other: Any, name: str, whose: str) -> None:
     names = ("observation_space", "action_space")
     x, u = (getattr(env, f"single_{each}", getattr(env, each)) for each in names)
     other_x, other_u = (getattr(other, each) for each in names)
-    same = x.shape == other_x.shape and u.shape == other_u.shape
-    wanted = (other_u.low, other_u.high)
-    if not same or not same_bounds((u.low, u.high), wanted, half_widths(*wanted)):
+    same = x.shape == other_x.shape and u.shape == other_u.shape and isinstance(u, gym.spaces.Box)
+    if same:
+        coarse, fine = (u, other_u) if u.dtype.itemsize <= other_u.dtype.itemsize else (other_u, u)
+        bounds = (fine.low, fine.high)
+        same = same_bounds((coarse.low, coarse.high), bounds, half_widths(*bounds))
+    if not same:
         raise ValueError(
             f"{name} has observations of shape {x.shape} and {u}, {whose} {other_x.shape} and "
             f"{other_u}. Give it a simulator of this plant, or the plant, in the same wrappers."

@@ -240,6 +240,12 @@ def as_controller(policy: Any) -> Controller:
         normalize = getattr(policy, "get_vec_normalize_env", lambda: None)()
         if normalize is None:
             return lambda t, observations, rows: predict(observations, deterministic=True)[0]
+        if normalize.observation_space.shape != policy.observation_space.shape:
+            raise ValueError(
+                f"VecNormalize shows {normalize.observation_space.shape}, but the model sees "
+                f"{policy.observation_space.shape}. Make VecNormalize the last wrapper, outside "
+                "VecFrameStack."
+            )
         shown = normalize.normalize_obs  # to a model, of an env below it
         return lambda t, observations, rows: predict(shown(observations), deterministic=True)[0]
     if not callable(policy):
@@ -521,7 +527,8 @@ def _require_fit(policy: Any, env: Any) -> None:
     Or where the env takes deviations, and the law's plant has an operating point, or inputs that
     do not hold the law's.
     """
-    if isinstance(getattr(policy, "action_space", None), gym.spaces.Box):
+    is_model = hasattr(policy, "observation_space")
+    if is_model and isinstance(getattr(policy, "action_space", None), gym.spaces.Box):
         require_like(env, policy, "env", "the model")
     acts = getattr(policy, "policy", policy)  # a model's
     owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
