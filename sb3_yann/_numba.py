@@ -8,8 +8,6 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
-from itertools import groupby
-from multiprocessing.spawn import get_executable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -69,36 +67,34 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
         kept._source_stamp = SOURCES
         codegen = dispatcher.targetctx.codegen()
         keys = {dispatcher._cache._index_key(each, codegen) for each in signatures}
-        if not (compiles_apart or keys <= set(kept._load_index())):
-            _compile_apart()
+        if not keys <= set(kept._load_index()):
+            _say(keep=True)
+            if dispatcher.targetoptions["fastmath"] and not compiles_apart:
+                _compile_apart(Path(dispatcher.py_func.__code__.co_filename).parent)
     for signature in signatures:
         dispatcher.compile(signature)
     dispatcher.disable_compile()
-    if not keep or dispatcher.stats.cache_misses:
+    if not keep:
         _say(keep)
     return dispatcher
 
 
 @cache
-def _compile_apart() -> None:
-    """Let other processes compile, one for each folder of the package, so that this one loads.
+def _compile_apart(folder: Path) -> None:
+    """Let another process compile the files of a folder, so that this one loads them.
 
     What one process compiles shares functions, what it loads does not, and with ``fastmath`` two
     copies sum in different orders: a training would depend on who compiled.
     """
-    _say(keep=True)
+    if not Path(sys.executable or "").stem.lower().startswith(("python", "pypy")):
+        return  # it belongs to another program, which this would begin
     package = Path(__file__).parent
-    files = [each.relative_to(package.parent) for each in compiled_sources(package)[1:]]
+    files = [each for each in compiled_sources(package)[1:] if each.parent == folder]
+    parts = [each.relative_to(package.parent).with_suffix("").parts for each in files]
     code = f"import sys; sys.path[:] = {[*map(str, sys.path)]}; from sb3_yann import _numba; "
-    code += "_numba.compiles_apart = True; import "
-    silent: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-    running = []
-    with suppress(OSError, TypeError):  # no Python of its own: this process compiles
-        for _, group in groupby(files, key=lambda file: file.parent):
-            modules = ", ".join(".".join(file.with_suffix("").parts) for file in group)
-            running.append(subprocess.Popen([get_executable(), "-c", code + modules], **silent))
-    for each in running:
-        each.wait()
+    code += f"_numba.compiles_apart = True; import {', '.join(map('.'.join, parts))}"
+    with suppress(OSError):  # then this process compiles
+        subprocess.run([sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True)
 
 
 @cache
@@ -107,5 +103,5 @@ def _say(keep: bool) -> None:
     how_often = (
         "once after an installation" if keep else "at each start, for its folder takes no file"
     )
-    words = f"sb3-yann compiles its inner loops ({how_often}): half a minute in all."
+    words = f"sb3-yann compiles its inner loops ({how_often}): about a minute in all."
     say(words, sys.stderr)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -235,7 +236,7 @@ class SimulatedEpisodes(BaseCallback):
         self.seed = check_int("seed", seed, 0)
         # Single envs, whose steps are the training env's: copies that step as one may round.
         given = isinstance(self.env, gym.Env)
-        self._pool = EnvPool(self.env if given else lambda: make_env(self.env))
+        self._pool = EnvPool(self.env if given else partial(make_env, self.env))
 
     @property
     def state(self) -> Simulated:

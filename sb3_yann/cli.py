@@ -88,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("page", help="where to write it: .html")
     one.add_argument("--env", help=f"{env}; without it nothing is played")
     one.add_argument("--episodes", type=int, default=20, metavar="N", help="default: 20")
+    one.add_argument("--seed", type=int, default=0, help="of the first episode; default: 0")
 
     one = add("export", _export, "write a controller: C code, a function block, ...")
     one.add_argument("law", help=f"{model}, a law's .npz file, or {problem}")
@@ -121,6 +122,8 @@ def _solve(options: Namespace) -> None:
         path = Path(options.save)
         if path.is_dir():
             raise IsADirectoryError(f"{path} is a folder; name a file in it.")
+        if path.suffix != ".npz":
+            raise ValueError(f"--save {path}: a law is written as .npz, by which it is known.")
         if not path.parent.is_dir():
             raise FileNotFoundError(f"There is no folder {path.parent}: make it first.")
     problem = _problem(options.problem)
@@ -155,7 +158,7 @@ def _plot(options: Namespace) -> None:
 def _report(options: Namespace) -> None:
     from sb3_yann import report as write
 
-    seeds = _seeds(options.episodes)
+    seeds = _seeds(options.episodes, options.seed)
     answer(f"Written: {write(_model(options.model), options.page, env=options.env, seeds=seeds)}")
 
 

@@ -9,11 +9,12 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import VectorEnv
 
 from sb3_yann._validation import check_type, half_widths, warn
@@ -200,22 +201,24 @@ def require_like_training(source: Source | EnvPool, training_env: Any, name: str
                 "another one, e.g. its id."
             )
         require_like(env, training_env, name, "the training env")
-        its = _arguments(env)
-        for each in training:
-            own = _arguments(each)
-            if own[0] == its[0] and own != its:
-                warn(f"{name} makes {its[0]} with {its[1]}, and the training env has {own[1]}.")
-                break
+        spec = env.spec
+        for own in (each.spec for each in training[:1]):
+            if spec is None or own is None or spec.id != own.id:
+                continue
+            names = sorted({*spec.kwargs, *own.kwargs} - {"render_mode"})
+            both = [[given.kwargs.get(each) for each in names] for given in (spec, own)]
+            if other := [each for each, a, b in zip(names, *both, strict=True) if _differ(a, b)]:
+                its, theirs = ({n: given.kwargs.get(n) for n in other} for given in (spec, own))
+                warn(f"{name} makes {spec.id} with {its}, and the training env has {theirs}.")
 
 
-def _arguments(env: gym.Env[Any, Any]) -> tuple[str, str]:
-    """Return the id of a registered env and in words what it was made with."""
-    spec = env.spec
-    if spec is None:
-        return "", ""
-    given = {name: each for name, each in spec.kwargs.items() if name != "render_mode"}
-    words = re.sub(" at 0x[0-9a-f]+", "", repr(given))  # gymnasium copies what it is given
-    return spec.id, words if given else "no arguments of its own"
+def _differ(one: Any, other: Any) -> bool:
+    """Tell whether two arguments of an env are others; gymnasium copies what it is given."""
+    with suppress(Exception):  # of whatever compares itself
+        if np.all(one == other):
+            return False
+    words = (re.sub(" at 0x[0-9a-fA-F]+", "", repr(each)) for each in (one, other))
+    return next(words) != next(words)
 
 
 def require_like(env: Any, other: Any, name: str, whose: str) -> None:

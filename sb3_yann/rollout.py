@@ -553,6 +553,7 @@ def _require_fit(policy: Any, env: Any) -> None:
     low, high = (each + model.u_ss for each in own)
     beyond = (space.low > low + 0.01 * half) & np.isfinite(low)
     beyond |= (space.high < high - 0.01 * half) & np.isfinite(high)
+    beyond |= (space.high - space.low > 20 * half) & np.isfinite([space.low, space.high]).all(0)
     if np.any(beyond):
         warn(
             f"{takes}, and the law's are from {low.tolist()} to {high.tolist()}: if the env is in "

@@ -1,6 +1,5 @@
 """What every test runs with, and the problems that several of them go through."""
 
-import importlib
 import os
 from collections.abc import Iterator
 
@@ -46,9 +45,6 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.option.loadscopereorder = False  # pytest-xdist would begin with files of many tests
-    if th is not None and not hasattr(config, "workerinput"):
-        # Compiled once, before workers begin.
-        importlib.import_module("sb3_yann.networks._kernels.yann_layer")
 
 
 # Files whose tests are slow for the most part.

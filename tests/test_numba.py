@@ -42,7 +42,7 @@ def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(monkeypatch, caps
         assert compiled("float64(float64)")(lambda x: x + 1.0)(1.0) == 2.0
     said = capsys.readouterr().err.splitlines()
     assert said == [
-        "sb3-yann compiles its inner loops (at each start, for its folder takes no file): half a "
+        "sb3-yann compiles its inner loops (at each start, for its folder takes no file): about a "
         "minute in all."
     ]
     _say.cache_clear()

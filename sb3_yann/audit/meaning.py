@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from itertools import permutations, product
@@ -106,12 +106,15 @@ def warn_of_signs(
         gains = []
         for i in starts:
             action = played.actions[i][0]
-            pushed = _push(env, action, j)
             try:
                 if i not in unmoved:
                     first = theta(played.observations[i][1:2])[:, states]
                     unmoved[i] = first if estimating is None else hold(i, action)
+                pushed = _push(env, action, j, 0.5)
                 change = hold(i, pushed) - unmoved[i]
+                if not np.any(np.nan_to_num(weight * change)):  # perhaps within a dead band
+                    pushed = _push(env, action, j, 1.0)
+                    change = hold(i, pushed) - unmoved[i]
             except Exception:  # of a brittle simulator: what it says under the MPC counts
                 break
             by = np.diff(inputs(np.array([action, pushed])), axis=0)[0, j]
@@ -124,26 +127,30 @@ def warn_of_signs(
             # An effect below 1e-3 of the states' standard deviation may be rounding.
             if size > 0 and max(np.linalg.norm(effect), 0.01 * size**0.5) > 1e-3:
                 gains.append(float(np.sum(effect * expected)) / size)
-        if not starts or len(gains) < len(starts):
-            continue
-        when = "a step" if steps == 1 else f"{steps} steps"
-        found = f"{np.median(gains):.2g} times as far in {when}, from {len(gains)} start"
-        found += "s" * (len(gains) > 1)
-        if max(gains) < 0:
-            warnings.append(
-                f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "
-                "the wrong way. Look at the sign and the order of the actions, and at B.",
-            )
-        elif min(gains) > FAR or (0 <= min(gains) and max(gains) < 1 / FAR):
-            warnings.append(
-                f"{name} moves the env otherwise than the model's B says: {found}. Is a step of "
-                f"the env the model's dt, {model.step_length}, and the input in the "
-                "same unit? Does it act, and without a delay? Else identify the model anew.",
-            )
+        if starts and len(gains) == len(starts):
+            when = "a step" if steps == 1 else f"{steps} steps"
+            warnings += _misled(name, gains, when, model.step_length)
     swapped = _swapped(modelled, answers, spread, estimating is not None)
     for words in [swapped] if swapped else warnings:
         warn(words)
     return taken
+
+
+def _misled(name: str, gains: Sequence[float], when: str, dt: str) -> Iterator[str]:
+    """Yield what an input does otherwise than the model says, if that holds from all starts."""
+    found = f"{np.median(gains):.2g} times as far in {when}, from {len(gains)} start"
+    found += "s" * (len(gains) > 1)
+    if max(gains) < 0:
+        yield (
+            f"{name} moves the env against the sign of the model's B: {found}. The MPC steers "
+            "the wrong way. Look at the sign and the order of the actions, and at B."
+        )
+    elif min(gains) > FAR or (0 <= min(gains) and max(gains) < 1 / FAR):
+        yield (
+            f"{name} moves the env otherwise than the model's B says: {found}. Is a step of "
+            f"the env the model's dt, {dt}, and the input in the same unit? Does it act, and "
+            "without a delay? Else identify the model anew."
+        )
 
 
 def _swapped(modelled: Array, answers: Array, spread: Array, outputs: bool) -> str:
@@ -176,14 +183,14 @@ def _swapped(modelled: Array, answers: Array, spread: Array, outputs: bool) -> s
     )
 
 
-def _push(env: gym.Env[Any, Any], action: Array, j: int) -> Array:
-    """Return an action whose entry j is half the way to the bound that is farther away."""
+def _push(env: gym.Env[Any, Any], action: Array, j: int, share: float) -> Array:
+    """Return an action whose entry j goes a share of the way to the bound that is farther away."""
     space: Any = env.action_space
     width = float(space.high[j]) - float(space.low[j])
     far = width if width < 1e30 else 1e3
     ends = np.clip([space.low[j], space.high[j]], action[j] - far, action[j] + far)
     pushed = np.array(action, dtype=space.dtype)
-    pushed[j] = (action[j] + max(ends, key=lambda end: abs(end - action[j]))) / 2
+    pushed[j] += share * (max(ends, key=lambda end: abs(end - action[j])) - action[j])
     return pushed
 
 

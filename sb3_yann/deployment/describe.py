@@ -276,11 +276,11 @@ def describe(
 
 
 def _warn_of_limits(limits: dict[str, Any], signals: dict[str, Any]) -> None:
-    """Warn of limits of a state, or of an output, that leave out the operating point."""
+    """Warn of limits of a reading that leave out the operating point."""
     low = limits["obs_min"]
     high = limits["obs_max"]
     rest = signals["obs_rest"]
-    for i in np.flatnonzero(((rest < low) | (rest > high)) & signals["watched"]):
+    for i in np.flatnonzero((rest < low) | (rest > high)):
         warn(
             f"Checks: obs_min = {low[i]:g} and obs_max = {high[i]:g} of {signals['obs_names'][i]} "
             f"leave out the operating point, {rest[i]:g}: there the controller takes its reading "

@@ -43,7 +43,8 @@ LITTLE = 0.005
 WORTH = 0.02  # A gain below this is not worth learning, which finds a part of it
 CURE = (
     "mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, observer, "
-    "mpc.disturbances.d_min, mpc.disturbances.d_max) of sb3_yann.wrappers."
+    "mpc.disturbances.d_min, mpc.disturbances.d_max) of sb3_yann.wrappers, within StageCost(env, "
+    "mpc) of this mpc."
 )
 CURE_IN_TWIN = (
     "mpc, observer = offset_free(mpc), and export(mpc, path, estimator=observer), or on to "

@@ -261,16 +261,16 @@ def _require_same_theta(old: LinearMPC, new: LinearMPC) -> None:
             f"theta of the MPC is {[*new.layout.names]}, that of the model "
             f"{[*old.layout.names]}: a correction needs the same entries. Make a new model."
         )
+    if not np.array_equal(old.tracking.C, new.tracking.C):
+        raise ValueError(
+            f"The MPC tracks the outputs {new.tracking.C.tolist()} x, the model "
+            f"{old.tracking.C.tolist()} x: a correction needs the same set-points."
+        )
     was, is_now = (np.concatenate([each.theta_ss, each.model.u_ss]) for each in (old, new))
     if not np.array_equal(was, is_now):
         raise ValueError(
             f"The operating point of the MPC is {is_now.tolist()}, that of the model "
             f"{was.tolist()}: a correction counts from it. Keep x_ss, u_ss and d_ss."
-        )
-    if not np.array_equal(old.tracking.C, new.tracking.C):
-        raise ValueError(
-            f"The MPC tracks the outputs {new.tracking.C.tolist()} x, the model "
-            f"{old.tracking.C.tolist()} x: a correction needs the same set-points."
         )
 
 

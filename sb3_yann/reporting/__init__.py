@@ -99,6 +99,8 @@ def report(
     """
     subject = _subject(model, env, guard, twin, headroom, seeds)
     target = Path(path)
+    if target.suffix.lower() not in ("", ".html", ".htm"):
+        raise ValueError(f"path = {str(target)!r}: the page is HTML, name it .html; print it then.")
     with ExitStack() as stack:
         try:
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,12 @@
-"""The guard's plants pay another reward than the MPC's cost, of which its audit warns."""
+"""The guard's plants pay another reward than the MPC's cost, and one ignores its input."""
 
 from pathlib import Path
 
 import pytest
 
-IGNORED = pytest.mark.filterwarnings("ignore:The reward is not minus the cost")
+IGNORED = pytest.mark.filterwarnings(
+    "ignore:The reward is not minus the cost", r"ignore:u\[0\] moves the env otherwise.*: 0 times"
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

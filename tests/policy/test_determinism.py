@@ -9,7 +9,10 @@ from fresh_process import run_python
 from guard_samples import STEPS, build, train
 from resumed import envs, guard_in_simulator, model_bits
 
-pytestmark = pytest.mark.filterwarnings("ignore:The reward is not minus")  # of the sample plant
+# The sample plant pays otherwise, and ignores its input.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:The reward is not minus", r"ignore:u\[0\] moves the env otherwise.*: 0 times"
+)
 CODE = "import resumed; resumed.fresh_trainings()"
 
 

@@ -107,7 +107,9 @@ def offset_free(
         "estimated": range(old.n_disturbances, of_both),
         "drift": None,  # the disturbance makes up for it
     }
-    terminal = Terminal(mpc.terminal.cost, set=_terminal_set(mpc, q))
+    F, g = mpc.terminal.set
+    same = np.insert(F, [mpc.layout.disturbance.stop] * q, 0.0, axis=-1), g
+    terminal = Terminal(mpc.terminal.cost, "invariant" if mpc.terminal.is_invariant else same)
     both = np.append(known.d_min, -bound), np.append(known.d_max, bound)
     found = _changed(mpc, own, DisturbanceBounds(*both, known.preview), terminal)
     noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
@@ -124,20 +126,6 @@ def offset_free(
         drifts = 0.03 * np.sqrt(np.diag(estimator.noise["measurement_noise"]))
         noise = {**estimator.noise, "disturbance_noise": drifts}
     return found, DisturbanceObserver(found.model, C, every=1 if every is None else every, **noise)
-
-
-def _terminal_set(mpc: LinearMPC, more: int) -> tuple[Array, Array] | str | None:
-    """Return the terminal set of the MPC with so many more disturbances: the invariant one anew."""
-    F, g = mpc.terminal.set
-    if not len(g):
-        return None
-    try:
-        anew = replace(mpc, terminal=Terminal(mpc.terminal.cost, set="invariant")).terminal.set
-    except ValueError:  # there is none: it is the user's own
-        anew = (F[:0], g[:0])
-    if all(np.array_equal(a, b) for a, b in zip(anew, (F, g), strict=True)):
-        return "invariant"
-    return np.insert(F, [mpc.layout.disturbance.stop] * more, 0.0, axis=-1), g
 
 
 def _changed(
@@ -210,6 +198,7 @@ def with_extra(mpc: LinearMPC, low: ArrayLike, high: ArrayLike) -> LinearMPC:
     start = mpc.layout.disturbance.start + first
     disturbances = DisturbanceBounds(inserted(known.d_min, bottom), inserted(known.d_max, top))
     terminal = Terminal(mpc.terminal.cost, (inserted(F, np.zeros(k), start), g))
+    vars(terminal)["is_invariant"] = mpc.terminal.is_invariant
     found = _changed(mpc, own, disturbances, terminal)
     found.take_laws(mpc)
     return found

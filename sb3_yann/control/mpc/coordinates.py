@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from sb3_yann._validation import Array, Bounds, Given, ReadOnlyArrays, check_bounds
+from sb3_yann._validation import Array, Bounds, Given, ReadOnlyArrays, check_bounds, is_kept
 from sb3_yann.control.model.linear_model import LinearModel
 
 
@@ -187,8 +187,7 @@ def theta_box(
     for value, fallback in zip(given, states, strict=True):
         part: Any = fallback if value is None else value
         # `dataclasses.replace` passes the stored box, which is read-only, and means the states.
-        is_stored = isinstance(part, np.ndarray) and not part.flags.writeable
-        parts.append(part[:n] if is_stored and part.ndim == 1 else part)
+        parts.append(part[:n] if is_kept(part) else part)
     pieces = [check_bounds("theta", parts[0], parts[1], n), *others]
     settled = np.argmax(layout.lift, axis=1)
     low, high = (np.concatenate(side)[settled] for side in zip(*pieces, strict=True))

@@ -471,6 +471,8 @@ class Terminal(ReadOnlyArrays):
 
     cost: Array
     set: tuple[Array, Array]
+    # No field: whether the set was asked for as "invariant".
+    is_invariant = False
 
     def __init__(self, cost: Given = None, set: HalfSpaces | str | None = None) -> None:
         cost = None if cost is None else _square("Terminal.cost", cost)

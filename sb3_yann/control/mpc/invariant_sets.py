@@ -26,6 +26,7 @@ def completed(problem: MPCProblem) -> Terminal:
     size = problem.n_theta
     cost: Any = problem.terminal.cost
     half_spaces: Any = problem.terminal.set
+    asked = half_spaces if isinstance(half_spaces, str) else ""
     if isinstance(half_spaces, tuple) and half_spaces[0].shape[1] != size:
         check_array("Terminal.set F", half_spaces[0], ("rows", problem.model.n_states))
     errors = problem.settled.error_system
@@ -43,7 +44,9 @@ def completed(problem: MPCProblem) -> Terminal:
         F = F @ np.eye(problem.n_theta)[problem.layout.settles]
         half_spaces = F, g + F @ problem.theta_ss
     F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
-    return Terminal(cost, (np.pad(F, ((0, 0), (0, size - F.shape[1]))), g))
+    found = Terminal(cost, (np.pad(F, ((0, 0), (0, size - F.shape[1]))), g))
+    vars(found)["is_invariant"] = asked == "invariant" or problem.terminal.is_invariant
+    return found
 
 
 def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:

@@ -84,7 +84,7 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
         kinds = [problem.bounded[kind] for kind in ("x", "y", "mixed")]
         soft = [each.names[i] for each in kinds for i in np.flatnonzero(each.softness)]
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
-    if problem.layout.n_references and not problem.layout.n_disturbances:
+    if problem.layout.n_references and not problem.model.estimated:
         yield "There is no integral action: a plant that is not its model may rest beside its"
         yield "set-points. offset_free(mpc) has it, and may cost less or more on the way there:"
         yield "  headroom(mpc, env) plays it in a simulator. Add it where that gains."
