@@ -13,7 +13,6 @@ from scipy import stats
 from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_yann._archive import digest_of
-from sb3_yann._validation import Array
 from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, INPUT_STEP, RULE, Difference, less_safe
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linear_system import with_units
@@ -59,10 +58,6 @@ def loops_part(subject: Subject) -> Part:
     policy = loops[OF_POLICY]
     averages = ("mean cost", np.mean), ("median cost", np.median), ("worst cost", np.max)
     values = [(name, float(of(mpc.costs)), float(of(policy.costs))) for name, of in averages]
-    shares = [_stage_costs(subject.problem, each) for each in (mpc, policy)]
-    names = "states", "inputs off their rest", "moves of inputs", "prices"
-    parts = zip(names, *shares, strict=True)
-    values += [(f"mean stage cost of {name}", *both) for name, *both in parts if any(both)]
     steps = [
         np.concatenate([np.abs(np.diff(np.asarray(u), axis=0)) for u in each.actions])
         for each in (mpc, policy)
@@ -82,7 +77,8 @@ def loops_part(subject: Subject) -> Part:
     count = len(subject.seeds)
     is_range = count > 2 and subject.seeds == (*range(first, first + count),)
     seeds = f"{first} to {subject.seeds[-1]}" if is_range else ", ".join(map(str, subject.seeds))
-    own = sum(shares[0])
+    theta, u, _ = mpc.steps()  # in deviations
+    own = float(subject.problem.deviations.stage_cost(theta, u).sum()) / count
     cost = "the sum of the MPC's stage cost: the env gives no reward"
     if is_rewarded(loops):
         cost = "minus the sum of the rewards"
@@ -149,29 +145,6 @@ def _exceeded(problem: LinearMPC, loops: Mapping[str, Trajectories]) -> Iterator
             exceeding.append(f"{who}, in {bad} of {len(largest)}{f': {words}' * bool(words)}")
     if exceeding:
         yield Finding("look", f"Episodes exceed a limit with the {'; with the '.join(exceeding)}.")
-
-
-def _stage_costs(problem: LinearMPC, loops: Trajectories) -> tuple[float, float, float, float]:
-    """Return what an episode costs at rest at u_s of theta, off it, by moving, and by prices."""
-    theta, u, _ = loops.steps()  # in deviations
-    own = problem.deviations
-    slopes = np.split(own.stage_slope, [problem.n_theta])
-
-    def quadratic(theta: Array, u: Array) -> float:
-        priced = theta @ slopes[0] + u @ slopes[1] + own.price.constant
-        return float((own.stage_cost(theta, u) - priced).sum()) / len(loops.costs)
-
-    def steady(held: Array) -> float:
-        still = theta.copy()
-        if problem.layout.n_previous:
-            still[..., problem.layout.previous] = held
-        return quadratic(still, held)
-
-    at_rest = steady(theta @ problem.error_system.to_input.T)
-    off_rest = steady(u)
-    whole = quadratic(theta, u)
-    prices = float(own.stage_cost(theta, u).sum()) / len(loops.costs) - whole
-    return at_rest, off_rest - at_rest, whole - off_rest, prices
 
 
 def _change(old: float, new: float) -> str:
