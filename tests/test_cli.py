@@ -157,6 +157,7 @@ def write_files(folder) -> None:
         (["export", "controller.npz", "p.c"], "does not hold a PiecewiseAffine (it has no '"),
         (["solve", "nowhere", "--save", "no/law.npz"], "There is no folder no: make it first"),
         (["solve", "nowhere", "--save", "."], ". is a folder; name a file in it"),
+        (["solve", "nowhere", "--save", "law.c"], "--save law.c: a law is written as .npz"),
         (["report", "law.npz", "page.html"], "law.npz is no model"),
         (["commission", "none", "--env", "my_cart:Cart", "--record", "r"], "There is no model"),
     ],

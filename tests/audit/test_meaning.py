@@ -239,14 +239,15 @@ class Plant(Sampled):
     starts = (-3, 3)
     steps = 12
 
-    def __init__(self, gains: Any, late: bool = False) -> None:
+    def __init__(self, gains: Any, late: bool = False, band: float = 0) -> None:
         self.gains = np.array(gains)
+        self.band = band
         self.late = late
 
     def moved(self, u: Any) -> Any:
         before = self.before if self.t else np.zeros(2)
         self.before = u
-        acts = self.gains * (before if self.late else u)
+        acts = self.gains * (before if self.late else u * (abs(u) > self.band))
         noise = 0.3 * self.np_random.normal(size=2)
         return COUPLED.step(self.x, acts) - 0.1 * self.x**3 / 9 + noise
 
@@ -271,6 +272,7 @@ def test_another_gain_is_no_other_sign_and_far_ones_and_dead_time_are_told(gains
     far = {(3, 0.2): ["heater"], (5, 1): ["valve"], (1, 1): ["valve", "heater"]}
     assert [each.split()[0] for each in told] == far[gains]
     assert all("0 times as far" in each for each in told) == (gains == (1, 1))
+    assert not said(lambda: guarded(STEERED, lambda: StageCost(Plant((1, 1), band=0.9), STEERED)))
 
 
 def test_inputs_in_another_order_are_told() -> None:

@@ -1,21 +1,16 @@
 """The figures of the tables by hand, and the report as a whole."""
 
-import dataclasses
-import os
 import sys
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import experiments
-from experiments import runner
 from experiments.__main__ import main
 from experiments.measures import rows_of
 from experiments.results import in_short, write_report
-from experiments.runner import Outcome, Run, load_all, run_all
+from experiments.runner import Outcome, Run
 
 pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
 
@@ -107,22 +102,6 @@ def test_the_command_writes_its_report(catalog, tmp_path, capsys) -> None:
     assert "2 of 3 runs" in capsys.readouterr().out
 
 
-def test_the_command_reports_what_failed(catalog, tmp_path, capsys) -> None:
-    assert main(["--report-only", "--results", "none.sqlite"]) == 1
-    good = catalog.execute
-
-    def fails(run: Run) -> Outcome:
-        return good(run if run.learner != "DDPG" else dataclasses.replace(run, seed=99))
-
-    catalog.execute = fails
-    assert main(["--jobs", "1", "--results", "elsewhere.sqlite"]) == 1
-    said = capsys.readouterr().out
-    assert "KeyError" in said and "CSTR / DDPG / seed 0 / 50 episodes" in said
-    assert "3 of 4 runs" in said
-    assert (tmp_path / "docs/results.md").exists()
-    assert main(["--report-only", "--results", "elsewhere.sqlite"]) == 0
-
-
 def row_of(outcomes, plant: str, episodes: int, learner: str):
     return next(row for row in rows_of(outcomes, plant, episodes) if row.learner == learner)
 
@@ -151,51 +130,3 @@ def test_the_short_table_has_a_row_for_each_plant_that_was_learnt() -> None:
     assert empty == "" and "after 50 training episodes, over 2 starts" in legend
     left = {run: out for run, out in reactor().items() if run.learner != "YANN-RL"}
     assert in_short(left) == ""
-
-
-RUNS = [Run("CSTR", "YANN-RL", seed, 10 * seed) for seed in range(3)]
-
-
-@pytest.fixture
-def results(tmp_path: Path) -> Path:
-    return tmp_path / "results.sqlite"
-
-
-def outcome(run: Run, starts: int = 4) -> Outcome:
-    """Return numbers that depend on the run alone."""
-    rng = np.random.default_rng(run.seed)
-    tested = np.arange(0, run.episodes + 1, 5)
-    shape = len(tested), starts
-    return Outcome(
-        checkpoints=tested,
-        test_costs=rng.random(shape),
-        test_violations=np.zeros(shape, int),
-        training_costs=rng.random(run.episodes),
-        training_mpc_costs=rng.random(run.episodes),
-        training_violations=rng.integers(2, size=run.episodes),
-        extra={"pid": np.array(os.getpid()), "threads": np.array(torch.get_num_threads())},
-        seconds=1.5,
-    )
-
-
-def same(one: Outcome, other: Outcome) -> bool:
-    names = [name for name in vars(one) if name != "extra"]
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
-
-
-def forbidden(run: Run) -> Outcome:
-    raise AssertionError(f"{run} should not run")
-
-
-def test_what_is_saved_is_not_done_again(results) -> None:
-    first = run_all(RUNS, outcome, results, jobs=1, progress=False)
-    again = run_all(RUNS, forbidden, results, jobs=1, progress=False)
-    assert list(first) == list(again) == RUNS
-    assert all(same(first[run], again[run]) and same(first[run], outcome(run)) for run in RUNS)
-
-
-def test_outcomes_of_other_settings_are_not_used(results, monkeypatch) -> None:
-    run_all(RUNS, outcome, results, jobs=1, progress=False)
-    assert not load_all([Run("CSTR", "YANN-RL", 0, 50)], results)
-    monkeypatch.setattr(runner, "FINGERPRINT", "others")
-    assert not load_all(RUNS, results)

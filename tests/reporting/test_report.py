@@ -440,6 +440,8 @@ def test_what_the_plant_has_confirmed_travels_with_the_model_and_is_on_the_page(
     model.save(tmp_path / "model.zip")
     loaded = DDPG.load(tmp_path / "model.zip")
     text = Outline(report(loaded, tmp_path / "page.html", env=Slide, seeds=range(40, 43))).text
+    with pytest.raises(ValueError, match="the page is HTML, name it"):
+        report(loaded, tmp_path / "page.pdf")
     for said in ("one of batch 3, which the plant has confirmed", "12 pairs", "3 alarms"):
         assert said in text
     assert "nothing has confirmed" not in text

@@ -354,6 +354,8 @@ def test_offset_free_keeps_a_terminal_set_of_the_user_s_and_makes_the_invariant_
         np.testing.assert_allclose(found.online().plant_input([*x, 0, 0]), given, atol=1e-9)
     anew = offset_free(invariant)[0].terminal.set[0]
     assert anew.shape[1] == 4 and np.any(anew[:, 2:])  # the room depends on the disturbance
+    stale = replace(invariant, R=[[3.0]])
+    assert np.any(offset_free(stale)[0].terminal.set[0][:, 2:])
 
 
 def test_replace_adds_to_theta_what_it_had_not() -> None:

@@ -149,7 +149,7 @@ def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> Non
     hint = "There is no integral action"
     for name, told in (
         ("servo", True),
-        ("servo with a disturbance", False),
+        ("servo with a disturbance", True),  # which is measured
         ("regulator with a disturbance", False),
         ("invariant", True),
     ):
