@@ -149,7 +149,8 @@ def evaluate(
     ----------
     policy : model or callable
         Something with ``predict(observation, deterministic=True)``, or a function from an
-        observation to an action, such as the explicit law.
+        observation to an action, such as the explicit law. A model below a VecNormalize is shown
+        what that makes of the env's observations.
     env : gymnasium.Env, str or callable
         Must end its episodes within a million steps. A given env runs them one after the other.
         A named one, or a function that makes one, is made for each seed: the episodes run side by

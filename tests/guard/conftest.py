@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 IGNORED = pytest.mark.filterwarnings(
-    "ignore:The reward is not minus the cost", r"ignore:u\[0\] moves the env otherwise.*: 0 times"
+    "ignore:The reward is not minus the cost", r"ignore:u\[0\] moves the env otherwise.* 0 times"
 )
 
 

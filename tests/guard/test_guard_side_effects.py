@@ -198,14 +198,14 @@ def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_polic
 def test_a_simulator_that_swallows_it_ends_the_training_all_the_same() -> None:
     def act():
         plays.append(1)
-        if len(plays) == 4:  # the candidate's turn
+        if len(plays) == 5:  # the candidate's turn, after two pushes of the input
             with suppress(KeyboardInterrupt):
                 ctrl_c()
 
     plays: list[int] = []
     model = build(gradient_steps=0)
     interrupted(model, 4 * STEPS, At([1], better), make_guard(partial(CutOff, FIRST, act)))
-    assert is_mpc(model) and len(plays) == 4
+    assert is_mpc(model) and len(plays) == 5
 
 
 def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch) -> None:

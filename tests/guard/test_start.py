@@ -107,7 +107,7 @@ def test_a_simulator_of_another_shape_is_refused(env) -> None:
 def test_a_simulator_that_is_made_otherwise_than_the_training_env_is_told() -> None:
     gym.register("Slide-v7", Slide)
     try:
-        with pytest.warns(UserWarning, match=r"Slide-v7 with no arg.* env has \{'low': -3.0\}"):
+        with pytest.warns(UserWarning, match=r"Slide-v7 with .*None\}.* env has \{'low': -3.0\}"):
             train(build(env=gym.make("Slide-v7", low=-3.0)), STEPS, make_guard("Slide-v7"))
     finally:
         gym.registry.pop("Slide-v7")

@@ -11,7 +11,7 @@ from resumed import envs, guard_in_simulator, model_bits
 
 # The sample plant pays otherwise, and ignores its input.
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:The reward is not minus", r"ignore:u\[0\] moves the env otherwise.*: 0 times"
+    "ignore:The reward is not minus", r"ignore:u\[0\] moves the env otherwise.* 0 times"
 )
 CODE = "import resumed; resumed.fresh_trainings()"
 

@@ -50,7 +50,7 @@ from weights import last_layer, unpin
 SEEDS = range(8)
 # The sample plant pays otherwise, and ignores its input.
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:The reward is not minus", r"ignore:u\[0\] moves the env otherwise.*: 0 times"
+    "ignore:The reward is not minus", r"ignore:u\[0\] moves the env otherwise.* 0 times"
 )
 
 
