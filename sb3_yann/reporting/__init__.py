@@ -99,7 +99,7 @@ def report(
     """
     subject = _subject(model, env, guard, twin, headroom, seeds)
     target = Path(path)
-    if target.suffix.lower() not in ("", ".html", ".htm"):
+    if target.suffix.lower() in (".pdf", ".docx", ".png", ".svg"):
         raise ValueError(f"path = {str(target)!r}: the page is HTML, name it .html; print it then.")
     with ExitStack() as stack:
         try:

@@ -108,8 +108,9 @@ def offset_free(
         "drift": None,  # the disturbance makes up for it
     }
     F, g = mpc.terminal.set
-    same = np.insert(F, [mpc.layout.disturbance.stop] * q, 0.0, axis=-1), g
-    terminal = Terminal(mpc.terminal.cost, "invariant" if mpc.terminal.is_invariant else same)
+    same = (np.insert(F, [mpc.layout.disturbance.stop] * q, 0.0, axis=-1), g) if len(g) else None
+    anew = mpc.terminal.is_invariant and len(g)
+    terminal = Terminal(mpc.terminal.cost, "invariant" if anew else same)
     both = np.append(known.d_min, -bound), np.append(known.d_max, bound)
     found = _changed(mpc, own, DisturbanceBounds(*both, known.preview), terminal)
     noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}

@@ -34,8 +34,7 @@ def report(
     feasible = points[law.in_domain(points)]
     parts = _parameters(problem), _size(problem, law), _shares(own, law, points, feasible)
     beyond = () if law is online else _beyond(own, law, online, points)
-    more = beyond, _active(own, feasible), _values(problem, law, feasible)
-    return "\n".join(chain(*parts, *more))
+    return "\n".join(chain(*parts, beyond, _active(own, feasible)))
 
 
 def _parameters(problem: MPCProblem) -> Iterator[str]:
@@ -185,22 +184,6 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
     idle = [name for name, count in ranked if not count]
     if idle:
         yield f"  never: {', '.join(idle)}"
-
-
-def _values(problem: MPCProblem, law: Law, feasible: Array) -> Iterator[str]:
-    u = ", ".join(labels_of(problem.model)[1]) if problem.model.input_names else "u"
-    units = problem.units
-    # In parentheses: rich would take names in brackets for its markup.
-    yield f"The law at a few parameters ({', '.join(problem.labels())}):"
-    for theta in np.vstack([problem.theta_rest, feasible[:3]]):
-        where = "" if law.in_domain(theta) else " (not feasible)"
-        taken = units.input_to_plant(law(theta))
-        taken = np.where(np.abs(taken) > 1e-9 * problem.u_half, taken, 0.0)  # no rounding
-        yield f"  {_numbers(units.to_plant(theta))} -> {u} = {_numbers(taken)}{where}"
-
-
-def _numbers(values: Array) -> str:
-    return f"[{', '.join(f'{value:.4g}' for value in values)}]"
 
 
 def _percent(count: int, total: int) -> str:

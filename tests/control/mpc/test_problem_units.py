@@ -142,8 +142,6 @@ def test_the_report_calls_states_by_their_names() -> None:
         "set-point of T (K)        345 to 355        [350]     reference of tracked output 0",
         "d[0]                        4 to 7          [5]       disturbance",
         "previous u[0]               8 to 15         [10]      input 0 of the step before",
-        "few parameters (T, c, set-point of T, d[0], u_prev[0]):",
-        "  [350, 2, 350, 5, 10] -> u = [10]",
     ):
         assert line in text
     assert "x[0] " in shown().report(samples=50).splitlines()[1]
@@ -155,7 +153,7 @@ def test_what_limits_the_plan_is_called_by_its_name() -> None:
     text = named.report(samples=50)
     assert "% the rate of flow at its lower bound" in text and "never: flow at its" in text
     assert "Soft bounds: T; a unit costs 100." in text
-    assert "u[0]" not in text and "x[0]" not in text and "-> flow = [10]" in text
+    assert "u[0]" not in text and "x[0]" not in text
 
 
 def test_a_warning_names_the_line_that_led_to_it_and_comes_once() -> None:
