@@ -161,6 +161,7 @@ def test_a_plants_episode_that_never_ends_is_an_error(monkeypatch) -> None:
         plant.play(plant.begin(seed=0), plant.mpc, None)
 
 
+@pytest.mark.filterwarnings("ignore:u.0. moves the env otherwise")  # that it ignores
 def test_a_simulator_without_costs_on_new_starts_is_named() -> None:
     class Costless(Slide):
         def reset(self, *, seed=None, options=None):

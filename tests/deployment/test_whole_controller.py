@@ -368,11 +368,11 @@ def test_what_estimates_is_refused_where_it_does_not_fit(tmp_path) -> None:
 
 def test_limits_and_a_present_input_in_other_units_are_told(tmp_path) -> None:
     mpc, observer = problem()
-    swapped = Checks([290, 40, 40, 290, 0], [310, 60, 60, 310, 2])
+    swapped = Checks([290, 40, 60, 290, 0], [310, 60, 70, 310, 2])
     with pytest.warns(UserWarning, match="leave out the operating point") as told:
         export(mpc, tmp_path / "plant.npz", estimator=observer, checks=swapped)
     named = [str(each.message).split(" leave")[0][-4:] for each in told]
-    assert named == ["x[0]", "x[2]", "r[0]", "r[1]"]
+    assert named == ["x[0]", "x[2]", "r[0]"]
     controller = Controller.load(tmp_path / "plant.npz")
     with pytest.warns(UserWarning, match=r"300 of u\[0\], is far beyond its bounds, 1 to 5"):
         controller([50, 300, 50, 300, 1], manual=[300, 7])
