@@ -80,7 +80,8 @@ class Commissioning:
 
     What counts is the stage cost, or the plant's own reward where that is another one. At an alarm
     of the watchdog the MPC has the plant within the same sample, until it has played a quiet
-    episode. Two in a row with an alarm are taken for a changed plant: the log begins anew.
+    episode. Two in a row with an alarm of how it moves are taken for a changed plant: the log
+    begins anew.
 
     Each episode and each decision is on the disk before the next begins: after a kill the same
     script repeats nothing but the episode that was cut off. When :meth:`run` returns, the model

@@ -352,7 +352,7 @@ class Journal:
 
     @property
     def changed(self) -> bool:
-        """Whether two episodes in a row had an alarm in this batch: the twin holds no longer."""
+        """Whether two episodes in a row had an alarm of how the plant moves in this batch."""
         last = [each.alarm for each, _ in self.batch[-2:]]
         return len(last) == 2 and all(alarm and alarm.kind not in NOT_DYNAMICS for alarm in last)
 

@@ -312,6 +312,7 @@ class LinearModel(LinearSystem):
         input_names: Sequence[str] = (),
         units: Units = (),
         time_unit: str | None = None,
+        disturbance_names: Sequence[str] = (),
     ) -> Self:
         """Return the model with names and units; notes and drift stay, as does a unit of time.
 
@@ -320,13 +321,16 @@ class LinearModel(LinearSystem):
 
         Parameters
         ----------
-        state_names, input_names : sequence of str
+        state_names, input_names, disturbance_names : sequence of str
             One for each, or none.
         units : mapping of name to unit, or sequence of str
             Of states and inputs, and of named disturbances.
         time_unit : str, optional
             Of ``dt``, where it has none yet: ValueError for another one.
         """
+        if len(disturbance_names):
+            loads = type(self)(**{**vars(self), "disturbance_names": disturbance_names})
+            return loads.named(state_names, input_names, units, time_unit)
         state_names, units = completed(self, state_names, input_names, units)
         given = {"state_names": state_names, "input_names": input_names, "units": units}
         if time_unit is not None:

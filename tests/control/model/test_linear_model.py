@@ -174,6 +174,10 @@ def test_names_are_kept_by_copies_and_do_not_count_in_equality() -> None:
 def test_naming_a_model_keeps_its_notes_and_drift() -> None:
     model = LinearModel(A, B, dt=1.0, notes=["from a log"], drift=[0.1, 0]).named(["a", "b"])
     assert (model.notes, model.drift.tolist()) == (("from a log",), [0.1, 0])
+    fed = LinearModel(A, B, dt=1.0, E=[[0.1], [0]]).named(
+        units={"feed": "kg/s"}, disturbance_names=["feed"]
+    )
+    assert (fed.disturbance_labels, fed.units[-1]) == (["feed"], "kg/s")
 
 
 @pytest.mark.parametrize(
