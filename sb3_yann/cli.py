@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs=2,
         default=(0, 1),
         metavar=("I", "J"),
-        help="entries of theta: numbers or names",
+        help="entries of theta: numbers, or names of states",
     )
 
     one = add("evaluate", _evaluate, "play episodes of a model and of its MPC")

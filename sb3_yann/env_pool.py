@@ -91,6 +91,7 @@ class OneOf(gym.Env[Any, Any]):
     def __init__(self, envs: Any, number: int) -> None:
         self.all = envs
         self.number = number
+        self.plant_name = name_of(envs)
         self.observation_space = envs.observation_space
         self.action_space = envs.action_space
 
