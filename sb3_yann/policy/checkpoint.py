@@ -319,6 +319,8 @@ def is_confirmed(model: Any) -> bool:
     state = getattr(model, "guard_state", None)
     if state is not None and state.accepted.is_actor_of(policy):
         return True
-    records = [*getattr(model, "improvements", ()), getattr(model, "commissioned", None)]
+    improved = [each for each in getattr(model, "improvements", ()) if each.accepted]
+    commissioned = getattr(model, "commissioned", None)
+    records = improved[-1:] + [commissioned] * (commissioned is not None and commissioned.accepted)
     now = fingerprint(policy.actor)
-    return any(each is not None and each.accepted and each.policy == now for each in records)
+    return any(each.policy == now for each in records)

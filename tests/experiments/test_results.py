@@ -100,6 +100,8 @@ def test_the_command_writes_its_report(catalog, tmp_path, capsys) -> None:
     assert main(["--quick", "--jobs", "1", "--only", "cstr / (MPC|optimum)"]) == 0
     assert (tmp_path / "out/paper-quick/results.md").exists()
     assert "2 of 3 runs" in capsys.readouterr().out
+    catalog.execute = None  # what is finished is not run again
+    assert main(["--jobs", "1", "--results", "here.sqlite"]) == 0
 
 
 def row_of(outcomes, plant: str, episodes: int, learner: str):

@@ -431,6 +431,9 @@ def test_improve_after_a_guard_is_no_failure_and_one_that_found_nothing_is_a_not
     model.improvements = (Improvement((check,), 0.0, False, source="Slide", episodes=9),)
     part = evidence_parts.improve_part(subject_of(model))
     assert part.findings[0].verdict == "note" and "a start costs more" in part.content
+    del model.guard_state
+    model.improvements = tuple(Improvement((), -0.1, True, policy=each) for each in (now, "later"))
+    assert evidence_parts.improve_part(subject_of(model)).findings[0].verdict == "failed"
 
 
 def test_what_the_plant_has_confirmed_travels_with_the_model_and_is_on_the_page(tmp_path) -> None:

@@ -26,7 +26,6 @@ def completed(problem: MPCProblem) -> Terminal:
     size = problem.n_theta
     cost: Any = problem.terminal.cost
     half_spaces: Any = problem.terminal.set
-    asked = half_spaces if isinstance(half_spaces, str) else ""
     if isinstance(half_spaces, tuple) and half_spaces[0].shape[1] != size:
         check_array("Terminal.set F", half_spaces[0], ("rows", problem.model.n_states))
     errors = problem.settled.error_system
@@ -45,7 +44,8 @@ def completed(problem: MPCProblem) -> Terminal:
         half_spaces = F, g + F @ problem.theta_ss
     F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
     found = Terminal(cost, (np.pad(F, ((0, 0), (0, size - F.shape[1]))), g))
-    vars(found)["is_invariant"] = asked == "invariant" or problem.terminal.is_invariant
+    was_asked = isinstance(problem.terminal.set, str)
+    vars(found)["is_invariant"] = was_asked or problem.terminal.is_invariant
     return found
 
 
