@@ -25,7 +25,7 @@ from sb3_yann.twin.env import Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
 EACH = 5  # episodes, at least, that show by themselves how much they vary
-AGO = 1, 2  # so many samples ago is what a memory knows
+DEPTHS = 2, 4  # samples that a memory reaches back, the fewest first
 REMEMBERED = (
     "errors that follow earlier inputs and errors, as in this log, perhaps because of a lag or a "
     "load that lasts"
@@ -63,14 +63,15 @@ class Forecast(NamedTuple):
 class _Replays:
     """The episodes of a log side by side, with what comes of policies in a judge.
 
-    Shorter ones count until their end. A judge that ``remembers`` knows that errors follow earlier
-    inputs and errors.
+    Shorter ones count until their end. With ``depths`` the judge has a memory: it knows that errors
+    follow inputs and errors of so many samples before, whichever explains most.
     """
 
-    def __init__(self, judge: Judge, episodes: Sequence[Episode], remembers: bool) -> None:
+    def __init__(self, judge: Judge, episodes: Sequence[Episode], depths: Sequence[int]) -> None:
         self.dynamics = judge.dynamics
         self.members = len(judge.dynamics.members)
         self.explains = False
+        self.depths = depths
         self.units = judge.dynamics.coordinates.units
         row = self.dynamics.row
         self.rows = padded([each.thetas for each in episodes])
@@ -85,7 +86,7 @@ class _Replays:
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
         self.weights = None
-        if remembers:
+        if depths:
             made = [self._regressors(t, r, inputs, self.errors) for t, r in enumerate(rows)]
             basis = np.stack(made)
             self.weights = self._memory(basis)
@@ -153,7 +154,8 @@ class _Replays:
         return np.asarray(found.reshape(self.members, count, some))
 
     def _regressors(self, t: int, rows: Array, inputs: Array, missed: Array) -> Array:
-        past = (of[t - lag] if t >= lag else 0 * of[0] for of in (inputs, missed) for lag in AGO)
+        ago = range(1, DEPTHS[-1] + 1)  # the latest first: a memory of less depth knows those
+        past = (of[t - k] if t >= k else 0 * of[0] for k in ago for of in (inputs, missed))
         one = np.ones((*rows.shape[:-1], 1))
         x = rows[..., self.dynamics.row.state]
         return np.concatenate([one, x, inputs[t], *past], axis=-1)
@@ -165,26 +167,34 @@ class _Replays:
         (Ljung, *System Identification*, section 4.2).
         """
         count = self.rows.shape[1]
-        plain = 1 + self.errors.shape[3] + self.inputs.shape[2]
+        each_ago = self.errors.shape[3] + self.inputs.shape[2]
+        plain = 1 + each_ago
         # 4: steps of a log for each coefficient, at least
-        if self.alive.sum() < 4 * basis.shape[-1] or count < 2:
+        sizes = [
+            k for k in (plain + n * each_ago for n in self.depths) if 4 * k <= self.alive.sum()
+        ]
+        if not sizes or count < 2:
             return None
         known = self.alive.copy()
-        known[: max(AGO)] = False
-        weights = []
-        left = np.zeros(2)
+        known[: DEPTHS[-1]] = False
+        weights = np.zeros((len(sizes), self.members, basis.shape[-1], self.errors.shape[3]))
+        left = np.zeros(1 + len(sizes))
         for k in range(self.members):
             unseen = np.arange(count) % self.members == k
             fit = known & ~unseen if np.any(known & ~unseen) else known
             test = known & unseen if np.any(known & unseen) else known
             z = basis[:, k]
             e = self.errors[:, k]
-            weights.append(_ridge(z[fit], e[fit]))
-            rests = e - z @ weights[-1], e - z[..., :plain] @ _ridge(z[fit][:, :plain], e[fit])
-            left += [np.sum((each[test] / self.units) ** 2) for each in rests]
+            for i, size in enumerate([plain, *sizes]):
+                found = _ridge(z[fit][:, :size], e[fit])
+                left[i] += np.sum(((e[test] - z[test][:, :size] @ found) / self.units) ** 2)
+                if i:
+                    weights[i - 1, k, :size] = found
+        best = int(np.argmin(left[1:]))
+        self.depths = self.depths[best : best + 1]
         # It must explain 2 % of the errors of one step on held-out episodes.
-        self.explains = bool(left[0] < 0.98 * left[1])
-        return np.array(weights)
+        self.explains = bool(left[1 + best] < 0.98 * left[0])
+        return weights[best]
 
 
 def _ridge(z: Array, y: Array) -> Array:
@@ -218,17 +228,18 @@ def forecast(
     rng = np.random.default_rng(0)
     some = -(-100 // count)  # so that a hundred runs begin anew
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
-    plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
+    plain, own = (_Replays(judges[0], episodes, each) for each in ((), DEPTHS))
     logged = np.stack([each.thetas[:1] for each in episodes]), None
     new = drawn.reshape(count, some, -1), plain.new_given(some, rng)
     found: list[tuple[float, float, float, str]] = []
     worst = -np.inf
     objection = ""
     for judge in bar("forecasts by models of the log", judges, timed=True):
-        for remembers in (False, True):
+        for depths in ((), own.depths):
+            remembers = bool(depths)
             if (judge.refuted and not remembers) or (remembers and not own.explains):
                 continue
-            replays = _Replays(judge, episodes, remembers)
+            replays = _Replays(judge, episodes, depths)
             if surely_worse(replays.left - (own if remembers else plain).left):
                 continue
             says = REMEMBERED if remembers else judge.says

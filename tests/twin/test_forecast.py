@@ -13,7 +13,15 @@ from sample_plants import Sampled
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.forecast import REMEMBERED, Forecast, _changed, _cure, _objection, _Replays
+from sb3_yann.twin.forecast import (
+    DEPTHS,
+    REMEMBERED,
+    Forecast,
+    _changed,
+    _cure,
+    _objection,
+    _Replays,
+)
 from sb3_yann.twin.trust import costs_of
 from sb3_yann.wrappers import SetPoint
 from sb3_yann_envs import ProblemBox
@@ -58,11 +66,11 @@ def twin(plant: Lagging, episodes: int = 6) -> PlantTwin:
     return PlantTwin.fit(MPC, [*log.pairs], residuals=POLYNOMIALS)
 
 
-@pytest.mark.parametrize("remembers", [False, True])
-def test_a_replay_with_the_mpc_costs_what_was_logged(remembers: bool) -> None:
+@pytest.mark.parametrize("depths", [(), DEPTHS])
+def test_a_replay_with_the_mpc_costs_what_was_logged(depths) -> None:
     found = twin(Lagging(0.4, 0.5))
     first = np.stack([each.thetas[:1] for each in found.episodes])
-    costs = _Replays(found.judges[0], found.episodes, remembers).costs(law_of(MPC), first)[..., 0]
+    costs = _Replays(found.judges[0], found.episodes, depths).costs(law_of(MPC), first)[..., 0]
     logged = [costs_of(MPC, each) for each in found.episodes]
     np.testing.assert_allclose(costs, np.tile(logged, (5, 1)), rtol=1e-9)
 
@@ -130,9 +138,9 @@ def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> No
 
 def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
     found = twin(Lagging(0.5, 1.0, noise=0.0))
-    memory = _Replays(found.judges[0], found.episodes, remembers=True)
+    memory = _Replays(found.judges[0], found.episodes, DEPTHS)
     assert memory.explains
-    plain = _Replays(found.judges[0], found.episodes, remembers=False)
+    plain = _Replays(found.judges[0], found.episodes, ())
     assert np.mean(memory.errors**2) < 0.5 * np.mean(plain.errors**2)
 
 
