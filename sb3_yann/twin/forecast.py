@@ -194,7 +194,7 @@ class _Replays:
         self.depths = self.depths[best : best + 1]
         # It must explain 2 % of the errors of one step on held-out episodes.
         self.explains = bool(left[1 + best] < 0.98 * left[0])
-        return weights[best]
+        return np.asarray(weights[best])
 
 
 def _ridge(z: Array, y: Array) -> Array:
@@ -331,7 +331,9 @@ def _cure(
     if not np.isfinite(high - low):
         return "log more episodes"
     if middle >= 0 or says == REMEMBERED:
-        kind = " for longer than the actuator takes" if says == REMEMBERED else ""
+        kind = (
+            " for longer than the actuator takes, or the load itself" if says == REMEMBERED else ""
+        )
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
     needed = independent * min(((high - middle) / middle) ** 2, 100.0)

@@ -163,7 +163,8 @@ def judge(
         )
         advice.append(
             f"Log {more(max(3, n_episodes))} more. If that is no help, the sensors are too "
-            "noisy, or what moves the plant is not in the log: a load, a state, a lag."
+            "noisy, or what moves the plant is not in the log: a load, a state, a lag, backlash, "
+            "a sensor set anew."
         )
     return problems, advice
 

@@ -13,15 +13,7 @@ from sample_plants import Sampled
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.forecast import (
-    DEPTHS,
-    REMEMBERED,
-    Forecast,
-    _changed,
-    _cure,
-    _objection,
-    _Replays,
-)
+from sb3_yann.twin.forecast import REMEMBERED, Forecast, _changed, _cure, _objection, _Replays
 from sb3_yann.twin.trust import costs_of
 from sb3_yann.wrappers import SetPoint
 from sb3_yann_envs import ProblemBox
@@ -66,7 +58,7 @@ def twin(plant: Lagging, episodes: int = 6) -> PlantTwin:
     return PlantTwin.fit(MPC, [*log.pairs], residuals=POLYNOMIALS)
 
 
-@pytest.mark.parametrize("depths", [(), DEPTHS])
+@pytest.mark.parametrize("depths", [(), (2, 4)])
 def test_a_replay_with_the_mpc_costs_what_was_logged(depths) -> None:
     found = twin(Lagging(0.4, 0.5))
     first = np.stack([each.thetas[:1] for each in found.episodes])
@@ -138,19 +130,18 @@ def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> No
 
 def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
     found = twin(Lagging(0.5, 1.0, noise=0.0))
-    memory = _Replays(found.judges[0], found.episodes, DEPTHS)
-    assert memory.explains
+    memory = _Replays(found.judges[0], found.episodes, (2, 4))
+    assert memory.explains and memory.depths == (4,)
     plain = _Replays(found.judges[0], found.episodes, ())
     assert np.mean(memory.errors**2) < 0.5 * np.mean(plain.errors**2)
 
 
 def test_where_it_may_cost_more_it_is_said_what_would_settle_it() -> None:
     found = twin(Lagging(0.5, 0.4))
-    law = law_of(MPC)
-    _, low, high, cure, *_ = found.forecast(lambda x: np.clip(1.05 * law(x), -1, 1))
+    _, low, high, cure, *_ = found.forecast(lambda x: np.clip(1.05 * law_of(MPC)(x), -1, 1))
     assert low < 0 < high and ("held steps of u[0]" in cure or "episodes more" in cure)
     said = _cure(0.01, -0.01, 0.02, REMEMBERED, 9, "u[0]", str)
-    assert said.startswith("log held steps of u[0] for longer than the actuator takes; with errors")
+    assert said.startswith("log held steps of u[0] for longer than the actuator takes, or the load")
     assert said.endswith("perhaps because of a lag or a load that lasts, the change is -1 to +2 %")
 
 

@@ -7,7 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control.identification.innovations import dead_times, no_effect, with_lags
+from sb3_yann.control.identification.innovations import (
+    dead_times,
+    long_arx,
+    no_effect,
+    with_lags,
+)
 from sb3_yann.control.identification.least_squares import Regression, stacked
 from sb3_yann.control.identification.residuals import leftover, project_out
 from sb3_yann.control.linear_system import names
@@ -56,7 +61,14 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
         _explained(known, n + j, target) > _explained(known, width + sum(best[: j + 1]) - 1, target)
         for j in range(n_inputs)
     ]
-    found = [0 if each else lag for lag, each in zip(best, prompt, strict=True)]
+    # An effect too small to be seen at first is none: what acts late acts more than just before.
+    long = long_arx(longer, MAX_DELAY)[1]
+    pick = np.eye(long.coefficients.shape[1])
+    first = [lag * width + n + j for j, lag in enumerate(best)]
+    found = [
+        0 if each or (lag and no_effect(long, pick[[i]] - pick[[i - width]], 0.1)) else lag
+        for lag, each, i in zip(best, prompt, first, strict=True)
+    ]
     # A hidden state makes earlier inputs count too, but earlier states with them.
     return none if any(found) and leftover(longer, found).is_hidden else found
 

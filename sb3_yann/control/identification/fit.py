@@ -31,7 +31,9 @@ from sb3_yann.control.identification.least_squares import (
 )
 from sb3_yann.control.identification.outputs import feedback, missed
 from sb3_yann.control.identification.residuals import (
+    BIASED,
     LONG_PREDICTION,
+    POOR,
     TIED,
     listed,
     project_out,
@@ -113,9 +115,11 @@ def fit_log(
             f"{longest_note(delays)}"
         )
     late = [] if any(delays) else early_note(episodes) or input_notes(found, episodes)
-    if late:
-        warn(log.in_names(" ".join(late)))
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
+    # -0.25: half of the correlation that noise alone makes
+    poor = np.any(fits[1] < POOR) and np.min(found.autocorrelation) < -0.25
+    if told := [*late, *(each for each in quality if poor and BIASED in each)]:
+        warn(log.in_names(" ".join(told)))
     notes = [*system.notes, *memory, *quality, *shrunk, *late]
     if log.lost_steps:
         notes.append(f"{log.lost_steps} steps at gaps, or of another time than dt, are left out.")

@@ -112,6 +112,13 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
     return lags, arx(episodes, lags, lags - 1)
 
 
+def long_arx(episodes: Sequence[Episode], limit: int) -> tuple[int, Regression]:
+    """Return how many lags, more than a dead time of ``limit``, and the ARX model with them."""
+    lags, found = lags_by_criterion(episodes)
+    longest = min(limit + 4, max((len(each) for each in episodes), default=0) - 1)
+    return (lags, found) if lags >= longest else (longest, arx(episodes, longest, longest - 1))
+
+
 def dead_times(
     episodes: Sequence[Episode], limit: int, n_driven: int | None = None
 ) -> list[tuple[int, ...]]:
@@ -125,11 +132,7 @@ def dead_times(
     """
     q = episodes[0].states.shape[1]
     m = n_driven or episodes[0].inputs.shape[1]
-    lags, found = lags_by_criterion(episodes)
-    longest = min(limit + 4, max((len(each) for each in episodes), default=0) - 1)
-    if lags < longest:
-        lags = longest
-        found = arx(episodes, longest, longest - 1)
+    lags, found = long_arx(episodes, limit)
     width = episodes[0].regressors.shape[1]
     columns = [[lag * width + q + j for lag in range(lags)] for j in range(m)]
     # What never acts has no dead time.
@@ -151,13 +154,15 @@ def above_rounding(found: Regression) -> Array:
     return found.covariance + np.diag(FLOOR * np.where(spread > 0, spread, 1.0) ** 2)
 
 
-def no_effect(found: Regression, columns: Sequence[int], chance: float) -> bool:
-    """Return whether an F test cannot tell the coefficients of some columns from zero.
+def no_effect(found: Regression, of: Sequence[int] | Array, chance: float) -> bool:
+    """Return whether an F test cannot tell coefficients from zero.
 
-    Of one column it is Hotelling's T-squared test.
+    It is of some columns, or of weighted sums of all columns, (k, columns). Of one it is
+    Hotelling's T-squared test.
     """
-    b = found.coefficients[:, columns]
-    own = found.correlation[np.ix_(columns, columns)] + np.finfo(float).tiny * np.eye(len(columns))
+    weights = of if isinstance(of, np.ndarray) else np.eye(found.coefficients.shape[1])[list(of)]
+    b = found.coefficients @ weights.T
+    own = weights @ found.correlation @ weights.T + np.finfo(float).tiny * np.eye(len(weights))
     inner = np.linalg.solve(own, b.T)
     wald = float(np.sum(np.linalg.solve(above_rounding(found), b) * inner.T))
     freedom = found.degrees_of_freedom - len(b) + 1

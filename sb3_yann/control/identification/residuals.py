@@ -194,6 +194,8 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
 
 
 LONG_PREDICTION = 10  # steps of the longer prediction whose fit is stated
+POOR = 50.0  # percent of its fit below which a model is called poor
+BIASED = "sensor noise, which biases A towards zero"
 
 
 def quality_notes(
@@ -226,7 +228,8 @@ def quality_notes(
     if ridge > 0:
         notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
     notes += _residual_notes(found, fitted, n)
-    noise = "process noise" + " alone" * any(each.endswith(UNTOLD) for each in notes)
+    more = any(each.endswith(UNTOLD) or each.startswith(CURVED) for each in notes)
+    noise = "process noise" + " alone" * more
     return [*notes, pole_note(*pole_errors(found, n), noise)]
 
 
@@ -272,7 +275,8 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
     if np.any(colored):
         notes.append(
             f"The residuals of neighboring steps are correlated ({listed(own)}): "
-            f"there is sensor noise, which biases A towards zero, or an unmodeled state. {UNTOLD}"
+            f"there is {BIASED}, or an unmodeled state: "
+            f"identify_outputs(log) models both. {UNTOLD}"
         )
     return notes
 
@@ -289,8 +293,7 @@ def _words_for(fits: tuple[Array, Array], steps: int) -> str:
     text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
     if len(words) < len(fits):
         text += f" No episode of them is {LONG_PREDICTION} steps long."
-    # 50.0: percent of the longer prediction's fit below which a model is called poor
-    if np.any(fits[1] < 50.0):
+    if np.any(fits[1] < POOR):
         text += f" Poor: {LONG_PREDICTION} steps ahead the model says little of the plant."
     return text
 
