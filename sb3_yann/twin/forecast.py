@@ -63,15 +63,15 @@ class Forecast(NamedTuple):
 class _Replays:
     """The episodes of a log side by side, with what comes of policies in a judge.
 
-    Shorter ones count until their end. With ``depths`` the judge has a memory: it knows that errors
-    follow inputs and errors of so many samples before, whichever explains most.
+    Shorter ones count until their end. With a ``depth`` the judge has a memory: errors follow the
+    inputs and errors of so many samples before.
     """
 
-    def __init__(self, judge: Judge, episodes: Sequence[Episode], depths: Sequence[int]) -> None:
+    def __init__(self, judge: Judge, episodes: Sequence[Episode], depth: int) -> None:
         self.dynamics = judge.dynamics
         self.members = len(judge.dynamics.members)
-        self.explains = False
-        self.depths = depths
+        self.depth = depth
+        self.unexplained = 1.0  # share of the errors of one step on held-out episodes
         self.units = judge.dynamics.coordinates.units
         row = self.dynamics.row
         self.rows = padded([each.thetas for each in episodes])
@@ -86,7 +86,7 @@ class _Replays:
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
         self.weights = None
-        if depths:
+        if depth:
             made = [self._regressors(t, r, inputs, self.errors) for t, r in enumerate(rows)]
             basis = np.stack(made)
             self.weights = self._memory(basis)
@@ -154,8 +154,8 @@ class _Replays:
         return np.asarray(found.reshape(self.members, count, some))
 
     def _regressors(self, t: int, rows: Array, inputs: Array, missed: Array) -> Array:
-        ago = range(1, DEPTHS[-1] + 1)  # the latest first: a memory of less depth knows those
-        past = (of[t - k] if t >= k else 0 * of[0] for k in ago for of in (inputs, missed))
+        ago = range(1, self.depth + 1)
+        past = (of[t - k] if t >= k else 0 * of[0] for of in (inputs, missed) for k in ago)
         one = np.ones((*rows.shape[:-1], 1))
         x = rows[..., self.dynamics.row.state]
         return np.concatenate([one, x, inputs[t], *past], axis=-1)
@@ -167,34 +167,25 @@ class _Replays:
         (Ljung, *System Identification*, section 4.2).
         """
         count = self.rows.shape[1]
-        each_ago = self.errors.shape[3] + self.inputs.shape[2]
-        plain = 1 + each_ago
-        # 4: steps of a log for each coefficient, at least
-        sizes = [
-            k for k in (plain + n * each_ago for n in self.depths) if 4 * k <= self.alive.sum()
-        ]
-        if not sizes or count < 2:
-            return None
+        plain = 1 + self.errors.shape[3] + self.inputs.shape[2]
         known = self.alive.copy()
-        known[: DEPTHS[-1]] = False
-        weights = np.zeros((len(sizes), self.members, basis.shape[-1], self.errors.shape[3]))
-        left = np.zeros(1 + len(sizes))
+        known[: self.depth] = False
+        # 4: steps of a log for each coefficient, at least
+        if known.sum() < 4 * basis.shape[-1] or count < 2:
+            return None
+        weights = []
+        left = np.zeros(2)
         for k in range(self.members):
             unseen = np.arange(count) % self.members == k
             fit = known & ~unseen if np.any(known & ~unseen) else known
             test = known & unseen if np.any(known & unseen) else known
             z = basis[:, k]
             e = self.errors[:, k]
-            for i, size in enumerate([plain, *sizes]):
-                found = _ridge(z[fit][:, :size], e[fit])
-                left[i] += np.sum(((e[test] - z[test][:, :size] @ found) / self.units) ** 2)
-                if i:
-                    weights[i - 1, k, :size] = found
-        best = int(np.argmin(left[1:]))
-        self.depths = self.depths[best : best + 1]
-        # It must explain 2 % of the errors of one step on held-out episodes.
-        self.explains = bool(left[1 + best] < 0.98 * left[0])
-        return np.asarray(weights[best])
+            weights.append(_ridge(z[fit], e[fit]))
+            rests = e - z @ weights[-1], e - z[..., :plain] @ _ridge(z[fit][:, :plain], e[fit])
+            left += [np.sum((each[test] / self.units) ** 2) for each in rests]
+        self.unexplained = float(left[0] / left[1])
+        return np.array(weights)
 
 
 def _ridge(z: Array, y: Array) -> Array:
@@ -217,8 +208,9 @@ def forecast(
 
     It is the union of the judges' intervals, of runs from the log's own starts, and of others from
     the box of all starts at new set-points and loads, which no policy was fitted to. Where its
-    errors follow earlier inputs and errors, a judge is asked again with a memory of them. The first
-    judge is the twin's own: there new starts must keep the rule for the worst ones, too.
+    errors follow earlier inputs and errors, a judge is asked again with memories of them. The first
+    judge is the twin's own: there new starts must keep the rule for the worst ones, too, and what
+    its memories change, they may by half as much again.
     ``loosest`` is the input that follows the MPC most closely.
     """
     problem = judges[0].dynamics.problem
@@ -228,28 +220,34 @@ def forecast(
     rng = np.random.default_rng(0)
     some = -(-100 // count)  # so that a hundred runs begin anew
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
-    plain, own = (_Replays(judges[0], episodes, each) for each in ((), DEPTHS))
+    own = [_Replays(judges[0], episodes, depth) for depth in (0, *DEPTHS)]
+    # A memory must explain 2 % of the errors of one step on held-out episodes.
+    own = [each for each in own if not each.depth or each.unexplained < 0.98]
+    best = min(own, key=lambda each: each.unexplained)
     logged = np.stack([each.thetas[:1] for each in episodes]), None
-    new = drawn.reshape(count, some, -1), plain.new_given(some, rng)
+    new = drawn.reshape(count, some, -1), own[0].new_given(some, rng)
     found: list[tuple[float, float, float, str]] = []
     worst = -np.inf
     objection = ""
     for judge in bar("forecasts by models of the log", judges, timed=True):
-        for depths in ((), own.depths):
-            remembers = bool(depths)
-            if (judge.refuted and not remembers) or (remembers and not own.explains):
+        for its in own:
+            if judge.refuted and (its is not best or not its.depth):
                 continue
-            replays = _Replays(judge, episodes, depths)
-            if surely_worse(replays.left - (own if remembers else plain).left):
+            replays = _Replays(judge, episodes, its.depth)
+            if surely_worse(replays.left - its.left):
                 continue
-            says = REMEMBERED if remembers else judge.says
+            says = REMEMBERED if its.depth else judge.says
             played = [[replays.costs(each, *of) for each in (law, act)] for of in (logged, new)]
             runs = [each.reshape(len(each), -1) for each in played[1]]
             with np.errstate(all="ignore"):
                 objection = objection if found else _objection(*runs)
-            for mpc, policy in played:
+            for k, (mpc, policy) in enumerate(played):
                 means = mpc.mean(axis=2), policy.mean(axis=2)
-                found.append((*_changed(*means, independent, runs), says))
+                middle, low, high = _changed(*means, independent, runs)
+                # 0.5: of what a memory changes, that it misses: behind noise it knows a part
+                own_memory = its.depth and judge is judges[0]
+                missed = 0.5 * (middle - found[k][0]) if own_memory else 0.0
+                found.append((middle, low + min(missed, 0.0), high + max(missed, 0.0), says))
                 with np.errstate(all="ignore"):
                     most = np.max(policy - mpc) / np.abs(mpc).mean()
                 worst = max(worst, float(np.nan_to_num(most, nan=np.inf)))
@@ -331,9 +329,7 @@ def _cure(
     if not np.isfinite(high - low):
         return "log more episodes"
     if middle >= 0 or says == REMEMBERED:
-        kind = (
-            " for longer than the actuator takes, or the load itself" if says == REMEMBERED else ""
-        )
+        kind = " for longer than the actuator takes, and any load" if says == REMEMBERED else ""
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
     needed = independent * min(((high - middle) / middle) ** 2, 100.0)

@@ -33,7 +33,6 @@ from sb3_yann.control.identification.outputs import feedback, missed
 from sb3_yann.control.identification.residuals import (
     BIASED,
     LONG_PREDICTION,
-    POOR,
     TIED,
     listed,
     project_out,
@@ -116,9 +115,7 @@ def fit_log(
         )
     late = [] if any(delays) else early_note(episodes) or input_notes(found, episodes)
     quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
-    # -0.25: half of the correlation that noise alone makes
-    poor = np.any(fits[1] < POOR) and np.min(found.autocorrelation) < -0.25
-    if told := [*late, *(each for each in quality if poor and BIASED in each)]:
+    if told := [*late, *(each for each in quality if each.startswith(BIASED))]:
         warn(log.in_names(" ".join(told)))
     notes = [*system.notes, *memory, *quality, *shrunk, *late]
     if log.lost_steps:

@@ -115,7 +115,14 @@ def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
 def long_arx(episodes: Sequence[Episode], limit: int) -> tuple[int, Regression]:
     """Return how many lags, more than a dead time of ``limit``, and the ARX model with them."""
     lags, found = lags_by_criterion(episodes)
-    longest = min(limit + 4, max((len(each) for each in episodes), default=0) - 1)
+    width = episodes[0].regressors.shape[1]
+    # 2: rows for each coefficient, at least
+    enough = (
+        p
+        for p in range(lags, limit + 5)
+        if sum(len(e) - p for e in episodes if len(e) > p) > 2 * p * width
+    )
+    longest = max(enough, default=lags)
     return (lags, found) if lags >= longest else (longest, arx(episodes, longest, longest - 1))
 
 

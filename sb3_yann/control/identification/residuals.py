@@ -195,7 +195,7 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
 
 LONG_PREDICTION = 10  # steps of the longer prediction whose fit is stated
 POOR = 50.0  # percent of its fit below which a model is called poor
-BIASED = "sensor noise, which biases A towards zero"
+BIASED = "Biased: "  # begins notes that are warned of
 
 
 def quality_notes(
@@ -227,14 +227,17 @@ def quality_notes(
         )
     if ridge > 0:
         notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
-    notes += _residual_notes(found, fitted, n)
+    notes += _residual_notes(found, fitted, n, bool(np.any(fits[1] < POOR)))
     more = any(each.endswith(UNTOLD) or each.startswith(CURVED) for each in notes)
     noise = "process noise" + " alone" * more
     return [*notes, pole_note(*pole_errors(found, n), noise)]
 
 
-def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[str]:
-    """Return notes on what the residuals hold beside white noise: curvature, or colour."""
+def _residual_notes(found: Regression, fitted: list[Episode], n: int, poor: bool) -> list[str]:
+    """Return notes on what the residuals hold beside white noise: curvature, or colour.
+
+    Much noise biases a model until its residuals are white: of a ``poor`` one earlier samples tell.
+    """
     share, rest = curvature_test(found, fitted)
     share = share[:n]
     own = found.autocorrelation[:n]
@@ -272,11 +275,17 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
             "time. Append earlier readings and inputs to the states, or measure what is missing. "
             + UNTOLD
         ]
-    if np.any(colored):
+    # 10.0: percent that earlier samples explain of what a poor model leaves, where noise biases it
+    poor &= bool(np.any(explained > 10.0)) and not np.any((share > 0) | (colored & (own > 0)))
+    if poor or np.any(colored):
+        which = (
+            f"The residuals of neighboring steps are correlated ({listed(own)})"
+            if np.any(colored)
+            else f"Earlier states and inputs explain {listed(explained)} % of the residuals"
+        )
         notes.append(
-            f"The residuals of neighboring steps are correlated ({listed(own)}): "
-            f"there is {BIASED}, or an unmodeled state: "
-            f"identify_outputs(log) models both. {UNTOLD}"
+            f"{BIASED * poor}{which}: there is sensor noise, which biases A towards zero, or an "
+            f"unmodeled state (identify_outputs models both). {UNTOLD}"
         )
     return notes
 
