@@ -184,7 +184,7 @@ class _Replays:
             weights.append(_ridge(z[fit], e[fit]))
             rests = e - z @ weights[-1], e - z[..., :plain] @ _ridge(z[fit][:, :plain], e[fit])
             left += [np.sum((each[test] / self.units) ** 2) for each in rests]
-        self.unexplained = float(left[0] / left[1])
+        self.unexplained = float(left[0] / left[1]) if left[1] > 0 else 1.0
         return np.array(weights)
 
 
@@ -231,7 +231,7 @@ def forecast(
     objection = ""
     for judge in bar("forecasts by models of the log", judges, timed=True):
         for its in own:
-            if judge.refuted and (its is not best or not its.depth):
+            if judge.refuted and not (its.depth and its is best):
                 continue
             replays = _Replays(judge, episodes, its.depth)
             if surely_worse(replays.left - its.left):

@@ -94,7 +94,8 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     """Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
 
     The estimate is consistent under process noise, independent from step to step (Ljung, *System
-    Identification*, 2nd ed., section 7.3). Sensor noise biases A towards zero: the notes say so.
+    Identification*, 2nd ed., section 7.3). Sensor noise biases A towards zero: notes say so, of a
+    poor model a warning; `identify_outputs` models it.
 
     Parameters
     ----------
