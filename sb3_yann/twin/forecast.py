@@ -32,18 +32,58 @@ REMEMBERED = (
 )
 
 
+class Actuator(NamedTuple):
+    """How what acts on a plant may follow the inputs, where nothing shows it.
+
+    ``size`` is a lag's pole; of a rate limit and of a play it is in half-widths of the inputs.
+    """
+
+    kind: str
+    size: float
+
+    def __str__(self) -> str:
+        """Name it."""
+        size = f"{100 * self.size:g} % of half the range"
+        return {
+            "lag": f"a lag with a pole of {self.size:g}",
+            "rate": f"a limit of {size} a sample",
+            "play": f"a play of {size}",
+        }[self.kind]
+
+    def moved(self, held: Array, u: Array, half: Array) -> Array:
+        """Return where it is after a sample with inputs, all (..., m)."""
+        if self.kind == "lag":
+            return self.size * held + (1 - self.size) * u
+        room = self.size * half
+        end, about = (u, held) if self.kind == "rate" else (held, u)
+        return np.clip(end, about - room, about + room)
+
+    def behind(self, inputs: Array, half: Array) -> Array:
+        """Return what acts in an episode with inputs (T, ..., m); it begins with the first."""
+        held = [inputs[0]]
+        for u in inputs[1:]:
+            held.append(self.moved(held[-1], u, half))
+        return np.stack(held)
+
+
+SIZES = {"lag": (0.3, 0.5, 0.7), "rate": (0.06, 0.12, 0.2, 0.3), "play": (0.03, 0.06, 0.12)}
+ACTUATORS = tuple(Actuator(kind, size) for kind, sizes in SIZES.items() for size in sizes)
+
+
 @dataclass(frozen=True)
 class Judge:
     """A twin that a log may refute, fitted without each fold of the episodes.
 
     Member k has not seen the episodes whose number is k modulo the members. ``says`` is what sets
-    it apart. Where it is ``refuted``, predicts held-out episodes surely worse than the twin, it
-    counts with a memory alone: dynamics that both lack may feign that.
+    it apart; inputs go through its ``actuator``, if any. Where it is ``refuted``, predicts held-out
+    episodes surely worse than the twin, it counts with a memory alone: dynamics that both lack may
+    feign that.
     """
 
     dynamics: Dynamics
     says: str = ""
     refuted: bool = False
+    actuator: Actuator | None = None
 
 
 class Forecast(NamedTuple):
@@ -69,6 +109,8 @@ class _Replays:
 
     def __init__(self, judge: Judge, episodes: Sequence[Episode], depth: int) -> None:
         self.dynamics = judge.dynamics
+        self.actuator = judge.actuator
+        self.half = judge.dynamics.problem.u_half
         self.members = len(judge.dynamics.members)
         self.depth = depth
         self.unexplained = 1.0  # share of the errors of one step on held-out episodes
@@ -82,7 +124,8 @@ class _Replays:
             np.repeat(each[:, None], self.members, axis=1) for each in (self.rows[:-1], self.inputs)
         )
         with np.errstate(all="ignore"):
-            predicted = np.stack([*map(self.dynamics.step, rows, inputs)])
+            acting = inputs if self.actuator is None else self.actuator.behind(inputs, self.half)
+            predicted = np.stack([*map(self.dynamics.step, rows, acting)])
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
         self.weights = None
@@ -131,6 +174,7 @@ class _Replays:
         like = np.repeat(np.arange(count), some)
         alive = self.alive[:, like]
         missed = self.errors[:, :, like]
+        held = np.repeat(self.inputs[None, 0, like], self.members, axis=0)
 
         def inputs_at(t: int, rows: Array) -> Array:
             u = act(np.nan_to_num(row.shown(rows).reshape(-1, problem.n_theta)))
@@ -139,7 +183,9 @@ class _Replays:
         def step(t: int, rows: Array, inputs: Array) -> Array:
             if self.weights is not None:
                 missed[t] += self._regressors(t, rows[t], inputs, missed) @ self.weights
-            after: Array = self.dynamics.step(rows[t], inputs[t]) + missed[t] @ row.spread.T
+            by = self.actuator
+            held[:] = inputs[t] if by is None else by.moved(held, inputs[t], self.half)
+            after: Array = self.dynamics.step(rows[t], held) + missed[t] @ row.spread.T
             row.clip(after)
             after[:, ~alive[t]] = rows[t][:, ~alive[t]]
             return after
@@ -333,4 +379,4 @@ def _cure(
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
     needed = independent * min(((high - middle) / middle) ** 2, 100.0)
-    return f"log about {more(max(int(np.ceil(needed)), EACH) - independent + 1)} more"
+    return f"log about {more(max(int(np.ceil(needed)), EACH, independent) - independent + 1)} more"

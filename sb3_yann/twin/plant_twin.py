@@ -227,7 +227,13 @@ class PlantTwin(LearntModel):
 
     def report(self) -> str:
         """Return what the twin explains, what it does not know, and whether to trust it."""
-        return "\n".join([*self.notes, report(self.problem, self.episodes, self.kind, self.trust)])
+        late = [
+            f"With {each.says}, steps are predicted better: forecasts ask it, too."
+            for each in self.judges
+            if each.actuator is not None
+        ]
+        found = report(self.problem, self.episodes, self.kind, self.trust)
+        return "\n".join([*self.notes, found, *late])
 
     def plot(self, axes: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
         """Draw costs of held-out episodes, and errors of free runs; return both axes."""

@@ -25,7 +25,7 @@ from sb3_yann.control.identification.residuals import FOLDS
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.coordinates import steady_states
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
-from sb3_yann.twin.forecast import Judge, surely_worse
+from sb3_yann.twin.forecast import ACTUATORS, Actuator, Judge, surely_worse
 from sb3_yann.twin.log import Episode, pieces
 from sb3_yann.units import FLOAT32_ROUNDING
 
@@ -480,7 +480,41 @@ def judges(
     ]
     worse = surely_worse(held_out(coordinates, parts, rivals).scores - scores).tolist()
     every = zip([replace(chosen, name=""), *rivals], [False, *worse], strict=True)
-    return tuple(Judge(Dynamics(problem, coordinates, e.by_fold), e.name, bad) for e, bad in every)
+    found = [Judge(Dynamics(problem, coordinates, e.by_fold), e.name, bad) for e, bad in every]
+    # Polynomials are as free as the chosen one, or as those that are tried beside networks.
+    return (*found, *_behind(coordinates, parts, chosen.setting or Setting(2, 1e-4, 1.0)))
+
+
+def _behind(coordinates: Coordinates, parts: Sequence[Episode], setting: Setting) -> list[Judge]:
+    """Return a twin behind the actuator that predicts one step best, if surely better than none.
+
+    An estimator goes by the inputs themselves: of its rows nothing is said.
+    """
+    problem = coordinates.row.problem
+    row = coordinates.row
+    if row.observer is not None or row.estimator is not None or len(parts) < 2:
+        return []
+
+    def tried(actuator: Actuator | None) -> tuple[Array, tuple[Residual, ...]]:
+        """Return mean logarithms of squared errors (episodes,), each without its fold, and fits."""
+        acting = [
+            replace(e, actions=actuator.behind(e.actions, problem.u_half)) if actuator else e
+            for e in parts
+        ]
+        fits = [ridge(coordinates, some, [setting])[0] for some in without_each_fold(acting)]
+        errors = []
+        for i, (z, y) in enumerate(map(coordinates.regression, acting)):
+            left = (y - fits[i % FOLDS].predict(z)) / coordinates.units
+            errors.append(np.log(np.mean(left**2) + 1e-20))
+        return np.array(errors), tuple(fits)
+
+    plain, _ = tried(None)
+    found = [(*tried(each), each) for each in ACTUATORS]
+    errors, fits, actuator = min(found, key=lambda each: each[0].mean())
+    if not surely_worse(plain - errors):
+        return []
+    says = f"{actuator} in the actuators, as in this log"
+    return [Judge(Dynamics(problem, coordinates, fits), says, actuator=actuator)]
 
 
 def reidentified(
