@@ -20,7 +20,7 @@ from examples import quadruple_tank as tank
 from experiments import plants
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann._validation import Array
-from sb3_yann.audit.meaning import in_deviations
+from sb3_yann.improvement.simulator import in_deviations
 from sb3_yann.wrappers import SetPoint
 
 Log = list[tuple[Array, Array]]

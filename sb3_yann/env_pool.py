@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from sb3_yann._validation import check_type, half_widths, warn
+from sb3_yann.control.observer import StateEstimator
 from sb3_yann.control.simulator import require_makes
 from sb3_yann.units import same_bounds
 
@@ -118,6 +119,19 @@ class OneOf(gym.Env[Any, Any]):
 def is_vec_env(env: Any) -> bool:
     """Return whether an env is a VecEnv of Stable-Baselines3, which is not imported for that."""
     return hasattr(env, "env_method") and hasattr(env, "num_envs")
+
+
+def observer_of(env: Any) -> StateEstimator | None:
+    """Return the observer among the wrappers of an env or of a VecEnv, None where there is none.
+
+    An id, a class or a function that makes an env has none.
+    """
+    found = None
+    if is_vec_env(env) and env.has_attr("observer"):
+        found = env.get_attr("observer", 0)[0]
+    elif isinstance(env, gym.Env) and env.has_wrapper_attr("observer"):
+        found = env.get_wrapper_attr("observer")
+    return found if isinstance(found, StateEstimator) else None
 
 
 def name_of(env: Any) -> str:

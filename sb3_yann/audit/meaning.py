@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
-from functools import partial
 from itertools import permutations, product
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from sb3_yann._validation import Array, Mask, warn
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linear_system import labels_of
 from sb3_yann.control.mpc.misreading import misread_states
-from sb3_yann.control.wrapper_stack import SHOW_THETA, require_state_shown, require_theta_order
+from sb3_yann.control.wrapper_stack import SHOW_THETA, require_theta_order
 from sb3_yann.rollout import Trajectories
-from sb3_yann.units import ActionUnits, Units
-from sb3_yann.wrappers.theta import EstimateState, below, require_vector
+from sb3_yann.wrappers.theta import EstimateState, below
 
 SIGN_STARTS = 5
 """Starts from which each input is pushed; it must act against the model from all of them."""
@@ -231,64 +227,6 @@ def explained(gain: Array, rewards: Array, known: Mask) -> float:
     if np.abs(x).max() <= 1e-9 * np.abs(gain[known]).max():
         return 1.0
     return max(float(x @ y / size), 0.0) ** 2 if size > 0 else 0.0
-
-
-Map = Callable[[Array], Array]  # from an observation to theta
-
-
-def _in_deviations(
-    make: Callable[[], gym.Env[Any, Any]], units: Units, observation: Map | None
-) -> gym.Env[Any, Any]:
-    """Return an env in plant units as laws compute with it: see :func:`in_deviations`."""
-    env = make()
-    seen: Any = env.observation_space
-    taken: Any = env.action_space
-    far = np.full(len(units.theta_ss), np.inf)
-    low, high = (seen.low, seen.high) if observation is None else (-far, far)
-
-    def theta(shown: Any) -> Array:
-        return units.to_deviations(shown if observation is None else observation(np.ravel(shown)))
-
-    def action(u: Any) -> Any:
-        # Rounding must not leave the space of the env.
-        return np.clip(units.input_to_plant(u), taken.low, taken.high).astype(taken.dtype)
-
-    seen = spaces.Box(low - units.theta_ss, high - units.theta_ss, dtype=np.float64)
-    inputs = spaces.Box(taken.low - units.u_ss, taken.high - units.u_ss, dtype=np.float64)
-    env = gym.wrappers.TransformObservation(env, theta, seen)
-    return gym.wrappers.TransformAction(env, action, inputs)
-
-
-def in_deviations(
-    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, observation: Map | None = None
-) -> Callable[[], gym.Env[Any, Any]]:
-    """Return a function that makes envs that show theta, and take inputs, in deviations.
-
-    ``observation`` makes theta in plant units of what the env shows; by default it shows that.
-    Actions in other units are a ValueError.
-    """
-    with closing(make()) as env:
-        space = require_vector(env, "action_space")
-        require_state_shown(env, observation is not None)
-        if observation is None:
-            require_spaces(problem, env)
-    units = ActionUnits.of(problem, space.low, space.high)
-    if units is not None and units.kind == "normalized":
-        raise ValueError(
-            f"The env takes normalized inputs, from {space.low.tolist()} to {space.high.tolist()}, "
-            f"and the MPC inputs from {problem.u_min.tolist()} to {problem.u_max.tolist()}. Wrap "
-            "it in gymnasium.wrappers.RescaleAction(env, mpc.u_min, mpc.u_max)."
-        )
-    own = problem.deviations
-    if units is None and own is not problem and ActionUnits.of(own, space.low, space.high):
-        raise ValueError(
-            f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "
-            f"the MPC is in plant units, from {problem.u_min.tolist()} to {problem.u_max.tolist()}."
-            " Leave x_ss and u_ss out of its model, or take the env in plant units."
-        )
-    if observation is None and not problem.units.shifted:
-        return make
-    return partial(_in_deviations, make, problem.units, observation)
 
 
 def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:

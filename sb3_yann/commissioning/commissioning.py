@@ -31,7 +31,7 @@ from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import RULE, Difference, allowed_excess, level_of_look
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, costs_of, excess_of_episodes
-from sb3_yann.env_pool import Source, one_env
+from sb3_yann.env_pool import Source, observer_of, one_env
 from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
 from sb3_yann.improvement.imitation import controller_of
@@ -44,7 +44,6 @@ from sb3_yann.policy.checkpoint import (
 )
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.rollout import preserve_rng
-from sb3_yann.twin.log import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
 Whole = tuple[dict[str, Any], list[Any]]  # weights and optimizers: see `whole_policy`

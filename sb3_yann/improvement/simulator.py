@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -20,7 +21,6 @@ from sb3_yann._validation import Array, NonFiniteWarning, warn
 from sb3_yann.audit.meaning import (
     SIGN_STARTS,
     SIGN_STEPS,
-    in_deviations,
     require_spaces,
     require_theta_shown,
     warn_of_box,
@@ -31,7 +31,8 @@ from sb3_yann.audit.meaning import (
 from sb3_yann.compare import NewSeeds, unsafe_columns
 from sb3_yann.control import LinearMPC, StateEstimator
 from sb3_yann.control.mpc.bound_excess import costs_of
-from sb3_yann.env_pool import ProcessEndedError, Source, maker, name_of, pool_of
+from sb3_yann.control.wrapper_stack import require_state_shown
+from sb3_yann.env_pool import ProcessEndedError, Source, maker, name_of, observer_of, pool_of
 from sb3_yann.plan import WEIGHT, Disagreement, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import (
     Controller,
@@ -44,13 +45,72 @@ from sb3_yann.rollout import (
 )
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of, play
 from sb3_yann.twin.env import LearntModel
-from sb3_yann.twin.log import SHORTEST, Episode, observer_of
+from sb3_yann.twin.log import SHORTEST, Episode
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.selection import fit_ensemble, fit_family
-from sb3_yann.wrappers.theta import SetPoint, below
+from sb3_yann.units import ActionUnits, Units
+from sb3_yann.wrappers.theta import SetPoint, below, require_vector
 
 FIRST = 3_000_000  # seed of the first episode: far from those that people try first
 EPISODES = 20  # of the MPC, with and without random inputs, that the first model is fitted to
+
+
+Map = Callable[[Array], Array]  # from an observation to theta
+
+
+def _in_deviations(
+    make: Callable[[], gym.Env[Any, Any]], units: Units, observation: Map | None
+) -> gym.Env[Any, Any]:
+    """Return an env in plant units as laws compute with it: see :func:`in_deviations`."""
+    env = make()
+    seen: Any = env.observation_space
+    taken: Any = env.action_space
+    far = np.full(len(units.theta_ss), np.inf)
+    low, high = (seen.low, seen.high) if observation is None else (-far, far)
+
+    def theta(shown: Any) -> Array:
+        return units.to_deviations(shown if observation is None else observation(np.ravel(shown)))
+
+    def action(u: Any) -> Any:
+        # Rounding must not leave the space of the env.
+        return np.clip(units.input_to_plant(u), taken.low, taken.high).astype(taken.dtype)
+
+    seen = spaces.Box(low - units.theta_ss, high - units.theta_ss, dtype=np.float64)
+    inputs = spaces.Box(taken.low - units.u_ss, taken.high - units.u_ss, dtype=np.float64)
+    env = gym.wrappers.TransformObservation(env, theta, seen)
+    return gym.wrappers.TransformAction(env, action, inputs)
+
+
+def in_deviations(
+    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, observation: Map | None = None
+) -> Callable[[], gym.Env[Any, Any]]:
+    """Return a function that makes envs that show theta, and take inputs, in deviations.
+
+    ``observation`` makes theta in plant units of what the env shows; by default it shows that.
+    Actions in other units are a ValueError.
+    """
+    with closing(make()) as env:
+        space = require_vector(env, "action_space")
+        require_state_shown(env, observation is not None)
+        if observation is None:
+            require_spaces(problem, env)
+    units = ActionUnits.of(problem, space.low, space.high)
+    if units is not None and units.kind == "normalized":
+        raise ValueError(
+            f"The env takes normalized inputs, from {space.low.tolist()} to {space.high.tolist()}, "
+            f"and the MPC inputs from {problem.u_min.tolist()} to {problem.u_max.tolist()}. Wrap "
+            "it in gymnasium.wrappers.RescaleAction(env, mpc.u_min, mpc.u_max)."
+        )
+    own = problem.deviations
+    if units is None and own is not problem and ActionUnits.of(own, space.low, space.high):
+        raise ValueError(
+            f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "
+            f"the MPC is in plant units, from {problem.u_min.tolist()} to {problem.u_max.tolist()}."
+            " Leave x_ss and u_ss out of its model, or take the env in plant units."
+        )
+    if observation is None and not problem.units.shifted:
+        return make
+    return partial(_in_deviations, make, problem.units, observation)
 
 
 class OutOfStepsError(Exception):

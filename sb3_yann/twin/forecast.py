@@ -43,31 +43,28 @@ class Actuator(NamedTuple):
 
     def __str__(self) -> str:
         """Name it."""
-        size = f"{100 * self.size:g} % of half the range"
-        return {
-            "lag": f"a lag with a pole of {self.size:g}",
-            "rate": f"a limit of {size} a sample",
-            "play": f"a play of {size}",
-        }[self.kind]
+        return f"a {self.kind} of {self.size:g}{' half-ranges' * (self.kind != LAG)}"
 
     def moved(self, held: Array, u: Array, half: Array) -> Array:
         """Return where it is after a sample with inputs, all (..., m)."""
-        if self.kind == "lag":
+        if self.kind == LAG:
             return self.size * held + (1 - self.size) * u
         room = self.size * half
-        end, about = (u, held) if self.kind == "rate" else (held, u)
+        end, about = (u, held) if self.kind == "rate limit" else (held, u)
         return np.clip(end, about - room, about + room)
 
     def behind(self, inputs: Array, half: Array) -> Array:
         """Return what acts in an episode with inputs (T, ..., m); it begins with the first."""
-        held = [inputs[0]]
-        for u in inputs[1:]:
-            held.append(self.moved(held[-1], u, half))
-        return np.stack(held)
+        held = inputs.copy()
+        for t in range(1, len(held)):
+            held[t] = self.moved(held[t - 1], inputs[t], half)
+        return held
 
 
-SIZES = {"lag": (0.3, 0.5, 0.7), "rate": (0.06, 0.12, 0.2, 0.3), "play": (0.03, 0.06, 0.12)}
+LAG = "lag with a pole"
+SIZES = {LAG: (0, 0.3, 0.5, 0.7), "rate limit": (0.06, 0.12, 0.2, 0.3), "play": (0.03, 0.06, 0.12)}
 ACTUATORS = tuple(Actuator(kind, size) for kind, sizes in SIZES.items() for size in sizes)
+NONE = ACTUATORS[0]  # what acts is the input
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,7 @@ class Judge:
     """A twin that a log may refute, fitted without each fold of the episodes.
 
     Member k has not seen the episodes whose number is k modulo the members. ``says`` is what sets
-    it apart; inputs go through its ``actuator``, if any. Where it is ``refuted``, predicts held-out
+    it apart; inputs go through its ``actuator``. Where it is ``refuted``, predicts held-out
     episodes surely worse than the twin, it counts with a memory alone: dynamics that both lack may
     feign that.
     """
@@ -83,7 +80,7 @@ class Judge:
     dynamics: Dynamics
     says: str = ""
     refuted: bool = False
-    actuator: Actuator | None = None
+    actuator: Actuator = NONE
 
 
 class Forecast(NamedTuple):
@@ -124,7 +121,7 @@ class _Replays:
             np.repeat(each[:, None], self.members, axis=1) for each in (self.rows[:-1], self.inputs)
         )
         with np.errstate(all="ignore"):
-            acting = inputs if self.actuator is None else self.actuator.behind(inputs, self.half)
+            acting = self.actuator.behind(inputs, self.half)
             predicted = np.stack([*map(self.dynamics.step, rows, acting)])
         errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
         self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
@@ -183,8 +180,7 @@ class _Replays:
         def step(t: int, rows: Array, inputs: Array) -> Array:
             if self.weights is not None:
                 missed[t] += self._regressors(t, rows[t], inputs, missed) @ self.weights
-            by = self.actuator
-            held[:] = inputs[t] if by is None else by.moved(held, inputs[t], self.half)
+            held[:] = self.actuator.moved(held, inputs[t], self.half)
             after: Array = self.dynamics.step(rows[t], held) + missed[t] @ row.spread.T
             row.clip(after)
             after[:, ~alive[t]] = rows[t][:, ~alive[t]]

@@ -8,13 +8,11 @@ from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, to_float, warn
-from sb3_yann.control import LinearMPC, StateEstimator
-from sb3_yann.env_pool import is_vec_env
+from sb3_yann.control import LinearMPC
 from sb3_yann.log import SECONDS, Log, as_matrices, require_one_state_more
 
 SHORTEST = 5  # steps that an episode has at least
@@ -217,23 +215,6 @@ def _theta(problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any]
     return theta
 
 
-class EstimatedDisturbanceWarning(UserWarning):
-    """The disturbances of a log move as an observer's estimate does, and no observer is given."""
-
-
-def observer_of(env: Any) -> StateEstimator | None:
-    """Return the observer among the wrappers of an env or of a VecEnv, None where there is none.
-
-    An id, a class or a function that makes an env has none.
-    """
-    found = None
-    if is_vec_env(env) and env.has_attr("observer"):
-        found = env.get_attr("observer", 0)[0]
-    elif isinstance(env, gym.Env) and env.has_wrapper_attr("observer"):
-        found = env.get_wrapper_attr("observer")
-    return found if isinstance(found, StateEstimator) else None
-
-
 def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
     """Warn where the disturbances of a log move as those of an observer.
 
@@ -266,6 +247,5 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
         warn(
             "The disturbances of the log follow the model's errors, as an observer's estimate "
             "does. A twin takes them for measured ones, which the policy does not move. Pass "
-            "observer=, the one of ObserveDisturbance.",
-            EstimatedDisturbanceWarning,
+            "observer=, the one of ObserveDisturbance."
         )

@@ -227,11 +227,7 @@ class PlantTwin(LearntModel):
 
     def report(self) -> str:
         """Return what the twin explains, what it does not know, and whether to trust it."""
-        late = [
-            f"With {each.says}, steps are predicted better: forecasts ask it, too."
-            for each in self.judges
-            if each.actuator is not None
-        ]
+        late = [f"With {e.says}, it predicts better." for e in self.judges if e.actuator.size]
         found = report(self.problem, self.episodes, self.kind, self.trust)
         return "\n".join([*self.notes, found, *late])
 

@@ -490,31 +490,27 @@ def _behind(coordinates: Coordinates, parts: Sequence[Episode], setting: Setting
 
     An estimator goes by the inputs themselves: of its rows nothing is said.
     """
-    problem = coordinates.row.problem
     row = coordinates.row
     if row.observer is not None or row.estimator is not None or len(parts) < 2:
         return []
 
-    def tried(actuator: Actuator | None) -> tuple[Array, tuple[Residual, ...]]:
+    def tried(actuator: Actuator) -> tuple[Array, tuple[Residual, ...], Actuator]:
         """Return mean logarithms of squared errors (episodes,), each without its fold, and fits."""
-        acting = [
-            replace(e, actions=actuator.behind(e.actions, problem.u_half)) if actuator else e
-            for e in parts
-        ]
+        half = row.problem.u_half
+        acting = [replace(e, actions=actuator.behind(e.actions, half)) for e in parts]
         fits = [ridge(coordinates, some, [setting])[0] for some in without_each_fold(acting)]
         errors = []
         for i, (z, y) in enumerate(map(coordinates.regression, acting)):
             left = (y - fits[i % FOLDS].predict(z)) / coordinates.units
             errors.append(np.log(np.mean(left**2) + 1e-20))
-        return np.array(errors), tuple(fits)
+        return np.array(errors), tuple(fits), actuator
 
-    plain, _ = tried(None)
-    found = [(*tried(each), each) for each in ACTUATORS]
+    found = [*map(tried, ACTUATORS)]
     errors, fits, actuator = min(found, key=lambda each: each[0].mean())
-    if not surely_worse(plain - errors):
+    if not surely_worse(found[0][0] - errors):
         return []
     says = f"{actuator} in the actuators, as in this log"
-    return [Judge(Dynamics(problem, coordinates, fits), says, actuator=actuator)]
+    return [Judge(Dynamics(row.problem, coordinates, fits), says, actuator=actuator)]
 
 
 def reidentified(

@@ -28,10 +28,10 @@ from sb3_yann import (
     improve,
     offset_free,
 )
-from sb3_yann.audit.meaning import in_deviations
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import simulator
 from sb3_yann.improvement.measuring import verdict_of
+from sb3_yann.improvement.simulator import in_deviations
 from sb3_yann.twin.selection import fit_ensemble
 from sb3_yann.wrappers import ObserveDisturbance, SetPoint, StageCost
 from sb3_yann_envs import problems

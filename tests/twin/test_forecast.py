@@ -14,7 +14,7 @@ from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin import forecast as module
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.forecast import REMEMBERED, Actuator, Forecast
+from sb3_yann.twin.forecast import LAG, REMEMBERED, Actuator, Forecast
 from sb3_yann.twin.trust import costs_of
 from sb3_yann.wrappers import SetPoint
 from sb3_yann_envs import ProblemBox
@@ -127,15 +127,13 @@ def test_a_gain_in_one_of_five_episodes_is_sure_where_others_lose_little() -> No
 def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
     found = twin(Lagging(0.5, 1.0, noise=0.0))
     plain, memory = (module._Replays(found.judges[0], found.episodes, depth) for depth in (0, 2))
-    assert memory.unexplained < 0.5
-    assert np.mean(memory.errors**2) < 0.5 * np.mean(plain.errors**2)
-    assert found.judges[-1].actuator == ("lag", 0.5) and "a lag with a pole of" in found.report()
+    assert memory.unexplained < 0.5 and np.mean(memory.errors**2) < 0.5 * np.mean(plain.errors**2)
+    assert found.judges[-1].actuator == (LAG, 0.5) and "a lag with a pole of" in found.report()
 
 
 def test_an_actuator_lags_moves_so_far_or_has_a_play() -> None:
-    held = {("lag", 0.5): (0, 0.5, 0.25), ("rate", 0.2): (0, 0.2, 0), ("play", 0.1): (0, 0.9, 0.1)}
-    for each, known in held.items():
-        np.testing.assert_allclose(Actuator(*each).behind(np.array([0.0, 1, 0]), 1.0), known)
+    for *each, a, b in (LAG, 0.5, 0.5, 0.25), ("rate limit", 0.2, 0.2, 0), ("play", 0.1, 0.9, 0.1):
+        assert Actuator(*each).behind(np.array([0.0, 1, 0]), 1.0) == pytest.approx([0, a, b])
 
 
 def test_where_it_may_cost_more_it_is_said_what_would_settle_it() -> None:

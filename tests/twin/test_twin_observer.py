@@ -26,9 +26,10 @@ from sb3_yann import (
     with_extra,
 )
 from sb3_yann._validation import Array
+from sb3_yann.env_pool import observer_of
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.dynamics import Dynamics
-from sb3_yann.twin.log import Episode, EstimatedDisturbanceWarning, observer_of, warn_of_estimates
+from sb3_yann.twin.log import Episode, warn_of_estimates
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.wrappers import EstimateState, SetPoint
 from twin_samples import (
@@ -111,7 +112,7 @@ def test_it_learns_what_an_estimate_that_is_taken_for_measured_hides() -> None:
     mpc = offset_free_problem()[0]
     found = observed()
     assert found.trusted and found.trust.cost_error < 1e-3
-    with pytest.warns(EstimatedDisturbanceWarning, match="Pass observer="):
+    with pytest.warns(UserWarning, match="Pass observer="):
         blind = PlantTwin.fit(mpc, [each[:2] for each in observed_log()])
     assert blind.trust.cost_error > 10 * found.trust.cost_error
 

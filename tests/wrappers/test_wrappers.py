@@ -21,8 +21,8 @@ from sb3_yann import (
     Tracking,
     offset_free,
 )
-from sb3_yann.audit.meaning import in_deviations
 from sb3_yann.control import StateEstimator
+from sb3_yann.improvement.simulator import in_deviations
 from sb3_yann.wrappers import (
     EstimateState,
     MeasuredDisturbance,
