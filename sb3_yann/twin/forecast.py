@@ -123,7 +123,9 @@ class _Replays:
         with np.errstate(all="ignore"):
             acting = self.actuator.behind(inputs, self.half)
             predicted = np.stack([*map(self.dynamics.step, rows, acting)])
-        errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
+        its = predicted[..., row.state]
+        turned = judge.dynamics.coordinates.nearest(self.rows[1:, None, :, row.state], its)
+        errors = turned - its
         self.errors = np.where(alive, errors, 0.0)  # (T, members, N, n)
         self.weights = None
         if depth:
@@ -182,6 +184,9 @@ class _Replays:
                 missed[t] += self._regressors(t, rows[t], inputs, missed) @ self.weights
             held[:] = self.actuator.moved(held, inputs[t], self.half)
             after: Array = self.dynamics.step(rows[t], held) + missed[t] @ row.spread.T
+            self.dynamics.coordinates.wrap(after)
+            if self.actuator.size:  # the law remembers its inputs, not what came of them
+                after[..., problem.layout.previous] = inputs[t][..., : problem.layout.n_previous]
             row.clip(after)
             after[:, ~alive[t]] = rows[t][:, ~alive[t]]
             return after
@@ -371,7 +376,8 @@ def _cure(
     if not np.isfinite(high - low):
         return "log more episodes"
     if middle >= 0 or says == REMEMBERED:
-        kind = " for longer than the actuator takes, and any load" if says == REMEMBERED else ""
+        slow = says == REMEMBERED or says.endswith("actuators")
+        kind = " for longer than the actuator takes, and any load" if slow else ""
         which = f"; with {says}, the change is {100 * low:+.2g} to {100 * high:+.2g} %"
         return f"log held steps of {loosest}{kind}{which if says else ''}"
     needed = independent * min(((high - middle) / middle) ** 2, 100.0)

@@ -227,9 +227,13 @@ class PlantTwin(LearntModel):
 
     def report(self) -> str:
         """Return what the twin explains, what it does not know, and whether to trust it."""
-        late = [f"With {e.says}, it predicts better." for e in self.judges if e.actuator.size]
+        known = [
+            f"With {e.says} steps are explained better; a load may look alike."
+            for e in self.judges
+            if e.actuator.size
+        ]
         found = report(self.problem, self.episodes, self.kind, self.trust)
-        return "\n".join([*self.notes, found, *late])
+        return "\n".join([*self.notes, found, *known])
 
     def plot(self, axes: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
         """Draw costs of held-out episodes, and errors of free runs; return both axes."""
@@ -263,6 +267,8 @@ class PlantTwin(LearntModel):
         act : callable
             From theta (rows, n_theta) to inputs (rows, m), in deviations.
         """
+        if not self.judges:  # of one episode
+            self.require_trust()
         share = np.where(self.trust.moves > 0, self.trust.excitation, np.inf)
         loosest = labels_of(self.problem.model)[1][int(np.argmin(share))]
         found = forecast(self.judges, self.episodes, self.starts, act, loosest)
@@ -338,7 +344,7 @@ def _fitted(
         members = [Residual.zero(len(coordinates.scale), problem.model.n_states)] * n_members
     dynamics = Dynamics(problem, coordinates, tuple(members))
     trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
-    found = judges(coordinates, parts, choice, runs.scores[chosen]) if choice.by_fold else ()
+    found = judges(coordinates, log, choice, runs.scores[chosen]) if choice.by_fold else ()
     name = f"hidden states, {choice.name}" if row.hidden else choice.name
     return PlantTwin(problem, log, dynamics, name, trust, notes, found)
 

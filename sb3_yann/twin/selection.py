@@ -460,7 +460,7 @@ def held_out(
 
 
 def judges(
-    coordinates: Coordinates, parts: Sequence[Episode], chosen: Candidate, scores: Array
+    coordinates: Coordinates, log: tuple[Episode, ...], chosen: Candidate, scores: Array
 ) -> tuple[Judge, ...]:
     """Return the twins that a log may not refute: the chosen one, and those with other gains.
 
@@ -468,6 +468,7 @@ def judges(
     chosen one owes to its shrinkage shows as well. ``scores`` (episodes,) are those of its runs.
     """
     problem = coordinates.row.problem
+    parts = pieces(log, FOLDS)
     degree = 1 if chosen.setting is None else chosen.setting.degree
     names = labels_of(problem.model)[1]
     gains = [*product(range(len(names)), GAINS)]
@@ -482,22 +483,23 @@ def judges(
     every = zip([replace(chosen, name=""), *rivals], [False, *worse], strict=True)
     found = [Judge(Dynamics(problem, coordinates, e.by_fold), e.name, bad) for e, bad in every]
     # Polynomials are as free as the chosen one, or as those that are tried beside networks.
-    return (*found, *_behind(coordinates, parts, chosen.setting or Setting(2, 1e-4, 1.0)))
+    return (*found, *_behind(coordinates, log, chosen.setting or Setting(2, 1e-4, 1.0)))
 
 
-def _behind(coordinates: Coordinates, parts: Sequence[Episode], setting: Setting) -> list[Judge]:
+def _behind(coordinates: Coordinates, log: tuple[Episode, ...], setting: Setting) -> list[Judge]:
     """Return a twin behind the actuator that predicts one step best, if surely better than none.
 
     An estimator goes by the inputs themselves: of its rows nothing is said.
     """
     row = coordinates.row
-    if row.observer is not None or row.estimator is not None or len(parts) < 2:
+    if row.observer is not None or row.estimator is not None:
         return []
 
     def tried(actuator: Actuator) -> tuple[Array, tuple[Residual, ...], Actuator]:
         """Return mean logarithms of squared errors (episodes,), each without its fold, and fits."""
         half = row.problem.u_half
-        acting = [replace(e, actions=actuator.behind(e.actions, half)) for e in parts]
+        whole = (replace(e, actions=actuator.behind(e.actions, half)) for e in log)
+        acting = pieces(tuple(whole), FOLDS)
         fits = [ridge(coordinates, some, [setting])[0] for some in without_each_fold(acting)]
         errors = []
         for i, (z, y) in enumerate(map(coordinates.regression, acting)):
@@ -509,7 +511,7 @@ def _behind(coordinates: Coordinates, parts: Sequence[Episode], setting: Setting
     errors, fits, actuator = min(found, key=lambda each: each[0].mean())
     if not surely_worse(found[0][0] - errors):
         return []
-    says = f"{actuator} in the actuators, as in this log"
+    says = f"{actuator} in the actuators"
     return [Judge(Dynamics(row.problem, coordinates, fits), says, actuator=actuator)]
 
 
