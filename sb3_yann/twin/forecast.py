@@ -61,10 +61,11 @@ class Actuator(NamedTuple):
         return held
 
 
-LAG = "lag with a pole"
+LAG = "lag with a pole"  # names a kind, as the others are named by themselves
+# Poles; half-ranges of the input a sample; half-ranges of play on each side. What is between two is
+# told by the nearer one. The first, without a lag, is no actuator.
 SIZES = {LAG: (0, 0.3, 0.5, 0.7), "rate limit": (0.06, 0.12, 0.2, 0.3), "play": (0.03, 0.06, 0.12)}
 ACTUATORS = tuple(Actuator(kind, size) for kind, sizes in SIZES.items() for size in sizes)
-NONE = ACTUATORS[0]  # what acts is the input
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Judge:
     dynamics: Dynamics
     says: str = ""
     refuted: bool = False
-    actuator: Actuator = NONE
+    actuator: Actuator = ACTUATORS[0]
 
 
 class Forecast(NamedTuple):
@@ -280,7 +281,7 @@ def forecast(
         for its in own:
             if judge.refuted and not (its.depth and its is best):
                 continue
-            replays = _Replays(judge, episodes, its.depth)
+            replays = its if judge is judges[0] else _Replays(judge, episodes, its.depth)
             if surely_worse(replays.left - its.left):
                 continue
             says = REMEMBERED if its.depth else judge.says

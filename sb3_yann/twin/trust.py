@@ -164,7 +164,7 @@ def judge(
         advice.append(
             f"Log {more(max(3, n_episodes))} more. If that is no help, the sensors are too "
             "noisy, or what moves the plant is not in the log: a load, a state, a lag, backlash, "
-            "a sensor set anew."
+            "a recalibrated sensor."
         )
     return problems, advice
 

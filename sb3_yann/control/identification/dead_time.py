@@ -61,7 +61,7 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
         _explained(known, n + j, target) > _explained(known, width + sum(best[: j + 1]) - 1, target)
         for j in range(n_inputs)
     ]
-    # An effect too small to be seen at first is none: what acts late acts more than just before.
+    # A dead time ends in a jump; behind sensor noise an effect only grows until it is seen.
     long = long_arx(longer, MAX_DELAY)[1]
     pick = np.eye(long.coefficients.shape[1])
     first = [lag * width + n + j for j, lag in enumerate(best)]
