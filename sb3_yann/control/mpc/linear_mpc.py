@@ -542,7 +542,7 @@ class LinearMPC(MPCProblem):
         """Return :func:`~sb3_yann.control.mpc.report.report` of the problem and its law."""
         check.check_int("samples", samples)
         check.check_int("seed", seed, 0)
-        return report(self, self.law(), self.online(), samples, seed)
+        return report(self, self.law(), samples, seed)
 
 
 def _as_control_horizon(

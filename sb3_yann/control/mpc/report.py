@@ -16,14 +16,10 @@ from sb3_yann.control.mpc.problem import MPCProblem, margins
 from sb3_yann.control.online import Law, OnlineLaw
 
 LOOP_STEPS = 50  # of a closed loop on the model
-BEYOND = 0.1  # widths of theta's box beyond it, in which states are tried
-APART = 0.05  # of an input's range, by which laws that differ by more are named
 BOUND = "bound of entry {}, which may move in"
 
 
-def report(
-    problem: MPCProblem, law: Law, online: OnlineLaw, samples: int = 500, seed: int = 0
-) -> str:
+def report(problem: MPCProblem, law: Law, samples: int = 500, seed: int = 0) -> str:
     """Return the parameters, the size of the law, and shares of the bounded box, as text.
 
     Points are drawn uniformly from the box: shares are good to 1 / sqrt(samples).
@@ -33,8 +29,7 @@ def report(
     points = rng.uniform(own.theta_min, own.theta_max, (samples, problem.n_theta))
     feasible = points[law.in_domain(points)]
     parts = _parameters(problem), _size(problem, law), _shares(own, law, points, feasible)
-    beyond = () if law is online else _beyond(own, law, online, points)
-    return "\n".join(chain(*parts, beyond, _active(own, feasible)))
+    return "\n".join(chain(*parts, _active(own, feasible)))
 
 
 def _parameters(problem: MPCProblem) -> Iterator[str]:
@@ -116,24 +111,6 @@ def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> It
     kept = _stay_feasible(problem, law, feasible).sum() if len(feasible) else 0
     kept_share = f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible"
     yield f"{kept_share} for {LOOP_STEPS} steps in closed loop on the model."
-
-
-def _beyond(problem: MPCProblem, law: Law, online: OnlineLaw, points: Array) -> Iterator[str]:
-    """Yield how far the explicit law is from the online one where neither box nor law reach."""
-    states = problem.layout.state
-    middle = (problem.theta_max + problem.theta_min)[states] / 2
-    points = points.copy()
-    points[:, states] = middle + (1 + 2 * BEYOND) * (points[:, states] - middle)
-    points = points[~law.in_domain(points)]
-    apart = np.abs(law(points) - online(points)) / (2 * problem.u_half)
-    if apart.size and apart.max() > APART:
-        far = int((apart > APART).any(axis=1).sum())
-        share = _percent(far, len(points))
-        most = f"{100 * apart.max():.0f} %"
-        yield f"Where there is no region, up to {100 * BEYOND:g} % beyond the box, the explicit law"
-        yield f"  is not the online one: at {share} of such points an input differs by more than"
-        yield f"  {100 * APART:g} % of its range, by {most} at most. Widen theta_min and theta_max,"
-        yield "  soften bounds, or refuse such readings: Checks(obs_min=, obs_max=) of an export."
 
 
 def _stay_feasible(problem: MPCProblem, law: Law, theta: Array) -> Array:

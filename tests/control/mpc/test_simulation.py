@@ -16,7 +16,6 @@ from sb3_yann.control import OnlineLaw, OnlineLawWarning
 from sb3_yann.control.explicit import budget, solve
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.mpc import linear_mpc
-from sb3_yann_envs import problems
 
 
 def test_a_simulation_is_the_law_on_its_model() -> None:
@@ -120,14 +119,6 @@ def test_shares_are_those_of_the_box() -> None:
     text = moving.report()
     assert f"{100 * kept.mean():.1f} % have a reachable steady state" in text
     assert "output 0\n" in text and "output 0, 1 sample ahead and after\n" in text
-
-
-def test_how_far_the_explicit_law_is_from_the_online_one_beyond_the_box_is_said() -> None:
-    words = "Where there is no region, up to 10 % beyond the box, the explicit law"
-    assert words not in input_bounds_only().report(samples=50)
-    said = problems.clipped_pendulum().report(samples=200)
-    assert words in said
-    assert 5 < float(re.search(r"range, by (\d+) % at most", said)[1]) <= 100
 
 
 def test_active_constraints_are_shares_of_the_feasible_parameters() -> None:
