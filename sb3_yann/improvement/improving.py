@@ -106,8 +106,6 @@ class Improvement:
         What the policy's estimates came from; nor is it in that zip.
     note : str
         What ended the search before a final check; empty where nothing did.
-    rests_aside : bool
-        Whether the MPC's own episodes in the simulator end beside its targets.
 
     Examples
     --------
@@ -128,7 +126,6 @@ class Improvement:
     model: Any = field(default=None, repr=False, compare=False)
     estimator: StateEstimator | None = field(default=None, repr=False, compare=False)
     note: str = ""
-    rests_aside: bool = False
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -193,11 +190,6 @@ class Improvement:
         text = "Accepted: a better policy."
         if self.model is not None:
             text += of_estimates(self.model.policy.problem)
-        if self.rests_aside:
-            text += (
-                " The MPC rests beside its targets there, and the policy knows this one plant: "
-                "where yours changes, start from offset_free(mpc), which headroom plays."
-            )
         return summary_lines(text, **rows, steps=steps, next=more)
 
     @property
@@ -636,8 +628,7 @@ class _Work:
         change = self.checks[-1].change if accepted else 0.0
         where = "the simulator", simulator.name, simulator.played, simulator.steps
         checks = tuple(self.checks)
-        aside = simulator.rests_aside
-        return Improvement(checks, change, accepted, before, *where, note=note, rests_aside=aside)
+        return Improvement(checks, change, accepted, before, *where, note=note)
 
     def _model(self, simulator: Simulator, number: int) -> LearntModel:
         """Return a model of all episodes so far.

@@ -199,7 +199,6 @@ class Simulator:
         self.new_seeds = NewSeeds(FIRST + 1_000_000 * seed)
         self.longest = 0
         self.episodes: list[Episode] = []
-        self.rests_aside = False
         self.shares = False
 
     def begin(self, later: int = 0) -> None:
@@ -216,7 +215,6 @@ class Simulator:
         each = self.usual // 2
         seeds = self.new_seeds(each - 1)
         self.learn(self.watch(seeds), seeds)
-        self.rests_aside = rests_aside(self.row, self.episodes)
         self.excite(each)
         self.require_episodes()
 
@@ -364,26 +362,6 @@ class Simulator:
     def close(self) -> None:
         """Close all envs."""
         self.envs.close()
-
-
-def rests_aside(row: RowLayout, episodes: Sequence[Episode]) -> bool:
-    """Return whether the MPC's episodes end beside its targets, on average to one side.
-
-    One that knows disturbances follows what a plant does; another knows its model alone.
-    """
-    problem = row.problem
-    layout = problem.layout
-    if layout.n_disturbances or len(episodes) < 2:
-        return False
-    C = problem.tracking.C
-    C = C if len(C) else np.eye(problem.model.n_states)[np.diag(problem.Q) > 0]
-    # The last row may show a set-point for which nothing has been done.
-    asked, ends = (row.shown(np.array([each.thetas[i] for each in episodes])) for i in (-2, -1))
-    wanted = asked[:, layout.reference][:, : len(C)] if layout.n_references else 0.0
-    left = (ends[:, layout.state] @ C.T - wanted) / (np.abs(C) @ problem.theta_half[layout.state])
-    error = 3 * left.std(axis=0, ddof=1) / np.sqrt(len(left))
-    # 0.01: half-widths of a state, by which the MPC rests beside its target
-    return bool(np.any(np.abs(left.mean(axis=0)) > np.maximum(0.01, error)))
 
 
 def of_law(problem: LinearMPC) -> Controller:

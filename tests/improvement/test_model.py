@@ -10,7 +10,7 @@ import pytest
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, YannPolicy, offset_free
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, YannPolicy, offset_free
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.improvement import simulator as module
 from sb3_yann.improvement.imitation import Teacher, controller_of, policy_of, refine
@@ -362,26 +362,6 @@ def bounded() -> PlantTwin:
     """The cart's twin, whose MPC knows a bound on its speed."""
     mpc = replace(problem(), x_min=[-np.inf, -1.0], x_max=[np.inf, 1.0], terminal=None)
     return PlantTwin.fit(mpc, log(4), residuals=POLYNOMIALS)
-
-
-@pytest.mark.parametrize(("aside", "wanted"), [(0.08, True), (0.02, False)])
-@pytest.mark.parametrize("tracks", [True, False])
-def test_an_mpc_that_rests_beside_its_targets_is_told_from_one_that_does_not(
-    tracks, aside, wanted
-) -> None:
-    tracking = {"tracking": Tracking([0], -1, 1)} if tracks else {}
-    model = LinearModel([[0.8]], [[0.5]], dt=1.0)
-    box = {"theta_min": -5, "theta_max": 5, "u_min": -2, "u_max": 2}
-    mpc = LinearMPC(model, Q=[[1.0]], R=[[0.1]], horizon=3, **box, **tracking)
-    rng = np.random.default_rng(0)
-    episodes = []
-    for r in rng.uniform(-1, 1, 9):
-        x = np.linspace(2, aside + tracks * r, 20) + 0.01 * rng.standard_normal(20)
-        theta = np.column_stack([x, np.full(20, r)])[:, : mpc.n_theta]
-        episodes.append(Episode(theta, np.zeros((19, 1))))
-    row = RowLayout(mpc)
-    assert module.rests_aside(row, episodes) is wanted
-    assert not module.rests_aside(row, episodes[:1])
 
 
 def test_the_error_is_what_ninety_five_per_cent_of_the_steps_keep() -> None:
