@@ -19,6 +19,7 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann_envs.spaces import ProblemBox
 
+EACH = 5  # episodes, at least, that show by themselves how much they vary
 RARE = 0.05  # how likely a start is, in one coordinate, beyond what the log shows
 
 
@@ -56,13 +57,15 @@ class Starts:
         """The box of theta (n_theta,), twice, that the log shows: all rows, and where it may begin.
 
         Beyond the latter, in one coordinate, lies one start in twenty: see :meth:`chance_beyond`.
+        Fewer than five episodes show no more than five of the same range would: one start in twenty
+        beyond two of them lies 25 times as far out, where a fit to two only guesses.
         """
         first = self.row.shown(self.first)
         rows = self.row.shown(self.rows)
-        k = len(self.first)
+        k = max(len(self.first), EACH)
         low = first.min(0)
         high = first.max(0)
-        ranges = 2 * (2 / (k + 1) / RARE) ** (1 / max(k - 1, 1)) - 1
+        ranges = 2 * (2 / (k + 1) / RARE) ** (1 / (k - 1)) - 1
         further = (high - low) / 2 * max(ranges - 1, 0.0)
         return np.minimum(rows.min(0), low - further), np.maximum(rows.max(0), high + further)
 

@@ -21,10 +21,9 @@ from sb3_yann.compare import RULE
 from sb3_yann.control.mpc.bound_excess import costs_of
 from sb3_yann.rollout import padded
 from sb3_yann.twin.dynamics import Dynamics, law_of, play
-from sb3_yann.twin.env import Starts
+from sb3_yann.twin.env import EACH, Starts
 from sb3_yann.twin.log import Episode, more_of, records
 
-EACH = 5  # episodes, at least, that show by themselves how much they vary
 DEPTHS = 2, 4  # samples that a memory reaches back, the fewest first
 REMEMBERED = (
     "errors that follow earlier inputs and errors, as in this log, perhaps because of a lag or a "

@@ -126,6 +126,20 @@ def test_a_start_is_the_rarer_the_farther_it_lies_outside_the_range_of_the_log()
     np.testing.assert_allclose(starts.chance_beyond(at), expected)
 
 
+@pytest.mark.parametrize("few", [2, 3, 4])
+def test_few_episodes_show_no_more_than_five_of_the_same_range_do(few: int) -> None:
+    mpc = problem()
+    first = np.linspace(-0.2, 0.2, 5)[:, None] * np.ones(mpc.n_theta)
+    ends = np.full((2, 2), [[-0.3], [0.3]])
+    five, fewer = (
+        Starts(RowLayout(mpc), *ends, each, np.zeros((1, mpc.n_theta))).shown
+        for each in (first, first[[0, -1, 2, 3][:few]])
+    )
+    np.testing.assert_array_equal(fewer, five)
+    # Of five, one in twenty lies beyond 2.2 times their range: 2 / 6 ((1 + 2.214) / 2) ** -4.
+    np.testing.assert_allclose(five[1], 0.2 * 2.214, rtol=1e-3)
+
+
 def limits_of(mpc: LinearMPC, **box: np.ndarray) -> Limits:
     k = mpc.model.n_states + mpc.model.n_inputs
     low = np.full(k, -0.5)
