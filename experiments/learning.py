@@ -1,8 +1,9 @@
 """What is gained over the MPC on each plant: `python -m experiments.learning`, hours of one core.
 
 Three seeds, fifty episodes that nothing has seen, beside what `headroom` finds on the same fifty;
-and the reactor from logs of its MPC alone. Nothing was set for any plant. Writes the tables of
-docs/improve.md; with names of plants it does their runs. PC-Gym's are in `experiments.pcgym`.
+and the reactor from logs of its MPC alone, ten of a kind. Nothing was set for any plant. Writes the
+tables of docs/improve.md; with names of plants it does their runs. PC-Gym's are in
+`experiments.pcgym`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs import problems
 
 SEEDS = range(3)
-LOG_SEEDS = range(40, 43)
+LOG_SEEDS = range(40, 50)
 TESTS = range(2000, 2050)
 PLANNED = "headroom"
 HEADER = (
@@ -179,8 +180,9 @@ def runs(names: Sequence[str]) -> list[Run]:
     seeds = {name: LOG_SEEDS if name == FROM_A_LOG else SEEDS for name in names}
     return fixed + [
         Run(name, learner, seeds[name][i], 0)
-        for i in range(len(SEEDS))
+        for i in range(max(map(len, seeds.values())))
         for name in names
+        if i < len(seeds[name])
         for learner in learners[name]
     ]
 
