@@ -245,7 +245,7 @@ def log_rows(outcomes: Mapping[Run, Outcome]) -> list[list[str]]:
                 name,
                 f"{sum(bool(each.extra['trusted']) for each in ours)} of {len(ours)}",
                 spread(change),
-                f"{closed + 0.0:.0f}",
+                f"{round(closed)}",
                 f"{worst:+.2f}",
                 f"{more}",
                 f"{np.median([each.seconds for each in ours]):.0f}",
