@@ -60,7 +60,7 @@ ADVICE = {
     "learn": "{why}: improve(mpc, {source}), or DDPG under an ImprovementGuard.",
 }
 UNKNOWN = "not known"
-"""The verdict where what was found may be chance, and where nothing was found in a poor model."""
+"""The verdict where what was found may be chance, or little though there may be more."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,9 @@ class Headroom:
         that; the rest.
     verdict : str
         What to do: one of "keep the MPC", "add ObserveDisturbance first", "re-identify", "learn";
-        "not known" where what was found is worth it but may be chance, and where nothing was found
-        with plans that were made in a poor model, or not played from every start.
+        "not known" where what was found is worth it but may be chance, and where little was found
+        with plans that were made in a poor model, or not played from every start, or of episodes in
+        which set-points move.
     source : str
         Where it was found.
     d_max : ndarray, shape (n,), optional
@@ -205,9 +206,11 @@ class Headroom:
                 "plans were made in a model of its episodes that is not the plant: when played, "
                 f"they cost {more} the MPC. Take more starts: n_starts=."
             )
-        if self.verdict == UNKNOWN:
-            return f"nothing was found, but {poor}"
         source = f"make, max_steps={self.budget:_}" if self.budget else "twin"
+        if self.verdict == UNKNOWN:
+            if poor:
+                return f"nothing was found, but {poor}"
+            return f"set-points move, and no plan knows when: improve(mpc, {source}) may find more."
         observer = CURE_IN_TWIN if self._in_twin else CURE
         named = [*ADVICE].index(self.verdict)  # a new model has the observer's part too
         brought = sum(parts[:2]) if named == 2 else parts[named - 1]
@@ -524,7 +527,10 @@ class _Search:
         if not self.poor and more.mean() < sure * np.std(more, ddof=1) / np.sqrt(len(more)):
             lost = 0.0  # it may be noise
         unplanned = int(np.count_nonzero(~self.planned))
-        if (lost > 0 or unplanned) and verdict_of(*parts) == "keep the MPC":
+        thetas, _, following = self.base.steps()
+        moving = np.any((following - thetas)[:, self.mpc.layout.reference])
+        some = moving and not self.random and total >= LITTLE / 10
+        if (lost > 0 or unplanned or some) and verdict_of(*parts) == "keep the MPC":
             verdict = UNKNOWN
         return dataclasses.replace(
             whole,

@@ -224,6 +224,12 @@ def test_changes_of_a_set_point_are_not_known_before() -> None:
     np.testing.assert_allclose(found.best_costs, found.mpc_costs, rtol=2e-3)
 
 
+def test_little_that_plans_find_between_moves_of_a_set_point_is_not_all() -> None:
+    found = headroom(heater(), partial(Heater, bend=0.03, steps=20), n_starts=6)
+    assert 1e-3 < found.total < 0.02 and found.verdict == "not known"
+    assert f"improve(mpc, make, max_steps={found.budget:_}) may find more" in found.report()
+
+
 def test_noise_is_no_headroom() -> None:
     """A plan that knew the noise to come would cost a fifth less than the MPC, which is optimal."""
     found = headroom(heater(), partial(Heater, noise=0.1), n_starts=10)
