@@ -529,8 +529,8 @@ class _Search:
         unplanned = int(np.count_nonzero(~self.planned))
         thetas, _, following = self.base.steps()
         moving = np.any((following - thetas)[:, self.mpc.layout.reference])
-        some = moving and not self.random and total >= LITTLE / 10
-        if (lost > 0 or unplanned or some) and verdict_of(*parts) == "keep the MPC":
+        part = moving and not self.random and total >= LITTLE / 10
+        if (lost > 0 or unplanned or part) and verdict_of(*parts) == "keep the MPC":
             verdict = UNKNOWN
         return dataclasses.replace(
             whole,
