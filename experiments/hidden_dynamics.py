@@ -250,10 +250,10 @@ def commission(seed: int) -> list[str]:
     model = DDPG(YannPolicy, make(), policy_kwargs=options, seed=0, device="cpu")
     run = Commissioning(model, make, batch=4, rounds=1, updates=300, seed=100_000 * seed)
     last = run.run(4)[-1]
-    told = f"{last.cost:.4g}, {last.mpc:.4g}"
+    costs = f"{last.cost:.4g}, {last.mpc:.4g}"
     alarms = sum(each.alarms for each in run.batches)
     change = f"{100 * true_change(run.model, mpc, make):+.2f}"
-    return [str(seed), run.kept, told, str(alarms), change, last.reason[:60]]
+    return [str(seed), run.kept, costs, str(alarms), change, last.reason[:60]]
 
 
 def main() -> None:

@@ -306,9 +306,9 @@ class _Envs:
         if self.problem is not None:
             action = action.astype(self.envs[i].action_space.dtype)
         observation, reward, terminated, truncated, info = self._asked(i, "step", action)
-        told = bool(info.get("violation", False)), bool(info.get("is_success", False))
+        reported = bool(info.get("violation", False)), bool(info.get("is_success", False))
         paid = float(info["penalty"]) if "excess" in info else 0.0  # as StageCost tells it
-        flags = bool(terminated), bool(truncated), *told, may_change_reward(info)
+        flags = bool(terminated), bool(truncated), *reported, may_change_reward(info)
         return np.array(observation), as_reward(reward), *flags, paid
 
     def _asked(self, i: int, name: str, *given: Any, **named: Any) -> Any:
@@ -356,9 +356,9 @@ class _Copies:
         """Step all copies with actions (k, m)."""
         observations, rewards, *ends, info = self.envs[0].step(actions)
         none = np.zeros(len(rows))
-        told = [info.get(name, none) for name in ("violation", "is_success", "violation")]
+        reported = [info.get(name, none) for name in ("violation", "is_success", "violation")]
         earned = np.array(rewards, dtype=np.float64)
-        flags = (np.array(each, dtype=bool) for each in (*ends, *told))
+        flags = (np.array(each, dtype=bool) for each in (*ends, *reported))
         return _Step._make([np.array(observations), earned, *flags, none])
 
 

@@ -135,8 +135,8 @@ class Explores(StartsAsMPC):
     def says_that_it_explores(self) -> None:
         """Warn once where nothing says that the plant is a simulator, and no guard is at work."""
         algorithm = self._algorithm
-        told = self.explored or self.simulator or self.guarded
-        if told or algorithm is None or algorithm.policy is not self:
+        said = self.explored or self.simulator or self.guarded
+        if said or algorithm is None or algorithm.policy is not self:
             return
         self.explored = True
         warn(

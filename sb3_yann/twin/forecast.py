@@ -258,7 +258,8 @@ def forecast(
     errors follow earlier inputs and errors, a judge is asked again with memories of them. The first
     judge is the twin's own: there new starts must keep the rule for the worst ones, too, and what
     its memories change, they may by half as much again.
-    ``loosest`` is the input that follows the MPC most closely.
+    ``loosest`` is the input that follows the MPC most closely. What is surely gained is gained from
+    starts that the log shows; elsewhere the MPC acts.
     """
     problem = judges[0].dynamics.problem
     law = law_of(problem)
@@ -302,7 +303,8 @@ def forecast(
     widest = max(found, key=lambda each: each[2])
     cure = _cure(*widest, independent, loosest, partial(more_of, problem, episodes))
     low = min(each[1] for each in found)
-    return Forecast(change, low, widest[2], cure, worst, objection)
+    high = widest[2] * starts.share if widest[2] < 0 else widest[2]
+    return Forecast(change, low, high, cure, worst, objection)
 
 
 def _objection(mpc: Array, policy: Array) -> str:

@@ -59,10 +59,10 @@ class RowLayout:
         n = self.problem.model.n_states
         if found is None or found.n_estimated != self.problem.layout.n_disturbances:
             return None
-        told = self.hidden or (isinstance(found, DisturbanceObserver) and found.C.shape == (n, n))
+        whole = self.hidden or (isinstance(found, DisturbanceObserver) and found.C.shape == (n, n))
         matrices = [found.gain[:n]] if self.hidden else [found.gain[:n], found.C]
         # 1e10: condition number from which on a matrix is not inverted
-        return found if told and max(map(np.linalg.cond, matrices)) < 1e10 else None
+        return found if whole and max(map(np.linalg.cond, matrices)) < 1e10 else None
 
     @property
     def is_estimate(self) -> bool:
