@@ -97,11 +97,7 @@ def reidentified(plant: Plant) -> LinearMPC:
 STRICT = {"cvar_alpha": 0, "backtrack": False}
 """No start may lose: the rule that the published runs had, and their critics a scale of 30."""
 _REACTOR = Plant(
-    "CSTR-v0",
-    400,
-    problems.cstr,
-    optimum.cstr_optimum,
-    guard={"rule": {**STRICT, "margin": 0.015}},
+    "CSTR-v0", 400, problems.cstr, optimum.cstr_optimum, guard={"rule": {**STRICT, "margin": 0.015}}
 )
 # The way from a pendulum that hangs to one that swings leads through worse policies.
 _PENDULUM = Plant(

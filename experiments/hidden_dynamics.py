@@ -23,15 +23,7 @@ from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG
 
 from experiments.markdown import table
-from sb3_yann import (
-    Commissioning,
-    LinearModel,
-    LinearMPC,
-    PlantTwin,
-    Tracking,
-    YannPolicy,
-    improve,
-)
+from sb3_yann import Commissioning, LinearModel, LinearMPC, PlantTwin, Tracking, YannPolicy, improve
 from sb3_yann._validation import Array, Feedback
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.forecast import Forecast

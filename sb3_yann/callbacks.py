@@ -48,7 +48,7 @@ class NoActionNoise(BaseCallback):
             warn(
                 f"NoActionNoise turns nothing off here: {kind} adds no noise, its policy draws its "
                 "actions. policy_kwargs={'initial_std': ...} says how far from the MPC's, and "
-                "predict(..., deterministic=True) draws none.",
+                "predict(..., deterministic=True) draws none."
             )
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
         if not hasattr(self.model, "replay_buffer"):

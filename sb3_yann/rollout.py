@@ -332,10 +332,7 @@ class _Envs:
             raise
 
 
-ANSWERS = {
-    "reset": "observation, info",
-    "step": "observation, reward, terminated, truncated, info",
-}
+ANSWERS = {"reset": "observation, info", "step": "observation, reward, terminated, truncated, info"}
 """What gymnasium asks of an env."""
 
 

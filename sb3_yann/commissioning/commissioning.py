@@ -36,12 +36,7 @@ from sb3_yann.evaluation import paired_rows, summary_lines
 from sb3_yann.improvement import improve
 from sb3_yann.improvement.imitation import controller_of
 from sb3_yann.improvement.simulator import Scenarios
-from sb3_yann.policy.checkpoint import (
-    ActorCheckpoint,
-    fingerprint,
-    restore_whole,
-    whole_policy,
-)
+from sb3_yann.policy.checkpoint import ActorCheckpoint, fingerprint, restore_whole, whole_policy
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.rollout import preserve_rng
 from sb3_yann.twin.plant_twin import PlantTwin

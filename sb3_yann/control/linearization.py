@@ -355,7 +355,7 @@ def linearize_env(
         if x is None and moves[-1] <= 1e-6 * moves[0]:
             warn(
                 f"The plant rests at other states too: x_ss = {found.x_ss.tolist()} is where a "
-                "reset led. Pass the state to hold, x_ss=[...].",
+                "reset led. Pass the state to hold, x_ss=[...]."
             )
         fault = _time_limit_fault(borrowed.env, found.u_ss) if borrowed.private else ""
         if not fault:
@@ -622,7 +622,7 @@ def _require_steady(rate: Rate, parts: list[Array], size: Array, dt: float, scal
     if not scaled and np.any((moved > 0.01 * np.abs(x)) & (x != 0) & (moved > 1e-8)):
         warn(
             f"In one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
-            f"{moved.tolist()}, much beside itself. Pass scale=..., how far each state moves.",
+            f"{moved.tolist()}, much beside itself. Pass scale=..., how far each state moves."
         )
 
 

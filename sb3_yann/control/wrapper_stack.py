@@ -124,7 +124,7 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
             what = "shows past states" if "DelayObservation" in late else "repeats past inputs"
             warn(
                 f"{name} {what}, and the law is one of the present state and input. Leave it out, "
-                "or put the inputs that are under way into the model's state.",
+                "or put the inputs that are under way into the model's state."
             )
         is_wrapped = getattr(layer, "env_is_wrapped", None)
         if is_wrapped is not None and "envs" not in vars(layer) and "venv" not in vars(layer):
@@ -143,7 +143,7 @@ def warn_of_moving_rewards(env: Any) -> None:
             warn(
                 "NormalizeReward divides rewards by a statistic that moves: they are not minus the "
                 "stage cost, for which the critic stands, so that it learns its value anew. The "
-                "law stays. Leave the wrapper out; the critic finds its scale itself.",
+                "law stays. Leave the wrapper out; the critic finds its scale itself."
             )
 
 

@@ -17,14 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann._progress import say
-from sb3_yann._validation import (
-    check_bool,
-    check_int,
-    check_options,
-    check_path,
-    check_range,
-    warn,
-)
+from sb3_yann._validation import check_bool, check_int, check_options, check_path, check_range, warn
 from sb3_yann.audit.reward import CostAudit
 from sb3_yann.compare import AcceptanceRule
 from sb3_yann.env_pool import EnvPool, Source, as_source, name_of, require_like_training
@@ -296,7 +289,7 @@ class ImprovementGuard(BaseCallback):
             if not goes_on:
                 warn(
                     f"The guard's env {settings.env} does not play the episodes of before: it is "
-                    "another simulator of that name. The policies are tried anew.",
+                    "another simulator of that name. The policies are tried anew."
                 )
         player.steps += known.steps if known else 0
         if not goes_on:
@@ -344,7 +337,7 @@ class ImprovementGuard(BaseCallback):
                     f"env {self.settings.env} pays something else, by which policies are compared. "
                     "Give it the env of the training, with the same StageCost; if it has it, its "
                     "reward holds more where its starts lead. The guard itself counts what soft "
-                    "bounds cost.",
+                    "bounds cost."
                 )
         dones = self.locals["dones"]
         state = self.state
@@ -354,7 +347,7 @@ class ImprovementGuard(BaseCallback):
             warn(
                 f"An episode of the training env has not ended after {LONG_EPISODE} steps, and the "
                 "guard decides at the ends of episodes. Give it a limit, by "
-                "gymnasium.wrappers.TimeLimit.",
+                "gymnasium.wrappers.TimeLimit."
             )
         last = state.last_trial
         if np.any(dones) and (last is None or state.episodes - last >= self.settings.eval_freq):
@@ -420,7 +413,7 @@ class ImprovementGuard(BaseCallback):
                 warn(
                     f"The best_model.zip that {type(each).__name__} keeps in {folder} is a "
                     f"candidate, which no guard has accepted. Load {instead} instead, or the model "
-                    "that learn leaves behind.",
+                    "that learn leaves behind."
                 )
                 return instead.parent
         return self.save_path

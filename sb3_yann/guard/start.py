@@ -89,7 +89,7 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
     if len(seeds) > 1 and alike and np.allclose(mpc.costs, mpc.costs[0], rtol=1e-6, atol=0):
         warn(
             f"All {len(seeds)} starts of the guard's env {name} are one and the same: its reset "
-            "ignores its seed. What the guard accepts is compared from this start only.",
+            "ignores its seed. What the guard accepts is compared from this start only."
         )
     _warn_of_misreading(player, seeds, mpc)
     if settings.rule.max_input_step is not None:

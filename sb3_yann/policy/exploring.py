@@ -144,7 +144,7 @@ class Explores(StartsAsMPC):
             f"{100 * self.initial_std:.3g} % of the input range around the policy's at first, "
             "limits or not, and nothing confirms what it learns. That belongs into a simulator, "
             "with an ImprovementGuard among the callbacks. If this env is one: "
-            "policy_kwargs={'simulator': True}.",
+            "policy_kwargs={'simulator': True}."
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -288,7 +288,7 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         if given := kwargs.get("critic_warmup"):
             warn(
                 f"critic_warmup = {given} does nothing here: PPO moves actor and critic at once. "
-                "Leave it out; actor_lr_mult makes the actor slower.",
+                "Leave it out; actor_lr_mult makes the actor slower."
             )
         kwargs |= {"critic_warmup": 0, "initial_std": initial_std, "actor_lr_mult": actor_lr_mult}
         super().__init__(*args, **kwargs)

@@ -135,11 +135,33 @@ class _Replays:
         if self.weights is not None:
             remembered = np.einsum("tmnk,mkj->tmnj", basis, self.weights)
             self.errors = np.where(alive, self.errors - remembered, 0.0)
-        number = np.arange(len(episodes))
+
+    @property
+    def alternate(self) -> bool:
+        """Whether the errors of every state alternate, as those of white sensor noise alone do.
+
+        Of ``v(t + 1) - a v(t)`` neighbors correlate by ``-a / (1 + a^2)``: -.4 or less where the
+        pole of the plant is slower than .5. A lag, backlash or load that lasts moves that up, and
+        so does a poor fit: most members must say it.
+        """
+        with np.errstate(all="ignore"):
+            products = np.sum(self.errors[1:] * self.errors[:-1], axis=(0, 2))  # (members, n)
+            below = products <= -0.4 * np.sum(self.errors**2, axis=(0, 2))
+        return bool(np.all(np.median(below, axis=0)))
+
+    def left(self, free: bool) -> Array:
+        """Return mean logarithms of squared held-out errors (N,): of one step, or of free runs.
+
+        The latter, of the linear model, tell more where sensors are noisy and nothing else errs.
+        """
+        number = np.arange(self.rows.shape[1])
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
+        A = self.dynamics.problem.deviations.model.A * self.units / self.units[:, None]
+        for t in range(1, len(unseen) * free):
+            unseen[t] += unseen[t - 1] @ A.T
         # Squared errors of 1e-20 of how far the states move are none.
         sizes = np.log(np.sum(unseen**2, axis=-1) + 1e-20)
-        self.left = np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0)
+        return np.asarray(np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0))
 
     def new_given(self, some: int, rng: np.random.Generator) -> Array:
         """Return references and loads (T, N * some, p) of new episodes, ``some`` like each logged.
@@ -255,9 +277,10 @@ def forecast(
 
     It is the union of the judges' intervals, of runs from the log's own starts, and of others from
     the box of all starts at new set-points and loads, which no policy was fitted to. Where its
-    errors follow earlier inputs and errors, a judge is asked again with memories of them. The first
-    judge is the twin's own: there new starts must keep the rule for the worst ones, too, and what
-    its memories change, they may by half as much again.
+    errors follow earlier inputs and errors, a judge is asked again with memories of them; where
+    they are those of noisy sensors alone, free runs say which judges the log refutes, as output
+    errors do (Ljung, section 7.2). The first judge is the twin's own: there new starts must keep
+    the rule for the worst ones, too, and what its memories change, they may by half as much again.
     ``loosest`` is the input that follows the MPC most closely. What is surely gained is gained from
     starts that the log shows; elsewhere the MPC acts.
     """
@@ -268,7 +291,10 @@ def forecast(
     rng = np.random.default_rng(0)
     some = -(-100 // count)  # so that a hundred runs begin anew
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
-    own = [_Replays(judges[0], episodes, depth) for depth in (0, *DEPTHS)]
+    own = [_Replays(judges[0], episodes, 0)]
+    noisy = own[0].alternate
+    if not noisy:
+        own += [_Replays(judges[0], episodes, depth) for depth in DEPTHS]
     # A memory must explain 2 % of the errors of one step on held-out episodes.
     own = [each for each in own if not each.depth or each.unexplained < 0.98]
     best = min(own, key=lambda each: each.unexplained)
@@ -282,7 +308,7 @@ def forecast(
             if judge.refuted and not (its.depth and its is best):
                 continue
             replays = its if judge is judges[0] else _Replays(judge, episodes, its.depth)
-            if surely_worse(replays.left - its.left):
+            if surely_worse(replays.left(noisy) - its.left(noisy)):
                 continue
             says = REMEMBERED if its.depth else judge.says
             played = [[replays.costs(each, *of) for each in (law, act)] for of in (logged, new)]

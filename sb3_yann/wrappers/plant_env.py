@@ -297,7 +297,7 @@ def warn_of_another_time(slope: Callable[[Array, Array], Array], mpc: LinearMPC)
             f"f(x, u) is {times:g} times as {pace} as the model of the "
             f"MPC, whose dt = {model.dt:g}{f' {model.time_unit}'.rstrip()}. If f is in "
             f"another unit of time than dt, pass lambda x, u: np.asarray(f(x, u)) {cure} "
-            f"{times:g}.",
+            f"{times:g}."
         )
 
 

@@ -8,12 +8,7 @@ import pytest
 from sample_laws import reactor_in_plant_units
 from sb3_yann import LinearModel, LinearMPC, Tracking
 from sb3_yann.evaluation import Trajectories, comparison_table, evaluate
-from sb3_yann.evaluation.plots import (
-    loops_figure,
-    plot_gains,
-    plot_surface,
-    use_figure,
-)
+from sb3_yann.evaluation.plots import loops_figure, plot_gains, plot_surface, use_figure
 from sb3_yann_envs import problems
 
 

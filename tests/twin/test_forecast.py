@@ -75,7 +75,7 @@ def test_the_mpc_itself_changes_nothing() -> None:
 
 def test_the_truth_lies_within_the_interval() -> None:
     plant = Lagging(0.0, 0.6)
-    seeds = range(5000, 5040)
+    seeds = range(5000, 5200)
     found = twin(plant, 12)
     law = law_of(MPC)
     before = evaluate(MPC.explicit(), lambda: copy.copy(plant), seeds).costs
@@ -129,6 +129,18 @@ def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
     plain, memory = (module._Replays(found.judges[0], found.episodes, depth) for depth in (0, 2))
     assert memory.unexplained < 0.5 and np.mean(memory.errors**2) < 0.5 * np.mean(plain.errors**2)
     assert found.judges[-1].actuator == (LAG, 0.5) and "a lag with a pole of" in found.report()
+
+
+def test_behind_noisy_sensors_alone_free_runs_tell_gains_and_nothing_is_remembered() -> None:
+    lagging, noisy = twin(Lagging(0.5, 1.0)), twin(Lagging(0.0, 1.0, noise=0.03))
+    behind, own, *others = (
+        module._Replays(judge, found.episodes, 0)
+        for found, judges in ((lagging, lagging.judges[:1]), (noisy, noisy.judges))
+        for judge in judges
+    )
+    assert own.alternate and not behind.alternate and len(others) == 2
+    for free in (False, True):
+        assert all(module.surely_worse(each.left(free) - own.left(free)) == free for each in others)
 
 
 def test_an_actuator_lags_moves_so_far_or_has_a_play() -> None:

@@ -7,12 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control.identification.innovations import (
-    dead_times,
-    long_arx,
-    no_effect,
-    with_lags,
-)
+from sb3_yann.control.identification.innovations import dead_times, long_arx, no_effect, with_lags
 from sb3_yann.control.identification.least_squares import Regression, stacked
 from sb3_yann.control.identification.residuals import leftover, project_out
 from sb3_yann.control.linear_system import names

@@ -20,12 +20,7 @@ from sb3_yann.control import ExplicitSolutionError
 from sb3_yann.control._kernels import polyhedra as _kernels
 from sb3_yann.control.explicit import solve as module
 from sb3_yann.control.explicit.budget import BudgetTimer
-from sb3_yann.control.polyhedra import (
-    Region,
-    bounded_region,
-    farthest_points,
-    largest_ball,
-)
+from sb3_yann.control.polyhedra import Region, bounded_region, farthest_points, largest_ball
 from sparse_qp import SparseQP, online_answers, relative_error
 
 # Those that ppopt solves in about a second.

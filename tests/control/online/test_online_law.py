@@ -12,14 +12,7 @@ from benchmarks.online_problems import points, six_masses, three_masses, wide_pl
 from general_problems import PROBLEMS, solved
 from sample_problems import braking
 from sb3_yann import Controller, export
-from sb3_yann.control import (
-    LinearModel,
-    LinearMPC,
-    OnlineLaw,
-    OutputBounds,
-    RateLimits,
-    SoftBounds,
-)
+from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, OutputBounds, RateLimits, SoftBounds
 from sb3_yann.control._kernels import online as _kernels
 from sb3_yann.control._kernels.online import SOLVED
 from sb3_yann.control.online import DualProgram, KnownPoints
