@@ -152,11 +152,13 @@ class _Replays:
     def left(self, free: bool) -> Array:
         """Return mean logarithms of squared held-out errors (N,): of one step, or of free runs.
 
-        The latter, of the linear model, tell more where sensors are noisy and nothing else errs.
+        The latter, of the linear model without what is unstable of it, tell more where sensors are
+        noisy and nothing else errs.
         """
         number = np.arange(self.rows.shape[1])
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
         A = self.dynamics.problem.deviations.model.A * self.units / self.units[:, None]
+        A /= max(1.0, float(np.abs(np.linalg.eigvals(A)).max()))
         for t in range(1, len(unseen) * free):
             unseen[t] += unseen[t - 1] @ A.T
         # Squared errors of 1e-20 of how far the states move are none.
