@@ -45,7 +45,7 @@ def fit_ensemble(
 
     A linear part is fitted by least squares, the networks to what it leaves of single steps, in a
     tenth of ``updates`` iterations of L-BFGS. With ``ahead`` above 1 these are half as many, and in
-    a fifth of ``updates`` steps of Adam all of it is fitted to windows of so many steps, along
+    three fifths of ``updates`` steps of Adam all of it is fitted to windows of so many steps, along
     which the model goes on from its own predictions: single steps take sensors' noise for dynamics.
 
     Where an estimator's memory stands for the plant's state, a step leaves loads as well, which
@@ -60,7 +60,7 @@ def fit_ensemble(
     networks = _Networks(pairs, alike, FLOAT32_ROUNDING * coordinates.units, generator, dtype)
     networks.fit_steps(pairs, updates // (10 if ahead == 1 else 20))
     if ahead > 1:
-        networks.fit_windows(coordinates, logs, ahead, updates // 5)
+        networks.fit_windows(coordinates, logs, ahead, 3 * updates // 5)
     return networks.residuals()
 
 
