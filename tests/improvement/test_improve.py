@@ -408,7 +408,7 @@ ENOUGH = {"n_starts": 10, "rounds": 2, "updates": 300}
 def twin_of(make=Spring, episodes: int = 10) -> PlantTwin:
     """Return the twin of episodes of a plant's MPC."""
     mpc = make().observation_space.problem
-    played = evaluate(mpc.explicit(), make, range(episodes))
+    played = evaluate(mpc.explicit(), make, range(100, 100 + episodes))
     return PlantTwin.fit(mpc, played.pairs, updates=1000)
 
 
