@@ -62,32 +62,12 @@ class Starts:
         """
         first = self.row.shown(self.first)
         rows = self.row.shown(self.rows)
+        k = max(len(self.first), EACH)
         low = first.min(0)
         high = first.max(0)
-        further = (high - low) / 2 * (self._ranges - 1)
+        ranges = 2 * (2 / (k + 1) / RARE) ** (1 / (k - 1)) - 1
+        further = (high - low) / 2 * max(ranges - 1, 0.0)
         return np.minimum(rows.min(0), low - further), np.maximum(rows.max(0), high + further)
-
-    @property
-    def share(self) -> float:
-        """How many of all starts lie in :attr:`shown`, with 95 % at least; of five episodes, 1.
-
-        As many draws from a uniform distribution tell, many times over.
-        """
-        k = len(self.first)
-        if k >= EACH:
-            return 1.0
-        varying = np.count_nonzero(np.ptp(self.row.shown(self.first), axis=0))
-        drawn = np.random.default_rng(0).uniform(size=(10_000, k, varying))
-        low = drawn.min(axis=1)
-        high = drawn.max(axis=1)
-        further = (high - low) / 2 * (self._ranges - 1)
-        held = np.minimum(high + further, 1.0) - np.maximum(low - further, 0.0)
-        return float(np.quantile(held.prod(axis=1), 0.05))
-
-    @property
-    def _ranges(self) -> float:
-        k = max(len(self.first), EACH)
-        return float(max(2 * (2 / (k + 1) / RARE) ** (1 / (k - 1)) - 1, 1.0))
 
     def draw(self, count: int, rng: np.random.Generator, episodes: Any = None) -> Array:
         """Return rows (count, size) where episodes begin: in the box, the rest as logged.

@@ -140,9 +140,8 @@ class _Replays:
     def alternate(self) -> bool:
         """Whether the errors of every state alternate, as those of white sensor noise alone do.
 
-        Of ``v(t + 1) - a v(t)`` neighbors correlate by ``-a / (1 + a^2)``: -.4 or less where the
-        pole of the plant is slower than .5. A lag, backlash or load that lasts moves that up, and
-        so does a poor fit: most members must say it.
+        Of ``v(t + 1) - a v(t)`` neighbors correlate by ``-a / (1 + a^2)``, -.4 where the pole is
+        .5. A lag, backlash or load moves that up, and so does a poor fit: most members must agree.
         """
         with np.errstate(all="ignore"):
             products = np.sum(self.errors[1:] * self.errors[:-1], axis=(0, 2))  # (members, n)
@@ -152,8 +151,7 @@ class _Replays:
     def left(self, free: bool) -> Array:
         """Return mean logarithms of squared held-out errors (N,): of one step, or of free runs.
 
-        The latter, of the linear model without what is unstable of it, tell more where sensors are
-        noisy and nothing else errs.
+        The latter, of the linear model made stable, tell more where sensors alone err.
         """
         number = np.arange(self.rows.shape[1])
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
@@ -283,8 +281,7 @@ def forecast(
     they are those of noisy sensors alone, free runs say which judges the log refutes, as output
     errors do (Ljung, section 7.2). The first judge is the twin's own: there new starts must keep
     the rule for the worst ones, too, and what its memories change, they may by half as much again.
-    ``loosest`` is the input that follows the MPC most closely. What is surely gained is gained from
-    starts that the log shows; elsewhere the MPC acts.
+    ``loosest`` is the input that follows the MPC most closely.
     """
     problem = judges[0].dynamics.problem
     law = law_of(problem)
@@ -331,7 +328,8 @@ def forecast(
     widest = max(found, key=lambda each: each[2])
     cure = _cure(*widest, independent, loosest, partial(more_of, problem, episodes))
     low = min(each[1] for each in found)
-    high = widest[2] * starts.share if widest[2] < 0 else widest[2]
+    # Of few episodes it is not known how many starts lie where a policy acts.
+    high = widest[2] if len(starts.first) >= EACH else max(widest[2], -1e-9)
     return Forecast(change, low, high, cure, worst, objection)
 
 

@@ -90,12 +90,10 @@ def as_episodes(
         if len(u) < SHORTEST:
             raise ValueError(f"episode {i} has {len(u)} steps; {SHORTEST} are the least.")
         for row, k in np.argwhere((u < problem.u_min - room) | (u > problem.u_max + room)):
-            low = problem.u_min[k]
-            high = problem.u_max[k]
             raise ValueError(
-                f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds {low:g} "
-                f"and {high:g} of the problem. A log is in plant units where the model has an "
-                "operating point, and in the model's own where it has none."
+                f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds "
+                f"{problem.u_min[k]:g} and {problem.u_max[k]:g} of the problem. A log is in plant "
+                "units where the model has an operating point, and in its own where it has none."
             )
         u = problem.units.input_to_deviations(np.clip(u, problem.u_min, problem.u_max))
         x = problem.units.to_deviations(x)

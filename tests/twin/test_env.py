@@ -140,16 +140,6 @@ def test_few_episodes_show_no_more_than_five_of_the_same_range_do(few: int) -> N
     np.testing.assert_allclose(five[1], 0.2 * 2.214, rtol=1e-3)
 
 
-@pytest.mark.parametrize("few", [2, 3])
-def test_how_many_starts_a_few_episodes_show(few: int) -> None:
-    row = RowLayout(problem())
-    drawn = np.random.default_rng(1).uniform(size=(2000, few, row.problem.n_theta))
-    every = [Starts(row, *2 * [np.zeros(2)], each, each) for each in drawn]
-    held = np.array([np.prod(np.diff(np.clip(each.shown, 0, 1), axis=0)) for each in every])
-    assert every[0].share < 1 and np.mean(held >= every[0].share) == pytest.approx(0.95, abs=0.02)
-    assert Starts(row, *2 * [np.zeros(2)], drawn[:5, 0], drawn[0]).share == 1
-
-
 def limits_of(mpc: LinearMPC, **box: np.ndarray) -> Limits:
     k = mpc.model.n_states + mpc.model.n_inputs
     low = np.full(k, -0.5)

@@ -102,6 +102,14 @@ def test_new_set_points_lie_between_those_of_the_log(levels: tuple[float, float]
     assert low == 0 and (high == 0) == (worst == 0) == (not objection) == sure
 
 
+def test_of_few_episodes_it_is_not_said_how_much_is_surely_gained(monkeypatch) -> None:
+    monkeypatch.setattr(module, "law_of", lambda mpc: lambda x: 0.6 * law_of(mpc)(x))
+    few, five = (
+        twin(Lagging(0.0, 1.5, noise=0.0), count).forecast(law_of(MPC)).high for count in (4, 5)
+    )
+    assert few == -1e-9 and five < -0.01
+
+
 def test_what_new_starts_lose_is_said_without_their_numbers() -> None:
     mpc = np.ones((5, 100))
     assert module._objection(mpc, mpc - 0.01) == ""
