@@ -320,10 +320,9 @@ def _other_pace(log: Logged) -> Iterator[str]:
     """Yield where the states move as the model's do in several samples, with any gain and zero."""
     model = log.problem.model
     x = log.rows[:, log.row.state]
-    n = model.n_states
     m = model.n_inputs
-    power: Array = np.eye(n)
-    driven: Array = np.zeros((n, m))
+    power: Array = np.eye(model.n_states)
+    driven: Array = np.zeros_like(model.B)
     left = []
     for _ in PACES:
         driven = driven + power @ model.B
