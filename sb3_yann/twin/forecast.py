@@ -155,10 +155,11 @@ class _Replays:
         """
         number = np.arange(self.rows.shape[1])
         unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
-        A = self.dynamics.problem.deviations.model.A * self.units / self.units[:, None]
-        A /= max(1.0, float(np.abs(np.linalg.eigvals(A)).max()))
-        for t in range(1, len(unseen) * free):
-            unseen[t] += unseen[t - 1] @ A.T
+        if free:
+            A = self.dynamics.problem.deviations.model.A * self.units / self.units[:, None]
+            A /= max(1.0, float(np.abs(np.linalg.eigvals(A)).max()))
+            for t in range(1, len(unseen)):
+                unseen[t] += unseen[t - 1] @ A.T
         # Squared errors of 1e-20 of how far the states move are none.
         sizes = np.log(np.sum(unseen**2, axis=-1) + 1e-20)
         return np.asarray(np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0))

@@ -405,10 +405,10 @@ ENOUGH = {"n_starts": 10, "rounds": 2, "updates": 300}
 
 
 @cache
-def twin_of(make=Spring, episodes: int = 10) -> PlantTwin:
+def twin_of(make=Spring, episodes: int = 20) -> PlantTwin:
     """Return the twin of episodes of a plant's MPC."""
     mpc = make().observation_space.problem
-    played = evaluate(mpc.explicit(), make, range(100, 100 + episodes))
+    played = evaluate(mpc.explicit(), make, range(episodes))
     return PlantTwin.fit(mpc, played.pairs, updates=1000)
 
 
@@ -417,7 +417,7 @@ def test_a_policy_of_a_twin_gains_on_the_plant(capsys, monkeypatch) -> None:
     model = model_of()
     found = improve(model, twin_of(), **ENOUGH)
     assert found.accepted and found.where == "the twin" and found.source == repr(twin_of())
-    assert found.change < -0.01 and found.episodes == 10 and found.steps == 0
+    assert found.change < -0.01 and found.episodes == 20 and found.steps == 0
     lines = [each for each in capsys.readouterr().err.splitlines() if each.startswith("[")]
     assert lines[-1].endswith("no objection")
     assert any("in the twin: policy -" in line and ", plans -" in line for line in lines)
