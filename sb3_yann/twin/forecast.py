@@ -137,16 +137,28 @@ class _Replays:
             self.errors = np.where(alive, self.errors - remembered, 0.0)
 
     @property
-    def alternate(self) -> bool:
-        """Whether the errors of every state alternate, as those of white sensor noise alone do.
+    def noise_alone(self) -> bool:
+        """Whether the errors are those of white sensor noise v: ``v(t + 1) - A v(t)``.
 
-        Of ``v(t + 1) - a v(t)`` neighbors correlate by ``-a / (1 + a^2)``, -.4 where the pole is
-        .5. A lag, backlash or load moves that up, and so does a poor fit: most members must agree.
+        With variances s they have the variances ``s + (A * A) s``, and ``-A diag(s)`` is their
+        covariance with the errors before. A lag, backlash or load moves that up, and so does a poor
+        fit: for every state most members must show nearly all of it.
         """
+        state = self.dynamics.row.state
+        some = np.argwhere(self.alive)
+        some = some[:: -(-len(some) // 500)]  # 500: samples at which A is taken, about
+        at = tuple(some.T)
         with np.errstate(all="ignore"):
-            products = np.sum(self.errors[1:] * self.errors[:-1], axis=(0, 2))  # (members, n)
-            below = products <= -0.4 * np.sum(self.errors**2, axis=(0, 2))
-        return bool(np.all(np.median(below, axis=0)))
+            A = self.dynamics.jacobians(self.rows[:-1][at][None], self.inputs[at][None])[0]
+            A = A[..., state, state]  # (members, samples, n, n)
+            variances = np.sum(self.errors**2, axis=(0, 2))  # (members, n)
+            found = np.einsum("tmki,tmkj->mij", self.errors[1:], self.errors[:-1])
+            grown = np.eye(A.shape[-1]) + np.mean(A**2, axis=1)
+            s = np.maximum(np.linalg.pinv(grown) @ variances[..., None], 0.0).swapaxes(1, 2)
+            expected = -A.mean(axis=1) * s
+            weighted = expected / variances[:, None]
+            share = np.sum(found * weighted, axis=2) / np.sum(expected * weighted, axis=2)
+        return bool(np.all(np.median(share >= 0.8, axis=0)))
 
     def left(self, free: bool) -> Array:
         """Return mean logarithms of squared held-out errors (N,): of one step, or of free runs.
@@ -292,7 +304,7 @@ def forecast(
     some = -(-100 // count)  # so that a hundred runs begin anew
     drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
     own = [_Replays(judges[0], episodes, 0)]
-    noisy = own[0].alternate
+    noisy = own[0].noise_alone
     if not noisy:
         own += [_Replays(judges[0], episodes, depth) for depth in DEPTHS]
     # A memory must explain 2 % of the errors of one step on held-out episodes.

@@ -150,7 +150,7 @@ class PlantTwin(LearntModel):
         n_members : int, default 5
             The first is fitted to all episodes, the others to as many drawn from them.
         updates : int, default 3000
-            Of networks: a twentieth are iterations of L-BFGS, then a fifth are steps of Adam.
+            Of networks: a twentieth are iterations on single steps, a tenth on windows.
         seed : int, default 0
             Of the draws of episodes, and of the weights that networks start from.
         units_confirmed : bool, default False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -27,10 +27,13 @@ from sb3_yann.control.mpc.coordinates import steady_states
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, Residual
 from sb3_yann.twin.forecast import ACTUATORS, Actuator, Judge, surely_worse
 from sb3_yann.twin.log import Episode, pieces
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.units import FLOAT32_ROUNDING
 
 FAMILY_UPDATES = 1000  # iterations of the fit of a family
 CONSTANTS = 2  # numbers that a fit of a family takes to differ from seed to seed
+
+Loss = Callable[[list[th.Tensor]], th.Tensor]  # of the weights of one network
 
 
 def fit_ensemble(
@@ -44,9 +47,9 @@ def fit_ensemble(
     """Return one network for each log, all fitted at once.
 
     A linear part is fitted by least squares, the networks to what it leaves of single steps, in a
-    tenth of ``updates`` iterations of L-BFGS. With ``ahead`` above 1 these are half as many, and in
-    three fifths of ``updates`` steps of Adam all of it is fitted to windows of so many steps, along
-    which the model goes on from its own predictions: single steps take sensors' noise for dynamics.
+    tenth of ``updates`` iterations of L-BFGS. With ``ahead`` above 1 these are half as many, and as
+    many as that tenth fit all of it to windows of so many steps, along which the model goes on from
+    its own predictions: single steps take sensors' noise for dynamics.
 
     Where an estimator's memory stands for the plant's state, a step leaves loads as well, which
     the MPC answers: a fit would take the answer for the cause. So networks are fitted to what
@@ -60,7 +63,8 @@ def fit_ensemble(
     networks = _Networks(pairs, alike, FLOAT32_ROUNDING * coordinates.units, generator, dtype)
     networks.fit_steps(pairs, updates // (10 if ahead == 1 else 20))
     if ahead > 1:
-        networks.fit_windows(coordinates, logs, ahead, 3 * updates // 5)
+        windows = [_windows(coordinates.row, log, ahead) for log in logs]
+        networks.fit_windows(coordinates, windows, updates // 10)
     return networks.residuals()
 
 
@@ -106,7 +110,6 @@ class _Networks:
         hidden = 48  # units in each of two hidden layers
         self.alike = alike
         self.of_row = of_row
-        self.generator = generator
         self.dtype = dtype
         count = len(pairs)
         k = pairs[0][0].shape[1]
@@ -147,10 +150,66 @@ class _Networks:
         return rows if self.alike is None else rows[self.alike[:, 0]] - rows[self.alike[:, 1]]
 
     def fit_steps(self, pairs: list[list[Array]], iterations: int) -> None:
-        """Fit them to single steps: each by itself, side by side, on all rows, by L-BFGS."""
+        """Fit them to single steps, on all rows."""
+
+        def loss_of(i: int) -> Loss:
+            z, y = pairs[i]
+            rows = (self.tensor(z) - self.center[i]) / self.width[i]
+            wanted = self.tensor(y) / self.unit[i]
+
+            def loss(weights: list[th.Tensor]) -> th.Tensor:
+                constants = [] if self.of_row is None else [weights[7][self.of_row]]
+                found = _network(weights[:7], th.cat([rows, *constants], dim=1))
+                errors: th.Tensor = self._compared(found - wanted)
+                return (errors**2).mean()
+
+            return loss
+
+        self._fit(loss_of, iterations)
+
+    def fit_windows(self, of: Coordinates, windows: list[Array], iterations: int) -> None:
+        """Fit them to windows (windows, k, steps + 1), going on from their own predictions.
+
+        A window begins at a reading. Its noise goes on as the linear model says, beside that of the
+        readings to come, of the same size: generalized least squares allow for it.
+        """
+        row = of.row
+        n = row.problem.model.n_states
+        A = row.linear[row.state][:, row.state] / of.units[:, None] * of.units
+        linear = self.tensor(row.linear[row.state][:, row.inputs].T)
+        low, high, scale, units = map(self.tensor, (of.low, of.high, of.scale, of.units))
+        turn = self.tensor(np.zeros(n) if of.turn is None else of.turn)
+        per_turn = th.where(turn > 0, 1 / turn, 0.0)
+
+        def loss_of(i: int) -> Loss:
+            window = self.tensor(windows[i])
+            steps = window.shape[-1] - 1
+            of_start = np.concatenate([np.linalg.matrix_power(A, t + 1) for t in range(steps)])
+            noise = np.linalg.cholesky(np.eye(n * steps) + of_start @ of_start.T)
+            whitened = self.tensor(np.linalg.inv(noise).T)
+
+            def loss(weights: list[th.Tensor]) -> th.Tensor:
+                x = window[..., :n, 0]
+                errors = []
+                for t in range(steps):
+                    features = th.cat([x, window[..., n:, t]], dim=-1)
+                    z = (features.clamp(low, high) / scale - self.center[i]) / self.width[i]
+                    x = features @ linear + _network(weights, z) * self.unit[i]
+                    after = window[..., :n, t + 1]
+                    x = x - turn * ((x - after) * per_turn).detach().round()  # an angle may jump
+                    errors.append((x - after) / units)
+                return steps * ((th.cat(errors, dim=-1) @ whitened) ** 2).mean()
+
+            return loss
+
+        self._fit(loss_of, iterations)
+
+    def _fit(self, loss_of: Callable[[int], Loss], iterations: int) -> None:
+        """Fit each by itself, side by side, by L-BFGS."""
+        count = len(self.unit)
         stopped = Event()
         with (
-            bar("networks of a model", total=len(pairs) * iterations, timed=True) as doing,
+            bar("networks of a model", total=count * iterations, timed=True) as doing,
             ThreadPoolExecutor() as pool,
         ):
 
@@ -159,87 +218,36 @@ class _Networks:
                 if stopped.is_set():
                     raise StopIteration
 
-            fits = [
-                pool.submit(self._fit_steps, i, z, y, iterations, done)
-                for i, (z, y) in enumerate(pairs)
-            ]
+            def fit(i: int) -> None:
+                weights = [each.detach()[i].requires_grad_() for each in self.weights]
+                loss = loss_of(i)
+
+                def slopes(flat: Array) -> tuple[float, Array]:
+                    vector_to_parameters(self.tensor(flat), weights)
+                    value = loss(weights)
+                    slopes = th.autograd.grad(value, weights)
+                    return value.item(), parameters_to_vector(slopes).double().numpy()
+
+                with threadpool_limits(1):  # of this thread
+                    # 50: pairs that L-BFGS remembers
+                    found = optimize.minimize(
+                        slopes,
+                        parameters_to_vector(weights).detach().double().numpy(),
+                        jac=True,
+                        method="L-BFGS-B",
+                        options={"maxiter": iterations, "maxcor": 50, "ftol": 0.0},
+                        callback=done,
+                    )
+                vector_to_parameters(self.tensor(found.x), weights)
+                for each, fitted in zip(self.weights, weights, strict=True):
+                    each.data[i] = fitted
+
+            fits = [pool.submit(fit, i) for i in range(count)]
             try:
                 for each in fits:
                     each.result()
             finally:
                 stopped.set()  # an interrupt does not wait for fits
-
-    def _fit_steps(self, i: int, z: Array, y: Array, iterations: int, done: Any) -> None:
-        """Fit network i to pairs z (rows, k), y (rows, n)."""
-        weights = [each.detach()[i].requires_grad_() for each in self.weights]
-        rows = (self.tensor(z) - self.center[i]) / self.width[i]
-        wanted = self.tensor(y) / self.unit[i]
-
-        def loss(flat: Array) -> tuple[float, Array]:
-            vector_to_parameters(self.tensor(flat), weights)
-            constants = [] if self.of_row is None else [weights[7][self.of_row]]
-            errors = _network(weights[:7], th.cat([rows, *constants], dim=1)) - wanted
-            value = (self._compared(errors) ** 2).mean()
-            slopes = th.autograd.grad(value, weights)
-            return value.item(), parameters_to_vector(slopes).double().numpy()
-
-        with threadpool_limits(1):  # of this thread
-            # 50: pairs that L-BFGS remembers
-            found = optimize.minimize(
-                loss,
-                parameters_to_vector(weights).detach().double().numpy(),
-                jac=True,
-                method="L-BFGS-B",
-                options={"maxiter": iterations, "maxcor": 50, "ftol": 0.0},
-                callback=done,
-            )
-        vector_to_parameters(self.tensor(found.x), weights)
-        for each, fitted in zip(self.weights, weights, strict=True):
-            each.data[i] = fitted
-
-    def fit_windows(
-        self, coordinates: Coordinates, logs: Sequence[Sequence[Episode]], ahead: int, updates: int
-    ) -> None:
-        """Fit them to windows of the logs, along which they go on from their own predictions."""
-        row = coordinates.row
-        ahead = min(ahead, *(max(map(len, log)) for log in logs))  # each log has such a window
-        n = row.problem.model.n_states
-        windows = []
-        for log in logs:
-            whole = [each for each in log if len(each) >= ahead]
-            parts = [row.features(e.thetas, np.vstack([e.actions, e.actions[-1:]])) for e in whole]
-            views = [sliding_window_view(each, ahead + 1, axis=0) for each in parts]
-            windows.append(np.concatenate(views))
-        longest = max(map(len, windows))  # short ones are repeated
-        windows = [each[np.arange(longest) % len(each)] for each in windows]
-        data = self.tensor(windows)  # (members, windows, k, ahead + 1)
-        linear = self.tensor(row.linear[row.state][:, row.inputs].T)
-        low, high, scale, units = (
-            self.tensor(each)
-            for each in (coordinates.low, coordinates.high, coordinates.scale, coordinates.units)
-        )
-        turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
-        per_turn = th.where(turn > 0, 1 / turn, 0.0)
-        adam = th.optim.Adam(self.weights, lr=1e-3)  # at first; it falls to zero
-        schedule = th.optim.lr_scheduler.CosineAnnealingLR(adam, max(updates, 1))
-        for _ in bar("networks of a model: steps of Adam", range(updates), timed=True):
-            # 32: windows of a log in a step of Adam
-            chosen = th.randint(data.shape[1], (32,), generator=self.generator)
-            window = data[:, chosen]
-            x = window[..., :n, 0]
-            loss = th.zeros((), dtype=self.dtype)
-            for t in range(ahead):
-                features = th.cat([x, window[..., n:, t]], dim=-1)
-                z = (features.clamp(low, high) / scale - self.center) / self.width
-                x = features @ linear + _network(self.weights, z) * self.unit
-                after = window[..., :n, t + 1]
-                x = x - turn * ((x - after) * per_turn).detach().round()  # an angle may have jumped
-                loss = loss + (((x - after) / units) ** 2).mean()
-            adam.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            th.nn.utils.clip_grad_norm_(self.weights, 10.0)
-            adam.step()
-            schedule.step()
 
     def residuals(self) -> list[Residual]:
         """Return them in scaled coordinates, one by one."""
@@ -261,6 +269,20 @@ class _Networks:
             parts.append(th.zeros((len(L), L.shape[1], L.shape[1] * L.shape[2])))
             arrays = [each.double().numpy().copy() for each in parts]
         return [Residual([each[i] for each in arrays]) for i in range(len(arrays[0]))]
+
+
+def _windows(row: RowLayout, log: Sequence[Episode], ahead: int) -> Array:
+    """Return windows (windows, k, steps + 1) of so many steps of a log, or of its longest episode.
+
+    They are evenly spaced.
+    """
+    steps = min(ahead, max(map(len, log)))
+    whole = [each for each in log if len(each) >= steps]
+    total = sum(len(each) - steps + 1 for each in whole)
+    # About 500 windows, more where these are farther apart than half of one, at most 1000.
+    apart = max(min(steps // 2, total // 500), total // 1000, 1)
+    parts = [row.features(e.thetas, np.vstack([e.actions, e.actions[-1:]])) for e in whole]
+    return np.concatenate([sliding_window_view(e, steps + 1, axis=0)[::apart] for e in parts])
 
 
 def _network(weights: Sequence[th.Tensor], z: th.Tensor) -> th.Tensor:

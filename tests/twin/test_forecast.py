@@ -146,7 +146,7 @@ def test_behind_noisy_sensors_alone_free_runs_tell_gains_and_nothing_is_remember
         for found, judges in ((lagging, lagging.judges[:1]), (noisy, noisy.judges))
         for judge in judges
     )
-    assert own.alternate and not behind.alternate and len(others) == 2
+    assert own.noise_alone and not behind.noise_alone and len(others) == 2
     for free in (False, True):
         assert all(module.surely_worse(each.left(free) - own.left(free)) == free for each in others)
 
