@@ -184,12 +184,11 @@ def loaded() -> LinearMPC:
 def test_what_theta_holds_besides_the_states_is_asked_for() -> None:
     x = np.zeros((8, 1))
     u = np.linspace(-0.3, 0.3, 7)[:, None]
-    r = 0.5
-    (episode,) = as_episodes(loaded(), [(x, u)], [r], [[7.0, 8.5]])
+    (episode,) = as_episodes(loaded(), [(x, u)], [0.5], [[7.0, 8.5]])
     known = np.column_stack([x, np.full(8, 0.5), np.tile([0.0, 0.5], (8, 1)), np.r_[0.0, u[:, 0]]])
     np.testing.assert_array_equal(episode.thetas, known)
     with pytest.raises(ValueError, match=r"theta holds 2 disturbances: pass disturbances=, shape"):
-        as_episodes(loaded(), [(x, u)], [r])
+        as_episodes(loaded(), [(x, u)], [0.5])
     with pytest.raises(ValueError, match="theta holds 1 references"):
         as_episodes(loaded(), [(x, u)], disturbances=[[7.0, 8.0]])
 

@@ -151,6 +151,23 @@ def test_behind_noisy_sensors_alone_free_runs_tell_gains_and_nothing_is_remember
         assert all(module.surely_worse(each.left(free) - own.left(free)) == free for each in others)
 
 
+@pytest.mark.parametrize("load", [0.0, 0.03])
+def test_noise_of_sensors_is_told_from_a_load_where_states_drive_each_other(load: float) -> None:
+    model = LinearModel([[0.2, -0.4], [0.6, 0.9]], [[0], [0.3]], 1.0)
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=2, x_min=-4, x_max=4, u_min=-1, u_max=1)
+    rng = np.random.default_rng(0)
+    log = []
+    for _ in range(20):
+        x, pushed = [rng.uniform(-1, 1, 2)], 0.0
+        u = np.repeat(rng.uniform(-1, 1, (12, 1)), 5, axis=0)
+        for each in u:
+            x.append(model.A @ x[-1] + model.B @ (each + pushed))
+            pushed = 0.95 * pushed + load * rng.normal()
+        log.append((x + 0.01 * rng.normal(size=(61, 2)), u))
+    found = PlantTwin.fit(mpc, log, residuals=["none"])
+    assert module._Replays(found.judges[0], found.episodes, 0).noise_alone == (load == 0)
+
+
 def test_an_actuator_lags_moves_so_far_or_has_a_play() -> None:
     for *each, a, b in (LAG, 0.5, 0.5, 0.25), ("rate limit", 0.2, 0.2, 0), ("play", 0.1, 0.9, 0.1):
         assert Actuator(*each).behind(np.array([0.0, 1, 0]), 1.0) == pytest.approx([0, a, b])
