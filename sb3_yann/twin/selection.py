@@ -177,28 +177,32 @@ class _Networks:
         n = row.problem.model.n_states
         A = row.linear[row.state][:, row.state] / of.units[:, None] * of.units
         linear = self.tensor(row.linear[row.state][:, row.inputs].T)
-        low, high, scale, units = map(self.tensor, (of.low, of.high, of.scale, of.units))
-        turn = self.tensor(np.zeros(n) if of.turn is None else of.turn)
-        per_turn = th.where(turn > 0, 1 / turn, 0.0)
+        low, high, scale = map(self.tensor, (of.low, of.high, of.scale[:, None]))
+        turn = None if of.turn is None else self.tensor(of.turn)
 
         def loss_of(i: int) -> Loss:
-            window = self.tensor(windows[i])
-            steps = window.shape[-1] - 1
+            steps = windows[i].shape[-1] - 1
+            first, *later = self.tensor(np.moveaxis(windows[i], -1, 0))
             of_start = np.concatenate([np.linalg.matrix_power(A, t + 1) for t in range(steps)])
             noise = np.linalg.cholesky(np.eye(n * steps) + of_start @ of_start.T)
-            whitened = self.tensor(np.linalg.inv(noise).T)
+            whitened = self.tensor(np.linalg.inv(noise).T / np.tile(of.units, steps)[:, None])
 
             def loss(weights: list[th.Tensor]) -> th.Tensor:
-                x = window[..., :n, 0]
+                W1, b1, W2, b2, W3, b3, L = self._scaled(weights, i)
+                last = th.cat([W3, L / scale, linear])
+                W1 = W1 / scale
+                row = first
                 errors = []
-                for t in range(steps):
-                    features = th.cat([x, window[..., n:, t]], dim=-1)
-                    z = (features.clamp(low, high) / scale - self.center[i]) / self.width[i]
-                    x = features @ linear + _network(weights, z) * self.unit[i]
-                    after = window[..., :n, t + 1]
-                    x = x - turn * ((x - after) * per_turn).detach().round()  # an angle may jump
-                    errors.append((x - after) / units)
-                return steps * ((th.cat(errors, dim=-1) @ whitened) ** 2).mean()
+                for after in later:
+                    z = row.clamp(low, high)
+                    hidden = th.addmm(b2, th.tanh(th.addmm(b1, z, W1)), W2).tanh()
+                    x = th.addmm(b3, th.cat([hidden, z, row], dim=1), last)
+                    if turn is not None:  # an angle may have jumped
+                        turns = (x - after[:, :n]).detach() / th.where(turn > 0, turn, th.inf)
+                        x = x - turn * turns.round()
+                    errors.append(x - after[:, :n])
+                    row = th.cat([x, after[:, n:]], dim=1)
+                return steps * ((th.cat(errors, dim=1) @ whitened) ** 2).mean()
 
             return loss
 
@@ -249,6 +253,14 @@ class _Networks:
             finally:
                 stopped.set()  # an interrupt does not wait for fits
 
+    def _scaled(self, weights: Sequence[th.Tensor], i: Any = slice(None)) -> list[th.Tensor]:
+        """Return weights in scaled coordinates, of network i or of all."""
+        W1, b1, W2, b2, W3, b3, L = weights
+        W1 = W1 / self.width[i].mT
+        L = L * self.unit[i] / self.width[i].mT
+        b1 = b1 - self.center[i] @ W1
+        return [W1, b1, W2, b2, W3 * self.unit[i], b3 * self.unit[i] - self.center[i] @ L, L]
+
     def residuals(self) -> list[Residual]:
         """Return them in scaled coordinates, one by one."""
         with th.no_grad():
@@ -261,11 +273,7 @@ class _Networks:
                 W1, W2, b2, W3, L = (
                     each.expand(len(b1), -1, -1) for each in (W1[:, :k], W2, b2, W3, L[:, :k])
                 )
-            first = W1 / self.width.mT
-            L = L * self.unit / self.width.mT
-            b1 = b1 - self.center @ first
-            b3 = b3 * self.unit - self.center @ L
-            parts = [first, b1, W2, b2, W3 * self.unit, b3, L]
+            parts = self._scaled([W1, b1, W2, b2, W3, b3, L])
             parts.append(th.zeros((len(L), L.shape[1], L.shape[1] * L.shape[2])))
             arrays = [each.double().numpy().copy() for each in parts]
         return [Residual([each[i] for each in arrays]) for i in range(len(arrays[0]))]
