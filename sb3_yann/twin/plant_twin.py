@@ -228,7 +228,7 @@ class PlantTwin(LearntModel):
     def report(self) -> str:
         """Return what the twin explains, what it does not know, and whether to trust it."""
         known = [
-            f"With {e.says} steps are explained better; a load may look alike."
+            f"With {e.says} steps are explained better; a load or noise may look alike."
             for e in self.judges
             if e.actuator.size
         ]
