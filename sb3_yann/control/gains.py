@@ -76,20 +76,28 @@ class Gains(ReadOnlyArrays):
 
 
 def projector(A: Array, integrators: int) -> Array:
-    """Return the spectral projector (n, n) of so many poles, those nearest to 1."""
+    """Return the spectral projector (n, n) of so many poles, those nearest to 1.
+
+    Poles that repeat are taken together: with so many of them, or more.
+    """
     n = len(A)
     if not integrators:
         return np.zeros((n, n))
     away = np.sort(np.abs(np.linalg.eigvals(A) - 1))
-    end = np.inf if integrators == n else (away[integrators - 1] + away[integrators]) / 2
+    # 1e-5: how far apart rounding shows poles that repeat
+    while integrators < n and away[integrators] - away[integrators - 1] < 1e-5:
+        integrators += 1
+    if integrators == n:
+        return np.eye(n)
+    end = (away[integrators - 1] + away[integrators]) / 2
 
     def near(pole: complex) -> bool:
         return bool(abs(pole - 1) < end)
 
-    right, left = (
-        linalg.schur(each, "complex", sort=near)[1][:, :integrators] for each in (A, A.T)
-    )
-    return np.real(right @ np.linalg.solve(left.conj().T @ right, left.conj().T))
+    T, Q, count = linalg.schur(A, "complex", sort=near)
+    beside = linalg.solve_sylvester(T[:count, :count], -T[count:, count:], T[:count, count:])
+    left = Q[:, :count].conj().T + beside @ Q[:, count:].conj().T
+    return np.real(Q[:, :count] @ left)
 
 
 def settled(A: Array, P: Array) -> Array:
@@ -122,12 +130,12 @@ def count_integrators(A: Array, deviation: Callable[[Array], float] = lambda R: 
     known = projector(A, near)
     count = 0
     while count < near:
-        following = count + (2 if values[count].imag else 1)
+        reached = projector(A, count + (2 if values[count].imag else 1))
         if abs(values[count] - 1) > ON_CIRCLE:
             before = projector(A, count)
             R = settled(A, before)
-            own = projector(A, following) - before
+            own = reached - before
             if not min(deviation(R @ known), deviation(R @ own)) * SURE_ERRORS > 1:
                 break
-        count = following
+        count = round(np.trace(reached))
     return count

@@ -277,8 +277,11 @@ class LinearMPC(MPCProblem):
             low = np.asarray(shown.low, np.float64)
             high = np.asarray(shown.high, np.float64)
             bounded = np.abs([low, high]) < largest_bound(model.x_ss)
-            limits["theta_min"] = np.where(bounded[0], low, -np.inf)
-            limits["theta_max"] = np.where(bounded[1], high, np.inf)
+            for side, end, within in (("min", low, bounded[0]), ("max", high, bounded[1])):
+                given: Any = options.get(f"x_{side}")
+                fits = given is not None and np.shape(given) in ((), end.shape)
+                far = np.full(end.shape, -np.inf if side == "min" else np.inf)
+                limits[f"theta_{side}"] = np.where(within, end, given if fits else far)
         if isinstance(own, LinearMPC):  # a PlantEnv's
             states = own.layout.state
             limits |= {"x_min": own.x_min, "x_max": own.x_max}

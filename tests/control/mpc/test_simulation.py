@@ -58,17 +58,17 @@ def test_the_bounds_are_those_of_the_spaces_as_the_plant_shows_them() -> None:
     mpc = LinearMPC.from_env(heater, Q=[[1]], R=[[0.01]], horizon=3, **given)
     assert (mpc.model.state_names, mpc.model.time_unit) == (("T",), "s")
     np.testing.assert_allclose([mpc.model.A[0, 0], mpc.model.B[0, 0]], [0.9, 0.05], atol=1e-6)
-    by_hand = LinearMPC(
-        mpc.model, Q=[[1]], R=[[0.01]], horizon=3, u_min=20, u_max=60, theta_min=300,
-        theta_max=400,
-    )  # fmt: skip
-    assert mpc == by_hand
+    box = {"u_min": 20, "u_max": 60, "theta_min": 300, "theta_max": 400}
+    assert mpc == LinearMPC(mpc.model, Q=[[1]], R=[[0.01]], horizon=3, **box)
     law = mpc.explicit()
     np.testing.assert_allclose(law.plant_input([350.0]), [40], atol=1e-6)
     assert 20 <= law.plant_input([390.0])[0] < 40
 
 
 def test_what_is_given_counts_more_than_the_spaces() -> None:
+    open_above = Plant(lambda x, u: 0.9 * x + u, (-9, np.inf), (-1, 1), 0)  # theta ends at x_max
+    mpc = LinearMPC.from_env(open_above, Q=[[1]], R=[[1]], horizon=2, dt=1, x_min=[-5], x_max=[5])
+    assert (mpc.theta_min, mpc.theta_max) == (-9, 5)
     mpc = LinearMPC.from_env("ClippedPendulum-v0", Q=np.eye(2), R=[[1]], horizon=2, u_max=1.5)
     assert mpc.u_max.tolist() == [1.5] and mpc.u_min.tolist() == [-2]
     with pytest.raises(TypeError, match="colour"):
